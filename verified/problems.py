@@ -1,7 +1,7 @@
 """What a proof file of version 2 is about: its numbers, by kind of claim, with nothing decided.
 
 The files that it binds are read with it. What the second kernel does not cover is told by name
-(NotCovered); what the pages do not allow is refused (strict.py). Standard library only.
+(NotCovered); what the pages do not allow is refused (strict*.py). Standard library only.
 """
 
 import hashlib
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import strict
+import strict_funnels
 from strict import Refused
 
 DIGITS = 60  # characters of a number
@@ -31,7 +32,7 @@ class Funnel:
         self.files: Files = {"proof": (content, document)}
         roles = "vector_field policy funnel"
         files, digests = _bound(self.claim.get("about"), folder, roles, self.files)
-        strict.flow(self.files)
+        strict_funnels.flow(self.files)
         self.field, self.policy, self.funnel = files
         if any(file["vector_field"] != digests["vector_field"] for file in files[1:]):
             raise Refused("a file names another vector field")
@@ -54,7 +55,7 @@ class Composition:
 
     def __init__(self, document: Any, content: str, folder: Path) -> None:
         self.files: Files = {"proof": (content, document)}
-        self.multipliers = strict.composition(document)
+        self.multipliers = strict_funnels.composition(document)
         roles = [f"stage{i}" for i in range(1, len(self.multipliers) + 2)]
         _bound(document["claim"]["about"], folder, " ".join(roles), self.files)
         self.stages = []
@@ -79,7 +80,7 @@ class Sampled:
         (self.model, self.policy, self.funnel), digests = _bound(about, folder, roles, self.files)
         if self.model.get("kind") == "trapezoidal":
             raise NotCovered("sampled funnels of models of kind trapezoidal are not covered")
-        strict.sampled(self.files)
+        strict_funnels.sampled(self.files)
         if any(file["model"] != digests["model"] for file in (self.policy, self.funnel)):
             raise Refused("a file names another model")
         if self.funnel["policy"] != digests["policy"]:

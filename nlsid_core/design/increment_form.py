@@ -10,6 +10,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import Node, parse
+from nlsid_core.kernel.matrix_polynomials import Box
 from nlsid_core.models import StableModel
 
 CORNERS = 16  # vertices whose Gramians balance a program
@@ -106,7 +107,7 @@ class Form:
         return [1.0 - part * (1.0 - self.rate**2) for part in FADING]
 
 
-def _parts(tree: Json | None, box: increments.Box) -> list[tuple[increments.Box, Node | None]]:
+def _parts(tree: Json | None, box: Box) -> list[tuple[Box, Node | None]]:
     """The leaves' parts of the box, and what bounds E there."""
     if tree is None:
         return []

@@ -20,6 +20,7 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import CertificateRejected, DataError, SolverError
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import parse
+from nlsid_core.kernel.matrix_polynomials import Box
 
 ROOMS = (1e-4, 1e-3, 1e-2, 0.1)  # relative, above the least γ², tried until the kernel proves it
 LARGEST = 1e4  # entry of a multiplier in balanced units: where nothing else bounds it
@@ -32,7 +33,7 @@ MOST_LEAVES = 16  # of a box whose vertices are too coarse
 LEAST_GRAMIAN = 1e-8  # of its mean: states that the output hardly sees
 
 # A box, or the entry that is halved and what becomes of the halves.
-Tree: TypeAlias = "increments.Box | tuple[int, tuple[Tree, Tree]]"
+Tree: TypeAlias = "Box | tuple[int, tuple[Tree, Tree]]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +283,7 @@ def _observed(A: FloatArray, C: FloatArray) -> FloatArray:
     return P
 
 
-def _leaves(tree: Tree) -> list[increments.Box]:
+def _leaves(tree: Tree) -> list[Box]:
     if isinstance(tree, list):
         return [tree]
     return [leaf for part in tree[1] for leaf in _leaves(part)]

@@ -24,6 +24,7 @@ from nlsid_core.errors import CertificateRejected, SolverError
 from nlsid_core.identification.leading_bounds import leading_bounds
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import parse
+from nlsid_core.kernel.matrix_polynomials import Box
 from nlsid_core.models import StateAffineModel
 
 RATE_ROOM = 0.05  # of 1 - the fastest rate found, given up for a well conditioned P
@@ -67,7 +68,7 @@ class StabilityProof:
 class Leaf:
     """A part of the box, its vertices E, and its multiplier N (m + n, m)."""
 
-    box: increments.Box
+    box: Box
     E: Matrices
     ends: Json | None = None  # what the kernel takes E from, if not from the box alone
     N: FloatArray | None = None
@@ -96,7 +97,7 @@ class _Search:
     def __post_init__(self) -> None:
         object.__setattr__(self, "m", self.F.shape[1] - len(self.F))
 
-    def leaf(self, box: increments.Box) -> Leaf:
+    def leaf(self, box: Box) -> Leaf:
         return Leaf(box, np.array(self.form.vertices(box, None), dtype=np.float64))
 
 

@@ -24,41 +24,17 @@ from itertools import pairwise, product
 from math import prod
 
 from . import text
+from .closed_loop import ClosedLoop, Decay
 from .decision import Decision
-from .exact import Matrix, at_most, definite, inverse_forms, semidefinite
+from .exact import at_most, inverse_forms, semidefinite
 from .files import Node, Read, Rejected, Terms, bound_files
-from .polynomials import Polynomial, Ring, Work, at_width
-from .positivity import expanded, positive, powers_of_two, read_squares
+from .polynomials import Ring, Work, at_width
+from .positivity import positive, read_squares
+from .trajectory import Bounds, Field, Funnel, Policy, read_field, read_funnel, read_policy
 
 HOLD_COST = 4  # of comparing one rate with another, in products
-MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
-MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
-MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
+MAX_LEVEL, MAX_PIECES = 16, 100_000
 PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
-Bounds = dict[int, tuple[Fraction, Fraction]]
-Curve = list[list[list[Fraction]]]  # by interval, control point, entry
-
-
-@dataclass(frozen=True)
-class Field:
-    """By time span: bounds of entries of (x, u), and equations in t, x, u and w."""
-
-    n: int
-    m: int
-    box: list[tuple[Fraction, Fraction]]
-    breaks: list[Fraction]
-    bounds: list[Bounds]
-    expansion: str
-    equations: list[list[Terms]]
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Control points of u₀ and K; limits: low and high by input."""
-
-    u: Curve
-    K: list[list[Matrix]]
-    limits: Bounds
 
 
 @dataclass(frozen=True)
@@ -86,24 +62,6 @@ class Hold:
     def push(self, k: int, corner: tuple[int, ...]) -> list[Fraction]:
         """δ at a corner, in interval k."""
         return [side * width for side, width in zip(corner, self.widths[k], strict=False)]
-
-
-@dataclass(frozen=True)
-class Decay:
-    """dV/dt <= rate (floor - V) wherever floor <= V <= 1; rate in 1/s."""
-
-    rate: Fraction
-    floor: Fraction
-
-
-@dataclass(frozen=True)
-class Funnel:
-    """Knots, control points of x₀, and P and ρ at the knots."""
-
-    t: list[Fraction]
-    x: Curve
-    P: list[Matrix]
-    rho: list[Fraction]
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -153,70 +111,6 @@ def decide_funnel(
         digests,
     )
     return decision, funnel
-
-
-def read_field(node: Node) -> Field:
-    """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
-    names = "states inputs uncertain breaks valid expansion pieces"
-    parts = node.document("vector_field", names)
-    n, m = parts["states"].whole(1, MAX_STATES), parts["inputs"].whole(0, MAX_INPUTS)
-    box = [(low, high) for low, high in parts["uncertain"].array(None, 2)]
-    if len(box) > MAX_UNCERTAIN or any(low > high for low, high in box):
-        raise Rejected(f"uncertain should hold at most {MAX_UNCERTAIN} pairs low <= high")
-    breaks = _increasing(parts["breaks"], 0, MAX_SPANS)
-    count = len(breaks) + 1
-    bounds: list[Bounds] = [{} for _ in range(count)]
-    for row in parts["valid"].items(0, MAX_BOUNDS):
-        j, low, high, *only = row.array(4 if type(row.value) is list and row.value[3:] else 3)
-        if j not in range(n + m) or not all(span in range(count) for span in only):
-            raise Rejected(f"{row.where} should be an entry of (x, u), low, high, and maybe a span")
-        for found in [bounds[int(span)] for span in only] or bounds:
-            before = found.get(int(j), (low, high))
-            found[int(j)] = max(low, before[0]), min(high, before[1])
-    equations = [
-        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, tuple) for row in piece.items(n, n)]
-        for piece in parts["pieces"].items(count, count)
-    ]
-    if any(max(e[1 + n + m :], default=0) > 1 for span in equations for p in span for e, _ in p):
-        raise Rejected(f"{parts['pieces'].where}: a monomial has degree above 1 in an entry of w")
-    return Field(n, m, box, breaks, bounds, parts["expansion"].text(), equations)
-
-
-def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
-    """The funnel: x₀ continuous, P ≻ 0 and ρ > 0 at every knot, and so in between."""
-    made_for = {role: digests[role] for role in ("vector_field", "policy")}
-    parts = node.document("funnel", "t x P rho", "continuous", made_for=made_for)
-    t = _increasing(parts["t"], 2, MAX_KNOTS)
-    K = len(t)
-    x = _curve(parts["x"], K - 1, n)
-    if any(before[-1] != after[0] for before, after in pairwise(x)):
-        raise Rejected("the nominal states of the funnel jump at a knot")
-    size = len(x[0][0])
-    P, rho = parts["P"].array(K, size, size), parts["rho"].array(K)
-    for k in range(K):
-        definite(P[k], f"P at knot {k}")
-        if rho[k] <= 0:
-            raise Rejected(f"rho is not positive at knot {k}")
-    return Funnel(t, x, P, rho)
-
-
-def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str]) -> Policy:
-    """The policy: around the funnel's own nominal, each input clipped at most once."""
-    made_for = {"vector_field": digests["vector_field"]}
-    parts, count = (
-        node.document("policy", "t x u K limits", "continuous", made_for=made_for),
-        len(funnel.x),
-    )
-    if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:
-        raise Rejected("the funnel is around another nominal than the policy's")
-    u, K = _curve(parts["u"], count, field.m), _curve(parts["K"], count, field.m, field.n)
-    rows = parts["limits"].array(None, 3)
-    limits = {int(row[0]): (row[1], row[2]) for row in rows if row[0] in range(field.m)}
-    if len(limits) != len(rows) or len(rows) > MAX_LIMITED:
-        raise Rejected(f"limits should be at most {MAX_LIMITED} rows, one each for some input")
-    if any(low >= high for low, high in limits.values()):
-        raise Rejected("limits should be rows (input, low, high) with low < high")
-    return Policy(u, K, limits)
 
 
 def _read_hold(
@@ -283,21 +177,6 @@ def _falls(falls: Decay | Fraction, end: str) -> str:
         f", and for any times t1 <= t2 from then until {end} s V(t2) <= {floor} or V(t2) <= "
         f"{floor} + exp(-{rate} (t2 - t1)) (V(t1) - {floor}), V = |x - x0|^2_P / rho"
     )
-
-
-def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
-    times: list[Fraction] = node.array(None)
-    if not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)):
-        raise Rejected(f"{node.where} should be {least} to {most} times that increase")
-    return times
-
-
-def _curve(node: Node, count: int, *shape: int | None) -> list:  # type: ignore[type-arg]
-    curve = node.array(count, None, *shape)
-    for control in curve:
-        if not 0 < len(control) <= MAX_TIME_DEGREE + 1 or len(control[0]) != len(curve[0][0]):
-            raise Rejected(f"{node.where} should have degree 0 to {MAX_TIME_DEGREE} in time")
-    return curve
 
 
 def inside(
@@ -417,7 +296,6 @@ def _range(ends: tuple[Fraction, Fraction]) -> str:
     return f"[{text.exact(ends[0])}, {text.exact(ends[1])}]"
 
 
-Change = dict[tuple[int, ...], Polynomial]  # by monomials in (δ, w); () is 1
 Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
 
 
@@ -444,7 +322,8 @@ def _decide_pieces(
     needed = list(product(range(len(spans)), range(len(vertices)), modes))
     order, pieces = _in_order(stated["pieces"], names, needed, len(modes[0]), work)
     multiplier = [] if decays else stated["multiplier"].monomials(field.n)
-    loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
+    # Of the last piece: those that share a closed loop follow each other.
+    loops: dict[tuple[object, ...], ClosedLoop] = {}
 
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, mode), level, index, i = order[number]
@@ -452,7 +331,7 @@ def _decide_pieces(
         key = ring.width, k, level, index, mode
         if key not in loops:
             loops.clear()
-            loops[key] = _Loop(ring, equations[spans[k]], policy, funnel, key[1:4], mode)
+            loops[key] = ClosedLoop(ring, equations[spans[k]], policy, funnel, key[1:4], mode)
             loops[key].grow(field.box, kappa[k] if kappa else [], falls)
         loop, piece = loops[key], pieces[i]
         c = loop.condition(multiplier, piece, stated, (*hold.push(k, corner), *w))
@@ -492,7 +371,7 @@ def _decide_rates(
     names = "input sign tau" + " mode" * bool(limited)
     order, pieces = _in_order(stated["rate_pieces"], names, needed, len(limited), work)
     halves = [(b - a) / 2 for a, b in field.box]
-    loops: dict[tuple[object, ...], _Loop] = {}  # as above
+    loops: dict[tuple[object, ...], ClosedLoop] = {}  # as above
 
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, (i, sign, *mode)), level, index, place = order[number]
@@ -500,7 +379,7 @@ def _decide_rates(
         key = ring.width, k, level, index, tuple(mode)
         if key not in loops:
             loops.clear()
-            loops[key] = _Loop(ring, equations[spans[k]], policy, funnel, key[1:4], key[4])
+            loops[key] = ClosedLoop(ring, equations[spans[k]], policy, funnel, key[1:4], key[4])
         loop, room, ranges = loops[key], hold.rates[k][i], [*hold.widths[k][: hold.moved], *halves]
         for j in pushing:
             column = [_pushed(equation, j, field) for equation in equations[spans[k]]]
@@ -592,167 +471,3 @@ def _in_order(
             raise Rejected(f"a piece of interval {k} is missing (vertex {v}, mode {mode})")
     work.spend(PIECE * len(pieces))
     return [(key, level, index, i) for key, _, level, index, i in order], pieces
-
-
-class _Loop:
-    """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it.
-
-    equations: with δ. held: what is nonnegative in the mode. gap: ρ - W. field: f by monomials in
-    (δ, w), of clip(ũ).
-    """
-
-    def __init__(
-        self, ring: Ring, equations: list[Terms], policy: Policy, funnel: Funnel,
-        place: tuple[int, int, int], mode: tuple[int, ...],
-    ) -> None:  # fmt: skip
-        (self.k, level, index), self.ring, x = place, ring, ring.variables
-        self.funnel, self.policy = funnel, policy
-        k, self.h = self.k, funnel.t[self.k + 1] - funnel.t[self.k]
-        self.in_time = in_time = partial(ring.bernstein, level=level, index=index)
-        self.rho = in_time(funnel.rho[k : k + 2])
-        ends = zip(funnel.P[k], funnel.P[k + 1], strict=True)
-        self.Px = [
-            ring.dot([in_time(pair) for pair in zip(*rows, strict=True)], x) for rows in ends
-        ]
-        self.gap = self.rho - ring.dot(x, self.Px)
-        inputs, self.held = [], []
-        for i, points in enumerate(zip(*policy.u[k], strict=True)):  # ũ = u₀ - Kx̄
-            inputs.append(in_time(points) - ring.dot(self._gains(i), x))
-        for side, (i, (low, high)) in zip(mode, policy.limits.items(), strict=True):
-            wanted = inputs[i]
-            if side:
-                self.held.append(low - wanted if side < 0 else wanted - high)
-                inputs[i] = ring.made(low if side < 0 else high)
-            else:
-                self.held.append((high - wanted) * (wanted - low))
-        centres = zip(*funnel.x[k], strict=True)
-        states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
-        self.field = _apart(ring, equations, [in_time(funnel.t[k : k + 2]), *states, *inputs])
-        self.changes: dict[int, Change] = {}
-
-    def _gains(self, i: int) -> list[Polynomial]:
-        """Row i of K."""
-        rows = zip(*(K[i] for K in self.policy.K[self.k]), strict=True)
-        return [self.in_time(points) for points in rows]
-
-    def _motion(self) -> list[Polynomial]:
-        """dx₀/ds."""
-        return [self.in_time(_slope(p)) for p in zip(*self.funnel.x[self.k], strict=True)]
-
-    def _along(self, direction: list[Polynomial], scale: Fraction) -> Change:
-        """scale direction'f."""
-        return {off: scale * self.ring.dot(rates, direction) for off, rates in self.field.items()}
-
-    def grow(
-        self,
-        box: list[tuple[Fraction, Fraction]],
-        kappa: Sequence[Fraction],
-        falls: Decay | Fraction,
-    ) -> None:
-        """`rest` and, by monomials in (δ, w), `growth`: all of c(s, x̄) but its multipliers.
-
-        falls: the decay, or the margin on the boundary. `shell`: what is nonnegative for a decay.
-        """
-        ring, k, h, x = self.ring, self.k, self.h, self.ring.variables
-        bend = [
-            [b - a for a, b in zip(*rows, strict=True)]
-            for rows in zip(self.funnel.P[k], self.funnel.P[k + 1], strict=True)
-        ]
-        # 2x̄'P dx₀/ds - x̄'(dP/ds)x̄: what of -dW/ds does not come from f
-        rest = 2 * ring.dot(self._motion(), self.Px) - ring.form(bend, x)
-        self.growth = self._along(self.Px, 2 * h)
-        moved = len(next(iter(self.field), ())) - len(box)
-        for j, (bound, (low, high)) in enumerate(zip(kappa, box, strict=False)):
-            unit = tuple(int(i == j) for i in range(-moved, len(box)))
-            along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
-            half = (high - low) / 2
-            rest -= half * bound / (4 * h) * (along * along) + half * h / bound
-        rise, rho, W = self.funnel.rho[k + 1] - self.funnel.rho[k], self.rho, self.rho - self.gap
-        if isinstance(falls, Decay):
-            floor = falls.floor * rho
-            self.rest = rho * rest + rise * W + falls.rate * h * (rho * (floor - W))
-            self.growth = {used: rho * part for used, part in self.growth.items()}
-            self.shell = [self.gap, W - floor]
-        else:
-            self.rest, self.shell = rise - falls * h * rho + rest, []
-
-    def condition(
-        self, multiplier: list[tuple[int, ...]], piece: dict[str, Node], stated: dict[str, Node],
-        off: Sequence[Fraction],
-    ) -> Polynomial:  # fmt: skip
-        """c(s, x̄) of a piece at a vertex of (δ, w)."""
-        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
-        if "mu" in piece:
-            parts.append((1, self._multiplied(multiplier, piece["mu"])))
-        parts += [(-weight, growth) for weight, growth in _at(off, self.growth)]
-        if "tau" in piece:
-            parts += self._taken(piece["tau"], self.shell + self.held, stated)
-        return self.ring.weighted(parts)
-
-    def _multiplied(self, multiplier: list[tuple[int, ...]], mu: Node) -> Polynomial:
-        """μ (ρ - W)."""
-        ring, size, stated = self.ring, len(multiplier), mu.members("shifts start end")
-        shifts = powers_of_two(stated["shifts"], size)
-        ends = zip(stated["start"].wholes(size), stated["end"].wholes(size), strict=True)
-        lines = [
-            ring.bernstein(pair) * ring.monomial(row)
-            for pair, row in zip(ends, multiplier, strict=True)
-        ]
-        return ring.dot([Fraction(2) ** shift for shift in shifts], lines) * self.gap
-
-    def rate_condition(
-        self, room: Fraction, i: int, sign: int, piece: dict[str, Node], stated: dict[str, Node],
-        off: Sequence[Fraction],
-    ) -> Polynomial:  # fmt: skip
-        """h room - sign dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l, of ũ = u₀ - Kx̄, at a vertex."""
-        if i not in self.changes:
-            self.changes[i] = self._change(i)
-        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.ring.made(self.h * room))]
-        parts += [(-sign * weight, change) for weight, change in _at(off, self.changes[i])]
-        parts += self._taken(piece["tau"], [self.gap, *self.held], stated)
-        return self.ring.weighted(parts)
-
-    def _change(self, i: int) -> Change:
-        """dũ_i/ds."""
-        ring, k, gains = self.ring, self.k, self._gains(i)
-        rows = zip(*(K[i] for K in self.policy.K[k]), strict=True)
-        turning = [self.in_time(_slope(points)) for points in rows]
-        own = self.in_time(_slope([u[i] for u in self.policy.u[k]]))
-        own += ring.dot(gains, self._motion()) - ring.dot(turning, ring.variables)
-        return {(): own} | self._along(gains, -self.h)
-
-    def _taken(
-        self, taus: Node, held: list[Polynomial], stated: dict[str, Node]
-    ) -> list[tuple[Fraction | int, Polynomial]]:
-        """-τ q for everything that is nonnegative here."""
-        parts: list[tuple[Fraction | int, Polynomial]] = []
-        for node, q in zip(taus.items(len(held), len(held)), held, strict=True):
-            tau = node.members("columns squares") | {"basis": stated["sides"]}
-            parts.append((-1, expanded(read_squares(tau, self.ring), self.ring) * q))
-        return parts
-
-
-def _slope(points: Sequence[Fraction]) -> list[Fraction]:
-    """Control points of the derivative in s."""
-    return [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
-
-
-def _at(off: Sequence[Fraction], parts: Change) -> list[tuple[Fraction, Polynomial]]:
-    """What multiplies each polynomial at a vertex of (δ, w)."""
-    return [
-        (prod((value for value, e in zip(off, used, strict=False) if e), start=Fraction(1)), part)
-        for used, part in parts.items()
-    ]
-
-
-def _apart(
-    ring: Ring, equations: list[Terms], forms: list[Polynomial]
-) -> dict[tuple[int, ...], list[Polynomial]]:
-    """f by its monomials in (δ, w), for t, x, u as forms in x̄ and s."""
-    rates: dict[tuple[int, ...], list[Terms]] = {}
-    n, known = len(equations), len(forms)
-    for i, equation in enumerate(equations):
-        for e, c in equation:
-            rates.setdefault(e[known:], [[] for _ in range(n)])[i].append((e[:known], c))
-    found = ring.substituted([p for parts in rates.values() for p in parts], forms)
-    return {used: found[n * i : n * i + n] for i, used in enumerate(rates)}

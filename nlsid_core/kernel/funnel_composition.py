@@ -9,10 +9,11 @@ from fractions import Fraction
 from itertools import pairwise
 
 from . import text
-from .continuous_funnel import Funnel, decide_funnel, inside
+from .continuous_funnel import decide_funnel, inside
 from .decision import Decision
 from .files import Node, Read, Rejected, bound_files
 from .polynomials import Work
+from .trajectory import Funnel
 
 MAX_STAGES = 100
 

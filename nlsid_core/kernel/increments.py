@@ -16,14 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise, product
-from math import comb, prod
 from typing import Any
 
 from . import text
-from .exact import MAX_ORDER, Matrix, combined, definite, transposed
+from .exact import Matrix, combined, definite, transposed
 from .exact import product as times
-from .files import MAX_STATED, Node, Rejected
+from .files import Node, Rejected
 from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
+from .matrix_polynomials import Box, Terms, bernstein, between, effort, side_by_side
 from .polynomials import Work
 from .signals import Signal, read_signal, read_signals, within
 from .terms import derivative
@@ -36,8 +36,6 @@ MATRIX = 500  # what deciding one costs at the least
 MAX_SLOPES = 10**7  # entries of all coefficients of ∂h/∂(v, x), in which a term may occur often
 MAX_SPLITS = 40  # of one box, one inside the other
 
-Box = list[tuple[Fraction, Fraction]]
-Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
 Polynomial = list[tuple[tuple[int, ...], Fraction]]
 
 
@@ -97,7 +95,7 @@ def positive(
     `multipliers` is a leaf {N}, N of M's order × m, a list of one for each form if there are
     several; or {split, parts}: the variable of the box that is halved, and the multipliers of the
     lower and of the upper half. A leaf may state `ends` beside N: bounds of the one entry of E that
-    varies, in the place of the vertices (`_between`).
+    varies, in the place of the vertices (`between`).
     """
     m, size = model.unknowns, len(forms[0][1])
     if multipliers is None:
@@ -249,16 +247,16 @@ def _state_affine(node: Node, driven: bool, bounds: Node | None) -> Model:
             of = zip(reach, parts["y_offset"].array(p), y_scale, strict=True)
             box = [tuple((end - o) / by for end in row) for row, o, by in of] * len(G) + box
     else:
-        E = _side_by_side(G, p)
+        E = side_by_side(G, p)
 
     def vertices(part: Box, ends: Node | None) -> list[Matrix]:
         if ends is not None and driven:
             raise Rejected(f"{ends.where}: ends are for two solutions under one input")
-        return _bernstein(E, part) if ends is None else _between(G, part, ends)
+        return bernstein(E, part) if ends is None else between(G, part, ends)
 
     model = Model(
         _period(parts), y, u, F, H, inputs, [(low, high) for low, high in box], vertices,
-        effort=_effort(E, [(low, high) for low, high in box]),
+        effort=effort(E, [(low, high) for low, high in box]),
         whole=len(box) if driven and p > 1 else 0, limits=limits,
     )  # fmt: skip
     return _driven(model, window) if driven else model
@@ -499,13 +497,13 @@ def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
     def vertices(part: Box, ends: Node | None) -> list[Matrix]:
         if ends is not None:
             raise Rejected(f"{ends.where}: ends are for state-affine models")
-        return only or _bernstein(E, part)
+        return only or bernstein(E, part)
 
     split = len(box) if driven else p + n
     model = Model(
         given.period, y, u, [row[: p + n] for row in F], [_unit(i, p + n) for i in range(p)],
         "for every input" if bounds is None else "while signals stay in the box", box,
-        vertices, ray=least is not None, effort=0 if only else _effort(E, box),
+        vertices, ray=least is not None, effort=0 if only else effort(E, box),
         whole=split if p > 1 and box else 0,
     )  # fmt: skip
     return _driven(model, window, [row[p + n :] for row in F]) if driven else model
@@ -563,132 +561,6 @@ _READERS: dict[str, Callable[[Node, bool], Model]] = {
     "cell_network": _cell_network,
     "monotone_equation": _monotone_equation,
 }
-
-
-def _side_by_side(G: Sequence[Terms], rows: int) -> Terms:
-    """[G_0 … G_n] as one matrix polynomial."""
-    zeros = [[[Fraction(0)] * len(g[0][1][0])] * rows for g in G]
-    found = [{tuple(powers): block for powers, block in g} for g in G]
-    used = sorted({powers for g in found for powers in g})
-    if len(used) > MAX_STATED:
-        raise Rejected(f"the model has {len(used)} monomials; at most {MAX_STATED} are taken")
-    return [
-        (
-            list(powers),
-            [
-                [
-                    entry
-                    for g, none in zip(found, zeros, strict=True)
-                    for entry in g.get(powers, none)[i]
-                ]
-                for i in range(rows)
-            ],
-        )
-        for powers in used
-    ]
-
-
-def _effort(E: Terms, box: Box) -> int:
-    """How many products the Bernstein form of E takes."""
-    degrees, entries = _degrees(E, len(box)), sum(map(len, E[0][1]))
-    longest = [max(end.numerator.bit_length() + end.denominator.bit_length() for end in ends)
-               for ends in box]  # fmt: skip
-    bits = sum(d * long for d, long in zip(degrees, longest, strict=True))
-    size = len(E) * (entries + len(box))
-    return prod(d + 1 for d in degrees) * size * (1 + (bits >> 11) ** 2)
-
-
-def _bernstein(E: Terms, box: Box) -> list[Matrix]:
-    """The Bernstein coefficients of E(w) on a box: their convex hull holds its values.
-
-    On [lo, hi], w^e has the coefficient Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j) at index k
-    of degree d.
-    """
-    degrees = _degrees(E, len(box))
-    tables = [
-        [
-            [
-                sum(
-                    (
-                        comb(e, j)
-                        * low ** (e - j)
-                        * (high - low) ** j
-                        * Fraction(comb(k, j), comb(d, j))
-                        for j in range(min(e, k) + 1)
-                    ),
-                    Fraction(0),
-                )
-                for k in range(d + 1)
-            ]
-            for e in range(d + 1)
-        ]
-        for d, (low, high) in zip(degrees, box, strict=True)
-    ]
-    found: set[tuple[tuple[Fraction, ...], ...]] = set()
-    for k in product(*(range(d + 1) for d in degrees)):
-        value = [[Fraction(0)] * len(row) for row in E[0][1]]
-        for powers, coefficients in E:
-            factors = (tables[i][e][k[i]] for i, e in enumerate(powers) if e)
-            weight = prod(factors, start=Fraction(1))
-            if weight:
-                value = combined(value, coefficients, weight)
-        found.add(tuple(map(tuple, value)))
-    return _extreme([[list(row) for row in value] for value in sorted(found)])
-
-
-def _degrees(E: Terms, variables: int) -> list[int]:
-    return [max(powers[i] for powers, _ in E) for i in range(variables)]
-
-
-def _between(G: list[Terms], box: Box, node: Node) -> list[Matrix]:
-    """[G_0 … G_n] at the stated ends of one quadratic G_0 = q, the others being constant.
-
-    low <= q(w) <= high on the box by the S-procedure: with weights a, b >= 0, as forms in [1; w],
-        q - low - Σ a_i (w_i - lo_i)(hi_i - w_i) ≻ 0,
-        high - q - Σ b_i (w_i - lo_i)(hi_i - w_i) ≻ 0.
-    """
-    q, *lagged = G
-    if len(q[0][1]) != 1 or any(any(e) for g in lagged for e, _ in g):
-        raise Rejected(f"{node.where}: ends are for one output whose lags have constant factors")
-    if any(sum(e) > 2 for e, _ in q):
-        raise Rejected(f"{node.where}: ends are for a leading coefficient of degree 2 at most")
-    if len(box) >= MAX_ORDER:
-        raise Rejected(f"{node.where}: ends are for at most {MAX_ORDER - 1} entries of the box")
-    parts = node.members("low high low_weights high_weights")
-    ends = parts["low"].number(), parts["high"].number()
-    for name, sign, end in (("low", 1, ends[0]), ("high", -1, ends[1])):
-        weights = parts[f"{name}_weights"].array(len(box))
-        if min(weights) < 0:
-            raise Rejected(f"{node.where}: weights should be 0 or more")
-        M = [[Fraction(0)] * (len(box) + 1) for _ in range(len(box) + 1)]
-        M[0][0] = -sign * end
-        for e, ((c,),) in q:
-            used = [i + 1 for i, power in enumerate(e) for _ in range(power)]
-            i, j = [0] * (2 - len(used)) + used
-            M[i][j] += sign * c / 2
-            M[j][i] += sign * c / 2
-        for i, (weight, (low, high)) in enumerate(zip(weights, box, strict=True), 1):
-            M[0][0] += weight * low * high
-            M[i][i] += weight
-            M[0][i] -= weight * (low + high) / 2
-            M[i][0] -= weight * (low + high) / 2
-        definite(M, f"the {name} end of the leading coefficient")
-    rest = [sum((c[0][0] for _, c in g), Fraction(0)) for g in lagged]
-    return [[[end, *rest]] for end in ends]
-
-
-def _extreme(E: list[Matrix]) -> list[Matrix]:
-    """Matrices with the same convex hull: the two ends where only one entry differs."""
-    varying = [
-        (i, j)
-        for i, row in enumerate(E[0])
-        for j, entry in enumerate(row)
-        if any(other[i][j] != entry for other in E)
-    ]
-    if len(varying) != 1:
-        return E
-    ((i, j),) = varying
-    return [min(E, key=lambda e: e[i][j]), max(E, key=lambda e: e[i][j])]
 
 
 def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
