@@ -156,10 +156,9 @@ def test_a_design_of_small_matrices_is_proved(
     def refused(*_: Any, **__: Any) -> Any:
         raise AssertionError("a program with every product was solved")
 
-    whole, solve = [], LSteps.solve
-    monkeypatch.setattr(LSteps, "solve", refused)
-    found = designed()
-    monkeypatch.setattr(LSteps, "solve", solve)
+    with monkeypatch.context() as patched:
+        patched.setattr(LSteps, "solved_case", refused)
+        found = designed()
     assert check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(0)
     run = simulate_boundary(found.model, found.policy, found.funnel, starts=500, rng=rng,

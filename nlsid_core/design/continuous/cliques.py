@@ -7,6 +7,7 @@ Source: docs/theory-funnels.md, "Many states".
 """
 
 from functools import cached_property
+from itertools import product
 from math import comb
 from typing import Any
 
@@ -77,13 +78,20 @@ class Cliques:
         points = np.random.default_rng(n).normal(size=(4 * n, n))
         self.points: FloatArray = points / np.linalg.norm(points, axis=1)[:, None]
         self.small = CliqueProgram(n, [tuple(int(self.place[j]) - 1 for j in S) for S in cliques])
-        rows = {tuple(row) for row in linear.tolist()}
+        rows = {tuple(row): place for place, row in enumerate(self.basis.tolist())}
+        unit = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
+        # Where the products of each small Gram matrix are in `basis`.
+        self.at = [
+            [rows[tuple(row)] for row in unit[block.products].sum(axis=1).tolist()]
+            for block in self.small.blocks
+        ]
+        used = {tuple(row) for row in linear.tolist()}
         for S in cliques:
             inside = monomials(len(S), [2, 3])
             wide = np.zeros((len(inside), n), dtype=np.int64)
             wide[:, list(S)] = inside
-            rows |= {tuple(row) for row in wide.tolist()}
-        self.exponents: IntArray = np.array(sorted(rows))
+            used |= {tuple(row) for row in wide.tolist()}
+        self.exponents: IntArray = np.array(sorted(used))
         # A polynomial with these exponents is known by its values at the same points.
         values = np.prod(self.exponents[:, None].astype(np.float64) ** self.exponents, axis=2)
         self._inverse = np.linalg.inv(values)
@@ -131,38 +139,24 @@ class CliqueSteps(LSteps):
         """The cliques."""
         return self.cliques
 
-    def solve(
-        self,
-        section: Section,
-        rho: float,
-        start: list[SphereSolution] | None = None,
-        *,
-        least: float = -np.inf,
-    ) -> list[SphereSolution]:
-        """φ, the only case; `start` and `least` change nothing."""
-        del start, least
+    def solved_case(
+        self, section: Section, rho: float, case: int, start: SphereSolution | None
+    ) -> SphereSolution:
+        """φ, of the only case; `start` changes nothing."""
+        del case, start
         P, g = self._posed(section, rho)
         found = self.cliques.small.solve(P, g, tolerance=FINER * self.tolerance)
-        basis, small = self.cliques.basis, self.cliques.small
-        rows = {tuple(row): place for place, row in enumerate(basis.tolist())}
+        basis = self.cliques.basis
         Q = np.zeros((len(basis), len(basis)))
-        unit = np.vstack([np.zeros((1, self.field.n), dtype=np.int64), np.eye(self.field.n)])
-        for block, gram in zip(small.blocks, found.grams, strict=True):
-            exponents = unit[block.products].sum(axis=1).astype(int).tolist()
-            at = [rows[tuple(row)] for row in exponents]
+        for at, gram in zip(self.cliques.at, found.grams, strict=True):
             Q[np.ix_(at, at)] += gram
         order = self.cliques.order
         size = np.sqrt(np.diag(section.P))[order]
         M = substitution(basis, size[:, None] * section.base[order])
         X = M.T @ Q @ M
         gap = (found.upper - found.m) / float(np.abs(g).max())
-        self.solved += 1
-        return [
-            SphereSolution(
-                found.m, found.upper, X, found.moments, gap, found.iterations,
-                (X, found.moments, found.m),
-            )
-        ]  # fmt: skip
+        warm = X, found.moments, found.m
+        return SphereSolution(found.m, found.upper, X, found.moments, gap, found.iterations, warm)
 
     def bounds(
         self, section: Section, rho: float, duals: list[SphereSolution], cases: Any
@@ -186,9 +180,8 @@ class CliqueSteps(LSteps):
         rates = self.rate(section, section.x + x_bar, u, none) - section.x_rate
         g = cliques.fitted(rates, section.P / size / np.sqrt(rho))
         turning = section.P_rate / size / size[:, None]
-        for i in range(self.field.n):
-            for j in range(i, self.field.n):
-                a, b = sorted((int(cliques.place[i]), int(cliques.place[j])))
-                g[0, 0, a, b] = g.get((0, 0, a, b), 0.0) - turning[i, j] * (1 + (i != j))
+        for i, j in product(range(self.field.n), repeat=2):
+            key = (0, 0, *sorted((int(cliques.place[i]), int(cliques.place[j]))))
+            g[key] = g.get(key, 0.0) - turning[i, j]
         P = section.P / size / size[:, None]
         return P[np.ix_(order, order)], cliques.small.vector(g)

@@ -275,18 +275,23 @@ class LSteps:
             cases = np.argsort(self.bounds(section, rho, start, cases.tolist()), kind="stable")
         found = {} if start is None else dict(enumerate(start))
         for case in cases.tolist():
-            (g,) = self.values(section, rho, [case])
-            tau: FloatArray = np.zeros((0, 0, 0))
-            if len(self.limits):
-                tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
-                g = g - products
-            warm = None if start is None else start[case]
-            solved = self.program.solve(g, tolerance=self.tolerance, start=warm)
-            found[case] = replace(solved, tau=tau)
+            found[case] = self.solved_case(section, rho, case, found.get(case))
             self.solved += 1
-            if solved.m < least:
+            if start is not None and found[case].m < least:
                 break
         return [found[case] for case in range(len(cases))]
+
+    def solved_case(
+        self, section: Section, rho: float, case: int, start: SphereSolution | None
+    ) -> SphereSolution:
+        """φ of one case."""
+        (g,) = self.values(section, rho, [case])
+        tau: FloatArray = np.zeros((0, 0, 0))
+        if len(self.limits):
+            tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
+            g = g - products
+        solved = self.program.solve(g, tolerance=self.tolerance, start=start)
+        return replace(solved, tau=tau)
 
     def predicted(
         self,
