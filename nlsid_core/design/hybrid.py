@@ -18,10 +18,8 @@ from nlsid_core.design.compose import Stage, read_stage, write_beside
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.jump_pieces import Crossing
 from nlsid_core.designs import HYBRID
-from nlsid_core.dynamics import Nominal, Rates, VectorField
-from nlsid_core.dynamics.jump import Jump
+from nlsid_core.dynamics import Jump, Nominal, Rates, VectorField
 from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.funnels.continuous import ContinuousFunnel
 
 KIND = "hybrid_funnel"
 SHARE = 0.9  # of how far the motion ends beyond the guard, in which the goal stays beyond it
@@ -82,9 +80,10 @@ def _jump_proof(number: int, jump: Jump, before: Stage, after: Stage) -> Json:
             f"{a.n} and {after.path} {b.n}"
         )
     if jump.start not in a.t[:-1]:
+        nearest = float(a.t[np.abs(a.t[:-1] - jump.start).argmin()])
         raise DataError(
-            f"jump {number} is watched from {jump.start!r} s on, which is no knot of {before.path}; "
-            f"the nearest is {float(a.t[np.abs(a.t[:-1] - jump.start).argmin()])!r} s"
+            f"jump {number} is watched from {jump.start!r} s on, which is no knot of "
+            f"{before.path}: take {nearest!r} s"
         )
     try:
         return Crossing(jump, a, b).proof()
@@ -143,9 +142,7 @@ def _crossing(jump: Jump, nominal: Nominal) -> float | None:
     )
 
 
-def _transition(
-    rates: VectorField | Any, nominal: Nominal, start: float, end: float
-) -> FloatArray:
+def _transition(rates: VectorField | Any, nominal: Nominal, start: float, end: float) -> FloatArray:
     """(n, n) by which a small deviation grows along the motion, its input unchanged."""
     n = nominal.x.control.shape[2]
 

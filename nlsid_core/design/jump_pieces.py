@@ -5,6 +5,7 @@ of time between them have these multipliers, linear in time. A piece on which no
 halved. Source: docs/certificate_hybrid_funnel.md.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import comb
@@ -31,7 +32,7 @@ from nlsid_core.design.continuous.witnesses import (
     matrices,
     together,
 )
-from nlsid_core.dynamics.jump import Jump
+from nlsid_core.dynamics import Jump
 from nlsid_core.errors import Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial import Polynomial
@@ -44,12 +45,11 @@ MAX_LEVEL = 8  # of halvings of an interval
 MOST = 0.5  # of the room: where nothing of the funnel is on the guard, multipliers give any
 
 
-
 @dataclass(frozen=True, eq=False)
 class Multipliers:
-    """At one instant, in x̄: τ (k', k'), μ (M,), the Gram matrix (k, k), and the room m it left.
+    """At one instant, in x̄: τ (k', k'), μ (M,), the Gram matrix (k, k), and the room that is left.
 
-    1 - V_b(R) = m Σ_i v_i² + v'Qv + τ (ρ - W) + μ g where |z| <= 1.
+    room: of the polynomial over its size, what all monomials of the basis in z have to spare.
     """
 
     tau: FloatArray
@@ -125,26 +125,23 @@ class Crossing:
             "pieces": pieces,
         }
 
-    def room(self) -> float:
-        """The least room that an instant leaves at a knot; below 0 none is left."""
-        knots = range(self.first(), len(self.before.t))
-        return min(
-            self._instant(max(k - 1, 0), vertex, 1.0 if k else 0.0).room
-            for k in knots
-            for vertex in range(len(self.resets))
-        )
-
     def _piece(self, part: Part, vertex: int) -> Json:
         """The piece as the kernel reads it; Infeasible if it is not shown to be positive."""
         ends = [self._instant(part.interval, vertex, s) for s in part.ends()]
         worst = min(ends, key=lambda end: end.room)
         if worst.room <= 0:
-            k, (a, b) = part.interval, part.ends()
-            h = self.before.t[k + 1] - self.before.t[k]
             raise Infeasible(
-                f"between {self.before.t[k] + a * h:.6g} and {self.before.t[k] + b * h:.6g} s the "
-                f"reset leads out of the next stage's start: V reaches {1 - worst.room:.4g} there"
+                "the reset is not shown to lead into the start of the next stage "
+                f"{self._said(part)}"
             )
+        start, end = ends
+        for pair in ([start, end], [start, start], [end, end]):  # near an instant its own serve
+            with suppress(Infeasible):
+                return self._written(part, vertex, pair)
+        raise Infeasible(f"no multipliers are found for all times {self._said(part)}")
+
+    def _written(self, part: Part, vertex: int, ends: list[Multipliers]) -> Json:
+        """The piece with multipliers between these two; Infeasible if it is not positive."""
         mu, stated = self._rounded(np.array([end.mu for end in ends]), part)
         squares = multiplier(self.sides, [end.tau for end in ends], bits=TAU_BITS)
         tau = matrices(squares["columns"], squares["squares"])
@@ -161,6 +158,11 @@ class Crossing:
             "mu": stated,
         } | {key: found[key] for key in ("columns", "squares")}
 
+    def _said(self, part: Part) -> str:
+        k, (a, b) = part.interval, part.ends()
+        first, h = self.before.t[k], self.before.t[k + 1] - self.before.t[k]
+        return f"between {first + a * h:.6g} and {first + b * h:.6g} s"
+
     def _instant(self, k: int, vertex: int, s: float) -> Multipliers:
         """What a program finds at s along interval k."""
         key = k, vertex, s
@@ -169,37 +171,20 @@ class Crossing:
         return self.known[key]
 
     def _solved(self, k: int, vertex: int, s: float) -> Multipliers:
-        funnel, n = self.before, self.jump.n
+        T = self._frame(k, s)
+        gap, guard, room = self._polynomials(vertex, Part(k, 0, 0), s, T)
+        try:
+            return _multipliers(room, gap, guard, self.basis, T)
+        except (Infeasible, SolverError) as error:
+            t = self.before.t
+            raise Infeasible(f"no multipliers at {t[k] + s * (t[k + 1] - t[k]):.6g} s") from error
+
+    def _frame(self, k: int, s: float) -> FloatArray:
+        """T (n, n) with W = ρ|z|² where x̄ = Tz, at s along interval k."""
+        funnel = self.before
         P = (1 - s) * funnel.P[k] + s * funnel.P[k + 1]
         rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
-        T = np.sqrt(rho) * np.linalg.inv(np.linalg.cholesky(P).T)
-        gap, guard, room = (_at(part, n) for part in self._polynomials(vertex, Part(k, 0, 0), s, T))
-        level, size = float(self.after.rho[0]), float(np.abs(guard.coefficients).max())
-        names = room.names
-        m = template("m", np.zeros((1, n), dtype=np.int64), names)
-        spread = Polynomial(2 * self.basis, np.ones(len(self.basis)), names)
-        inside = SumOfSquares(
-            room / level - m * spread, (gap / rho,), (guard / size,), 2 * self.half,
-            basis=self.basis, name="inside",
-        )  # fmt: skip
-        try:
-            found = solve(Program(names, (inside, NonNegative(MOST - m)), maximise=m))
-        except (Infeasible, SolverError) as error:
-            raise Infeasible(
-                f"no multipliers at {funnel.t[k] + s * (funnel.t[k + 1] - funnel.t[k]):.6g} s"
-            ) from error
-        identity, left = found["inside"], found.values["m[0]"]
-        gram = _placed(identity.gram.basis, identity.gram.Q, self.basis)
-        tau = _placed(identity.multipliers[0].basis, identity.multipliers[0].Q, self.sides)
-        mu = _coefficients(identity.equality_multipliers[0], self.rows)
-        around = [substitution(rows, np.linalg.inv(T)) for rows in (self.basis, self.sides, self.rows)]
-        of_v, of_side, of_row = around
-        return Multipliers(
-            level / rho * of_side.T @ tau @ of_side,
-            level / size * of_row.T @ mu,
-            level * of_v.T @ (gram + left * np.eye(len(gram))) @ of_v,
-            left,
-        )
+        return np.asarray(np.sqrt(rho) * np.linalg.inv(np.linalg.cholesky(P).T))
 
     def _polynomials(
         self, vertex: int, part: Part, end: float | None = None, T: FloatArray | None = None
@@ -213,7 +198,9 @@ class Crossing:
             if end is None:
                 return restrict(weighted(control[None]), level, index)
             degree = len(control) - 1
-            shares = [comb(degree, i) * end**i * (1 - end) ** (degree - i) for i in range(degree + 1)]
+            shares = [
+                comb(degree, i) * end**i * (1 - end) ** (degree - i) for i in range(degree + 1)
+            ]
             return np.tensordot(shares, control, 1)[None, None]
 
         funnel, after = self.before, self.after
@@ -236,7 +223,7 @@ class Crossing:
         for i, left in enumerate(away):
             weighed: Graded = {}
             for entry, right in zip(after.P[0, i].tolist(), away, strict=True):
-                weighed = add(weighed, {q: entry * values for q, values in right.items()})
+                weighed = add(weighed, _scaled(entry, right))
             room = add(room, negative(multiply(left, weighed, n)))
         return gap, guard, room
 
@@ -262,35 +249,55 @@ class Crossing:
         """The witness that sign g > 0 in the funnel before at a knot."""
         funnel, n = self.before, self.jump.n
         k, s = (knot, 0.0) if knot < len(funnel.t) - 1 else (knot - 1, 1.0)
-        P, rho = funnel.P[knot], float(funnel.rho[knot])
-        T = np.sqrt(rho) * np.linalg.inv(np.linalg.cholesky(P).T)
-        gap, guard, _ = (_at(part, n) for part in self._polynomials(0, Part(k, 0, 0), s, T))
-        half = max((self.jump.guard.degree + 1) // 2, 1)
-        basis, sides = monomials(n, range(half + 1)), monomials(n, range(half))
-        size, names = float(np.abs(guard.coefficients).max()), guard.names
-        m = template("m", np.zeros((1, n), dtype=np.int64), names)
-        spread = Polynomial(2 * basis, np.ones(len(basis)), names)
-        beside = SumOfSquares(
-            sign * guard / size - m * spread, (gap / rho,), degree=2 * half, basis=basis, name="side"
-        )
-        found = solve(Program(names, (beside, NonNegative(MOST - m)), maximise=m))
-        left = found.values["m[0]"]
-        if left <= 0:
+        basis = monomials(n, range(max((self.jump.guard.degree + 1) // 2, 1) + 1))
+        T = self._frame(k, s)
+        gap, guard, _ = self._polynomials(0, Part(k, 0, 0), s, T)
+        found = _multipliers(_scaled(sign, guard), gap, None, basis, T)
+        if found.room <= 0:
             raise Infeasible(
                 f"the guard is not {'above' if sign > 0 else 'below'} 0 on all of the funnel at "
                 f"{funnel.t[knot]:.6g} s, where it {'is watched from' if sign > 0 else 'ends'}"
             )
-        identity = found["side"]
-        tau = _placed(identity.multipliers[0].basis, identity.multipliers[0].Q, sides)
-        gram = _placed(identity.gram.basis, identity.gram.Q, basis) + left * np.eye(len(basis))
-        of_v, of_side = (substitution(rows, np.linalg.inv(T)) for rows in (basis, sides))
-        squares = multiplier(sides, size / rho * of_side.T @ tau @ of_side)
-        gap, guard, _ = self._polynomials(0, Part(k, 0, 0), s)
+        sides = basis[basis.sum(axis=1) < basis.sum(axis=1).max()]
+        squares = multiplier(sides, found.tau)
         stated = _squares(sides, matrices(squares["columns"], squares["squares"]))
-        signed: Graded = {q: sign * part for q, part in guard.items()}
-        c = add(signed, negative(multiply(stated, gap, n)))
-        Q = size * of_v.T @ gram @ of_v
-        return _witness(basis, c, np.array([Q, Q])) | {"tau": squares}
+        gap, guard, _ = self._polynomials(0, Part(k, 0, 0), s)
+        c = add(_scaled(sign, guard), negative(multiply(stated, gap, n)))
+        return _witness(basis, c, np.array([found.gram, found.gram])) | {"tau": squares}
+
+
+def _multipliers(
+    room: Graded, gap: Graded, guard: Graded | None, basis: IntArray, T: FloatArray
+) -> Multipliers:
+    """The most that room / size keeps above 0 where gap >= 0 and guard = 0, all in z of x̄ = Tz.
+
+    size: of the constant or the largest coefficient of `room`. τ has the monomials of the basis but
+    those of its highest degree. Raises Infeasible or SolverError if the program is not solved.
+    """
+    n, half = basis.shape[1], int(basis.sum(axis=1).max())
+    p, inside = _at(room, n), _at(gap, n)
+    level, rho = float(np.abs(p.coefficients).max()), inside.coefficient((0,) * n)
+    zero = () if guard is None else (_at(guard, n),)
+    size = [float(np.abs(g.coefficients).max()) for g in zero]
+    m = template("m", np.zeros((1, n), dtype=np.int64), p.names)
+    spread = Polynomial(2 * basis, np.ones(len(basis)), p.names)
+    equalities = tuple(g / by for g, by in zip(zero, size, strict=True))
+    squares = SumOfSquares(
+        p / level - m * spread, (inside / rho,), equalities, 2 * half, basis=basis, name="squares"
+    )
+    found = solve(Program(p.names, (squares, NonNegative(MOST - m)), maximise=m))
+    identity, left = found["squares"], found.values["m[0]"]
+    sides, A = basis[basis.sum(axis=1) < half], np.linalg.inv(T)
+    gram = _placed(identity.gram.basis, identity.gram.Q, basis) + left * np.eye(len(basis))
+    tau = _placed(identity.multipliers[0].basis, identity.multipliers[0].Q, sides)
+    of_v, of_side = substitution(basis, A), substitution(sides, A)
+    mu = np.zeros(0)
+    for g, by, found_mu in zip(zero, size, identity.equality_multipliers, strict=True):
+        rows = monomials(n, range(2 * half - g.degree + 1))
+        mu = level / by * substitution(rows, A).T @ _coefficients(found_mu, rows)
+    return Multipliers(
+        level / rho * of_side.T @ tau @ of_side, mu, level * of_v.T @ gram @ of_v, left
+    )
 
 
 def _witness(basis: IntArray, c: Graded, ends: FloatArray) -> Json:
@@ -318,8 +325,12 @@ def _composed(p: Polynomial, values: list[Graded], known: dict[tuple[int, ...], 
 
     result: Graded = {}
     for exponent, c in p.terms():
-        result = add(result, {q: float(c) * part for q, part in power(tuple(exponent[:n])).items()})
+        result = add(result, _scaled(float(c), power(tuple(exponent[:n]))))
     return result
+
+
+def _scaled(factor: float, p: Graded) -> Graded:
+    return {q: factor * part for q, part in p.items()}
 
 
 def _graded(rows: IntArray, ends: FloatArray) -> Graded:

@@ -1,8 +1,8 @@
 """Claim: funnels that pass into each other where a guard is met, by a reset of the state.
 
 F_a and F_b are funnels of their own dynamics and policies, each with its own clock. A jump from a
-to b has a guard g(x), watched from a knot t_w of F_a on, and a reset R(x, w) with w in a box, affine
-in each entry of w. It has to show
+to b has a guard g(x), watched from a knot t_w of F_a on, and a reset R(x, w), affine in each entry
+of w, which is in a box. It has to show
     g > 0 on F_a(t_w),    g < 0 at the end of F_a, and on every piece of time between them
     c(s, x̄) = ρ_b - |R(x, w) - b|²_{P_b} - τ (ρ - W) - μ g(x) > 0,    x = x₀ + x̄,
 for every x̄ and every vertex of w; b, P_b and ρ_b are those of the start of F_b, W = x̄'Px̄ and ρ
@@ -206,13 +206,12 @@ def _decide_side(
     (guard,) = ring.substituted([jump.guard], x)
     gap = funnel.rho[k + end] - ring.form(funnel.P[k + end], ring.variables)
     tau = expanded(read_witness(parts["tau"], ring), ring)
-    what = f"that the guard is {'above' if sign > 0 else 'below'} 0 at {text.exact(funnel.t[k + end])} s"
+    when, where = text.exact(funnel.t[k + end]), "above" if sign > 0 else "below"
+    what = f"that the guard is {where} 0 at {when} s"
     positive(sign * guard - tau * gap, read_squares(parts, ring), ring, what)
 
 
-def _assumptions(
-    jump: Jump, role: str, before: str, after: str, clock: Fraction
-) -> list[str]:
+def _assumptions(jump: Jump, role: str, before: str, after: str, clock: Fraction) -> list[str]:
     """What the jump assumes of the system."""
     start = text.exact(jump.start)
     found = [
@@ -221,7 +220,9 @@ def _assumptions(
         f"assumed, its clock at {text.exact(clock)} s"
     ]
     if jump.box:
-        ranges = (f"w{j} in [{text.exact(a)}, {text.exact(b)}]" for j, (a, b) in enumerate(jump.box))
+        ranges = (
+            f"w{j} in [{text.exact(a)}, {text.exact(b)}]" for j, (a, b) in enumerate(jump.box)
+        )
         found.append(f"{role}: {', '.join(ranges)}")
     if jump.expansion:
         found.append(

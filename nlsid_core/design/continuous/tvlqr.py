@@ -49,11 +49,13 @@ def tvlqr(
     R: ArrayLike,
     S_final: ArrayLike,
     gain: str = "constant",
+    stability: float = 0.0,
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
     Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
-    "linear" is continuous.
+    "linear" is continuous. stability: α in 1/s, A + αI/2 for A, so that linear solutions let
+    |x̄|²_S fall at least as exp(-αt) (Anderson and Moore, a prescribed degree of stability).
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
@@ -67,7 +69,7 @@ def tvlqr(
     def rate(t: float, S: FloatArray) -> FloatArray:
         A, B = _linearised(field, nominal, t)
         BS = B.T @ S
-        return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q))
+        return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q + stability * S))
 
     S = _backward(
         rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
@@ -91,9 +93,17 @@ def tvlqr(
 
 
 def lyapunov(
-    field: VectorField, policy: ContinuousPolicy, *, Q: ArrayLike, P_final: ArrayLike
+    field: VectorField,
+    policy: ContinuousPolicy,
+    *,
+    Q: ArrayLike,
+    P_final: ArrayLike,
+    stability: float = 0.0,
 ) -> FloatArray:
-    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
+    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2).
+
+    stability: α in 1/s, A + αI/2 for A.
+    """
     Q = definite(Q, field.n, "Q", strict=False)
     P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
@@ -101,7 +111,7 @@ def lyapunov(
     def rate(t: float, P: FloatArray) -> FloatArray:
         A, B = _linearised(field, nominal, t)
         closed = A - B @ policy.K(t)
-        return np.asarray(-(closed.T @ P + P @ closed + Q))
+        return np.asarray(-(closed.T @ P + P @ closed + Q + stability * P))
 
     return _backward(rate, nominal.t, P_final, "the Lyapunov equation")
 

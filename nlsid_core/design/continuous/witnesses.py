@@ -271,9 +271,7 @@ def fitted(basis: IntArray, grams: FloatArray) -> FloatArray:
     raise Infeasible(f"the Gram matrices of a piece need factors of degree above {MAX_DEGREE}")
 
 
-def gram_curves(
-    basis: IntArray, c: FloatArray, rows: IntArray, ends: FloatArray
-) -> FloatArray:
+def gram_curves(basis: IntArray, c: FloatArray, rows: IntArray, ends: FloatArray) -> FloatArray:
     """(B, N+1, k, k) control points of Q(s) with c = v'Qv, near to those linear between `ends`.
 
     c: (B, N+1, M) control points of the coefficients of `rows` (M, n). ends: (B, 2, k, k).
