@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.continuous.setting import DEFECT, limits_of
+from nlsid_core.design.continuous.setting import largest_defect, limits_of
 from nlsid_core.dynamics import Nominal, Rates, VectorField, cubic_through, linear_through
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.options import is_number, numbers
@@ -111,7 +111,7 @@ def plan_motion(
     while True:
         found = mesh.nominal(z)
         gaps = found.gaps(rates)
-        wanted = DEFECT * float(np.abs(found.x.derivative().control).max())
+        wanted = largest_defect(found)
         if (gaps <= GOOD * wanted).all() or (knots is not None and (gaps <= wanted).all()):
             return found
         worst = int(gaps.argmax())

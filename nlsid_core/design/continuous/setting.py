@@ -42,6 +42,7 @@ TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback r
 DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
+AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, in a state's unit a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,13 +240,18 @@ def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
             f"{field.m}"
         )
     gap, t, state = nominal.defect(field)
-    scale = float(np.abs(nominal.x.derivative().control).max())
-    if gap > DEFECT * max(scale, 1e-9):
+    if gap > largest_defect(nominal):
+        scale = float(np.abs(nominal.x.derivative().control).max())
         raise DataError(
             f"the nominal does not obey the dynamics: dx{state}/dt is off by {gap:.3g} at "
             f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
             "or more knots"
         )
+
+
+def largest_defect(nominal: Nominal) -> float:
+    """By how much ẋ₀ may miss the dynamics."""
+    return DEFECT * max(float(np.abs(nominal.x.derivative().control).max()), AT_REST)
 
 
 def refuse_saturated(policy: ContinuousPolicy) -> None:

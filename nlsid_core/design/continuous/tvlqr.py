@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
@@ -26,7 +27,9 @@ from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
 
-RTOL, ATOL = 1e-9, 1e-10  # of the integrations; P's interpolation error is far larger
+RTOL = 1e-9  # of S between knots, to √(S_ii S_jj); P's interpolation error is far larger
+EASY, MOST_STEPS = 1e-12, 256  # of the same: then fewer steps are tried next; of an interval
+GAUSS = 15**0.5 / 10  # of a step: from its middle to the outer two of Gauss's three points
 NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
 BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
 DIFFERENCE = 1e-5  # of a knot interval, for the slope of B: errors of 1e-10
@@ -66,13 +69,13 @@ def tvlqr(
         raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
     R_inverse = np.linalg.inv(R)
 
-    def rate(t: float, S: FloatArray) -> FloatArray:
+    def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        BS = B.T @ S
-        return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q + stability * S))
+        A = A + stability / 2 * np.eye(field.n)
+        return np.block([[A, -B @ R_inverse @ B.T], [-Q, -A.T]])
 
     S = _backward(
-        rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
+        hamiltonian, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
     )
 
     def gain_at(k: int, side: float) -> FloatArray:
@@ -87,7 +90,7 @@ def tvlqr(
         inner = (before[:-1] + after[1:]) / 2  # the dynamics of two intervals may differ a little
         K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
     else:
-        K = _cubic_gain(field, nominal, S, R_inverse, rate)
+        K = _cubic_gain(field, nominal, S, R_inverse, hamiltonian)
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
     return Tracking(policy, S)
 
@@ -108,12 +111,12 @@ def lyapunov(
     P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
 
-    def rate(t: float, P: FloatArray) -> FloatArray:
+    def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        closed = A - B @ policy.K(t)
-        return np.asarray(-(closed.T @ P + P @ closed + Q + stability * P))
+        closed = A - B @ policy.K(t) + stability / 2 * np.eye(field.n)
+        return np.block([[closed, np.zeros_like(closed)], [-Q, -closed.T]])
 
-    return _backward(rate, nominal.t, P_final, "the Lyapunov equation")
+    return _backward(hamiltonian, nominal.t, P_final, "the Lyapunov equation")
 
 
 def integrate_nominal(
@@ -188,17 +191,18 @@ def _cubic_gain(
     nominal: Nominal,
     S: FloatArray,
     R_inverse: FloatArray,
-    rate: Callable[[float, FloatArray], FloatArray],
+    hamiltonian: Callable[[float], FloatArray],
 ) -> PiecewisePolynomial:
     """K = R⁻¹B'S with its slopes R⁻¹(B'Ṡ + Ḃ'S), Ṡ from the Riccati equation."""
-    t = nominal.t
+    t, n = nominal.t, field.n
     step = DIFFERENCE * float(np.min(np.diff(t)))
     B, ahead, behind = (
         np.array([_linearised(field, nominal, float(s) + shift)[1] for s in t])
         for shift in (0.0, step, -step)
     )
     B_rate = (ahead - behind) / (2 * step)
-    S_rate = np.array([rate(float(s), S[k]) for k, s in enumerate(t)])
+    H = np.array([hamiltonian(float(s)) for s in t])
+    S_rate = H[:, n:, :n] + H[:, n:, n:] @ S - S @ H[:, :n, :n] - S @ H[:, :n, n:] @ S
     values = R_inverse @ B.transpose(0, 2, 1) @ S
     slopes = R_inverse @ (B.transpose(0, 2, 1) @ S_rate + B_rate.transpose(0, 2, 1) @ S)
     return cubic_through(t, values, slopes)
@@ -212,31 +216,51 @@ def _linearised(
 
 
 def _backward(
-    rate: Callable[[float, FloatArray], FloatArray], t: FloatArray, final: FloatArray, what: str
+    hamiltonian: Callable[[float], FloatArray], t: FloatArray, final: FloatArray, what: str
 ) -> FloatArray:
-    n = len(final)
+    """S (K, n, n) = Y X⁻¹ at t (K,), with d[X; Y]/dt = H(t) [X; Y] and S(t_f) = final."""
+    S = np.empty((len(t), *final.shape))
+    S[-1] = final
+    most, count = BLOW_UP * float(np.abs(final).max()), 1
+    for k in range(len(t) - 2, -1, -1):
+        rough, count = _stepped(hamiltonian, t[k : k + 2], S[k + 1], count), 2 * count
+        while True:
+            S[k] = _stepped(hamiltonian, t[k : k + 2], S[k + 1], count)
+            if not np.abs(S[k]).max() <= most:  # or is not a number
+                raise Infeasible(f"no bounded solution of {what} (at {t[k]:.4g} s)")
+            sizes = np.sqrt(np.diag(S[k]))
+            gap = float((np.abs(S[k] - rough) / sizes / sizes[:, None]).max())
+            if gap <= RTOL or count >= MOST_STEPS:
+                break
+            rough, count = S[k], 2 * count
+        count = max(1, count // (4 if gap <= EASY else 2))
+    return S
 
-    def flat(s: float, S: FloatArray) -> FloatArray:
-        return rate(s, S.reshape(n, n)).ravel()
 
-    def explodes(_: float, S: FloatArray) -> float:
-        return float(BLOW_UP * np.abs(final).max() - np.abs(S).max())
+def _stepped(
+    hamiltonian: Callable[[float], FloatArray], ends: FloatArray, S: FloatArray, count: int
+) -> FloatArray:
+    """S at the start of an interval from S at its end, in `count` steps of order 6.
 
-    explodes.terminal = True  # type: ignore[attr-defined]
-    solved: Any = solve_ivp(
-        flat,
-        (t[-1], t[0]),
-        final.ravel(),
-        t_eval=t[::-1],
-        method="DOP853",
-        rtol=RTOL,
-        atol=ATOL,
-        events=explodes,
-    )
-    if not solved.success or solved.y.shape[1] != len(t):
-        raise Infeasible(f"no bounded solution of {what} ({solved.message})")
-    S = solved.y.T[::-1].reshape(-1, n, n)
-    return np.asarray((S + S.transpose(0, 2, 1)) / 2)
+    Source: Blanes, Casas, Oteo and Ros, "The Magnus expansion and some of its applications", 2009,
+    (253) to (257), with Gauss's three points.
+    """
+    n, times = len(S), np.linspace(ends[1], ends[0], count + 1)
+    for start, end in itertools.pairwise(times.tolist()):
+        h, middle = end - start, (start + end) / 2
+        first, second, third = (h * hamiltonian(middle + h * side) for side in (-GAUSS, 0, GAUSS))
+        slope, bend = (third - first) / (2 * GAUSS), (third - 2 * second + first) / (2 * GAUSS**2)
+        inner = _commutator(second, slope)
+        outer = slope - _commutator(second, 2 * bend + inner) / 60
+        omega = second + bend / 12 + _commutator(inner - 20 * second - bend, outer) / 240
+        X, Y = np.split(expm(omega) @ np.vstack([np.eye(n), S]), [n])
+        S = np.linalg.solve(X.T, Y.T)
+        S = (S + S.T) / 2
+    return S
+
+
+def _commutator(A: FloatArray, B: FloatArray) -> FloatArray:
+    return A @ B - B @ A
 
 
 def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
