@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from tests.core.kernel.oracle_composition import agrees_alone
 from tests.core.kernel.oracle_continuous import (
     Degree,
     add,
@@ -24,6 +23,7 @@ from tests.core.kernel.oracle_continuous import (
     power,
     squares,
 )
+from tests.core.kernel.oracle_continuous import agrees as agrees_alone
 from tests.core.kernel.oracle_polynomial import P, left_over
 from tests.core.kernel.oracle_stability import solved
 
@@ -123,7 +123,8 @@ class Leap:
         stated, funnel, n = self.proof[name], self.before, self.n
         x = numbers(funnel["x"])
         centre = x[knot][0] if knot < len(x) else x[-1][-1]
-        shape, e = numbers(funnel["P"][knot]), [P.variable(n, i) for i in range(n)]
+        shape = numbers(funnel["P"][knot])
+        e: list[Any] = [P.variable(n, i) for i in range(n)]
         gap = Fraction(funnel["rho"][knot]) - dot(e, [dot(row, e) for row in shape])
         node = stated["tau"]
         tau = squares(node["basis"], node["columns"], node["squares"], Fraction(0), e)
@@ -170,8 +171,8 @@ class Leap:
                  for rows in zip(*ends, strict=True)]  # fmt: skip
         rho = bernstein(numbers(funnel["rho"][k : k + 2]), s)
         gap = rho - dot(e, [dot(row, e) for row in shape])
-        tau = squares(self.proof["sides"], *(piece["tau"][m] for m in ("columns", "squares")),
-                      sigma, e)  # fmt: skip
+        node = piece["tau"]
+        tau = squares(self.proof["sides"], node["columns"], node["squares"], sigma, e)
         mu = Fraction(0)
         lists = (piece["mu"][key] for key in ("shifts", "start", "end"))
         for row, shift, start, end in zip(self.proof["multiplier"], *lists, strict=True):
