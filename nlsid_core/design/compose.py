@@ -73,6 +73,7 @@ class Stage:
 
 
 def read_stage(number: int, path: Path) -> Stage:
+    """The funnel of a proof file and the files beside it; raises as `compose_funnels`."""
     document = files.load_document(path)
     claim = document.get("claim")
     about = claim.get("about") if isinstance(claim, dict) else None

@@ -421,6 +421,7 @@ def equation_document(p: Polynomial) -> Json:
 
 
 def read_equation(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+    """The polynomial of an `equation_document`; DocumentError says what is wrong with it."""
     if not isinstance(document, dict):
         raise DocumentError(f"{source}: expected an object, found {type(document).__name__}")
     rows = files.member(document, "exponents", list, source=source)
