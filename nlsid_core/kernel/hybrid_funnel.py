@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from itertools import chain, product
-from math import prod
 
 from . import text
 from .closed_loop import FunnelPart, read_multiplier
@@ -45,17 +44,6 @@ class Jump:
     expansion: str
     guard: Terms
     reset: list[Terms]
-
-    def at(self, w: tuple[Fraction, ...]) -> list[Terms]:
-        """The reset for one w: polynomials in x."""
-        rows = []
-        for entry in self.reset:
-            found: dict[tuple[int, ...], Fraction] = {}
-            for e, c in entry:
-                value = c * prod(a for a, used in zip(w, e[self.n :], strict=True) if used)
-                found[e[: self.n]] = found.get(e[: self.n], Fraction(0)) + value
-            rows.append(list(found.items()))
-        return rows
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -157,9 +145,9 @@ def _decide_jump(jump: Jump, stated: Node, before: Funnel, after: Funnel, work: 
     for name, k, index, sign in (("start", first, 0, 1), ("end", last - 1, 1, -1)):
         decide_side = partial(_decide_side, jump, before, (k, index), sign, parts[name])
         at_width(jump.n, work, decide_side)
+    if (last - first) * 2 ** len(jump.box) > MAX_PIECES:
+        raise Rejected(f"more than {MAX_PIECES} intervals times vertices")
     vertices = list(product(*jump.box))
-    if (last - first) * len(vertices) > MAX_PIECES:
-        raise Rejected(f"more than {MAX_PIECES} intervals and vertices")
     needed = [(k, v, ()) for k, v in product(range(first, last), range(len(vertices)))]
     order, pieces = in_order(parts["pieces"], "tau mu", needed, 0, work)
     multiplier = parts["multiplier"].monomials(jump.n)
@@ -167,7 +155,8 @@ def _decide_jump(jump: Jump, stated: Node, before: Funnel, after: Funnel, work: 
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, _), level, index, i = order[number]
         part, piece = FunnelPart(ring, before, (k, level, index)), pieces[i]
-        guard, *reached = ring.substituted([jump.guard, *jump.at(vertices[v])], part.states)
+        known = [*part.states, *map(ring.made, vertices[v])]
+        guard, *reached = ring.substituted([jump.guard, *jump.reset], known)
         tau = piece["tau"].members("columns squares") | {"basis": parts["sides"]}
         taken = expanded(read_squares(tau, ring), ring) * part.gap
         taken += read_multiplier(piece["mu"], multiplier, ring) * guard

@@ -198,6 +198,18 @@ def test_jumps_and_stages_go_together() -> None:
     assert "should be a list of 1 to 50 entries" in refusal(forged)
 
 
+def test_vertices_are_counted_before_they_are_listed() -> None:
+    """32 entries of w have 2^32 vertices."""
+    forged = case("switch")
+    jump = forged.about["jump1.json"]
+    jump["uncertain"] = [[-1.0, 1.0]] * 32
+    jump["reset"] = [{"exponents": [[1] + [0] * 32], "coefficients": [1.0]}]
+    mutations.bind_again(forged)
+    contents = {name: files.encode(about) for name, about in forged.about.items()}
+    with pytest.raises(Rejected, match="jump1: more than 100000 intervals times vertices"):
+        kernel.decide(files.encode(forged.document), contents.__getitem__)
+
+
 def test_a_stage_with_a_hold_is_refused() -> None:
     forged = case("cycle")
     forged.about["stage1.proof.json"]["claim"]["hold"] = 0.01
