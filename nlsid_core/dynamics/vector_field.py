@@ -305,7 +305,7 @@ class VectorField:
             "breaks": self.breaks.tolist(),
             "valid": self.valid.tolist(),
             "expansion": self.expansion,
-            "pieces": [[_written(p) for p in part] for part in self.pieces],
+            "pieces": [[equation_document(p) for p in part] for part in self.pieces],
         }
 
     @classmethod
@@ -323,7 +323,7 @@ class VectorField:
         for part in files.member(document, "pieces", list, source=source):
             if not isinstance(part, list):
                 raise DocumentError(f"{source}: a piece should be a list of equations")
-            pieces.append(tuple(_read(p, names, source=f"{source} equation") for p in part))
+            pieces.append(tuple(read_equation(p, names, source=f"{source} equation") for p in part))
         breaks = files.array(document, "breaks", (None,), source=source)
         rows = files.member(document, "valid", list, source=source)
         valid = files.array(document, "valid", (len(rows), None), source=source)
@@ -416,7 +416,7 @@ def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntAr
     return exponents, table
 
 
-def _written(p: Polynomial) -> Json:
+def equation_document(p: Polynomial) -> Json:
     """Distinct monomials in increasing order; a coefficient that is no float64 as "p/q"."""
     order = [k for k in np.lexsort(p.exponents.T[::-1]).tolist() if p.coefficients[k]]
     exact = [Fraction(p.coefficients[k]) for k in order]
@@ -429,7 +429,8 @@ def _written(p: Polynomial) -> Json:
     }
 
 
-def _read(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+def read_equation(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+    """The polynomial of an `equation_document`; DocumentError says what is wrong with it."""
     if not isinstance(document, dict):
         raise DocumentError(f"{source}: expected an object, found {type(document).__name__}")
     rows = files.member(document, "exponents", list, source=source)

@@ -133,6 +133,7 @@ def prepare(
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
     decay: float | None = None,
+    stability: float = 0.0,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -148,7 +149,8 @@ def prepare(
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
-    given, tracking = policy is not None, _tracking(field, nominal, wanted, policy, Q, R, gain)
+    given = policy is not None
+    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain, stability)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
@@ -303,6 +305,7 @@ def _tracking(
     Q: FloatArray,
     R: FloatArray,
     gain: str,
+    stability: float,
 ) -> Tracking:
     """ContinuousPolicy and P(t): of the LQR, or the given policy with its Lyapunov equation."""
     if goal is not None:
@@ -319,13 +322,13 @@ def _tracking(
                 "and a policy."
             ) from error
     if policy is None:
-        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain, stability=stability)
     if policy.vector_field != files.digest(field.document()):
         raise DataError("the policy was made for other dynamics")
     same = np.array_equal(policy.x.control, nominal.x.control)
     if not same or not np.array_equal(policy.t, nominal.t):
         raise DataError("the policy is around another nominal")
-    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
+    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final, stability=stability))
 
 
 def _kept(
