@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from nlsid_core import files, proofs
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.design.compose import Stage, read_stage, write_beside
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.jump_pieces import Crossing
@@ -96,6 +96,8 @@ def goal_before(
     dynamics: VectorField | Callable[..., Any],
     nominal: Nominal,
     inlet: Goal,
+    *,
+    uncertain: ArrayLike | None = None,
 ) -> Goal:
     """Where a motion is to end that jumps into `inlet`, to first order in the deviation from it.
 
@@ -103,6 +105,7 @@ def goal_before(
     motion as if nothing happened. A solution beside it crosses earlier or later; what it is there,
     but for a shift along the flow, the reset takes into the inlet, such as `Goal.start_of` the
     funnel after. Along the flow the goal is as wide as leaves all of it beyond the guard.
+    uncertain: rows (low, high) of w if the dynamics are a function of it: it is at the centre.
 
     Raises DataError if the motion does not cross the guard, or ends before it.
     """
@@ -117,7 +120,7 @@ def goal_before(
         )
     rates = dynamics
     if not isinstance(dynamics, VectorField):
-        rates = Rates.numeric(dynamics, n, nominal.u.control.shape[2])
+        rates = Rates.numeric(dynamics, n, nominal.u.control.shape[2], uncertain)
     x, flow = nominal.x(when), nominal.x.derivative()(when)
     guard, reset = jump.slopes(x)
     to_guard = np.eye(n) - np.outer(flow, guard) / (guard @ flow)

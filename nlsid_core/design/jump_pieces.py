@@ -158,6 +158,25 @@ class Crossing:
             "mu": stated,
         } | {key: found[key] for key in ("columns", "squares")}
 
+    def _elsewhere(self) -> str:
+        """To first order: a knot at which it is above 0, or how narrow the funnel has to be."""
+        funnel = self.before
+        shares = []
+        for points, P, rho in zip(funnel.x.control, funnel.P, funnel.rho, strict=False):
+            slope = self.jump.slopes(points[0])[0]
+            reach = np.sqrt(rho * (slope @ np.linalg.solve(P, slope)))
+            shares.append(float(self.jump.height(points[:1])[0]) / max(float(reach), 1e-300))
+        above = np.flatnonzero(np.array(shares) > 1)
+        if len(above):
+            return f"; to first order it is at {float(funnel.t[above[-1]])!r} s"
+        best = int(np.argmax(shares))
+        if shares[best] <= 0:
+            return "; nor is it on the motion at any knot"
+        return (
+            f"; to first order a funnel {shares[best]:.2g} times as wide would do at "
+            f"{float(funnel.t[best])!r} s: take a goal so much narrower"
+        )
+
     def _said(self, part: Part) -> str:
         k, (a, b) = part.interval, part.ends()
         first, h = self.before.t[k], self.before.t[k + 1] - self.before.t[k]
@@ -256,7 +275,8 @@ class Crossing:
         if found.room <= 0:
             raise Infeasible(
                 f"the guard is not {'above' if sign > 0 else 'below'} 0 on all of the funnel at "
-                f"{funnel.t[knot]:.6g} s, where it {'is watched from' if sign > 0 else 'ends'}"
+                f"{funnel.t[knot]:.6g} s, where it "
+                f"{f'is watched from{self._elsewhere()}' if sign > 0 else 'ends'}"
             )
         sides = basis[basis.sum(axis=1) < basis.sum(axis=1).max()]
         squares = multiplier(sides, found.tau)

@@ -1,6 +1,7 @@
 """Funnels that jump into each other: what is proved is true on the guard, and forgeries are not."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ import pytest
 
 from nlsid_core import files, kernel
 from nlsid_core.arrays import Json
-from nlsid_core.design import compose_jumps
+from nlsid_core.design import Goal, compose_jumps, goal_before, integrate_nominal
+from nlsid_core.dynamics import Jump, VectorField
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import Rejected
 from nlsid_core.proofs import check
@@ -52,6 +54,42 @@ def test_a_jump_is_proved_exactly_where_it_leads_into_the_next_funnel(
     else:
         with pytest.raises(Infeasible, match=r"jump 1: .* between \d"):
             compose_jumps([first], [jump(1.0 + off)], tmp_path / "whole")
+
+
+def test_a_guard_that_is_watched_where_it_may_be_met_names_what_would_do(tmp_path: Path) -> None:
+    """The guard is x: it is above 0 where the centre is more than the half-width."""
+    first = saved(falling, 1.0, [0.0, 0.5, 0.85, 1.2], 0.1, tmp_path / "first")
+    found = files.load_document(first.with_name("funnel.json"))
+    above = [
+        t for t, x, P, rho in zip(found["t"], found["x"], found["P"], found["rho"], strict=False)
+        if x[0][0] > (rho / P[0][0]) ** 0.5
+    ]  # fmt: skip
+    late = replace(jump(1.0), start=0.85)
+    with pytest.raises(
+        Infeasible, match=rf"at 0\.85 s, .*; to first order it is at {above[-1]} s$"
+    ):
+        compose_jumps([first], [late], tmp_path / "whole")
+    higher = Jump.of(lambda x: [x[0] - 0.9], lambda x: [x[0]], 1, start=0.5)
+    share = max(
+        (x[0][0] - 0.9) / (rho / P[0][0]) ** 0.5
+        for x, P, rho in zip(found["x"], found["P"], found["rho"], strict=False)
+    )
+    with pytest.raises(Infeasible, match=rf"a funnel {share:.2g} times as wide would do at 0\.0 s"):
+        compose_jumps([first], [higher], tmp_path / "whole")
+    beyond = Jump.of(lambda x: [x[0] - 2], lambda x: [x[0]], 1, start=0.5)
+    with pytest.raises(Infeasible, match="nor is it on the motion at any knot"):
+        compose_jumps([first], [beyond], tmp_path / "whole")
+
+
+def test_a_goal_before_a_jump_takes_w_at_its_centre() -> None:
+    field = VectorField.from_function(falling, 1, 0)
+    motion = integrate_nominal(field, lambda _: np.zeros(0), t=[0.0, 0.5, 1.2], start=[1.0])
+    inlet = Goal([1.0], [[1e4]])
+    alone = goal_before(jump(1.0), field, motion, inlet)
+    pushed = goal_before(
+        jump(1.0), lambda x, w: [falling(x)[0] + w[0]], motion, inlet, uncertain=[[-0.1, 0.1]]
+    )
+    assert pytest.approx(alone.P, rel=1e-6) == pushed.P
 
 
 @pytest.mark.parametrize("name", ["switch", "cycle"])
