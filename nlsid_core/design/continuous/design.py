@@ -27,6 +27,7 @@ from nlsid_core.design.continuous.finer import (
 )
 from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
+from nlsid_core.design.continuous.held_sweep import held_sweep, widths_by_size
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
@@ -50,7 +51,7 @@ from nlsid_core.progress import Progress, silent
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
-SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
+SCALES = (1.0, 0.8, 0.5)  # of ρ as it is expected with a hold: where the input's rate is bounded
 GROWTH = 4.0  # of the margin, where some piece is not proved
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
@@ -364,10 +365,13 @@ def _found(setting: Setting, progress: Progress) -> _Found:
     if hold.shortest > span:
         raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
 
-    known: dict[float, Changes] = {}
+    changes = None
+    if hold.period:
+        outer = ContinuousFunnel(setting.policy.x, setting.P, free, "", "")
+        changes = Changes.of(_with_widths(setting), setting.policy, outer)
 
     def held(period: float) -> _Found:
-        return _held(setting, expansion, replace(hold, period=period), known, progress)
+        return _held(setting, expansion, replace(hold, period=period), changes, progress)
 
     if not hold.longest:
         return held(hold.period)
@@ -392,57 +396,44 @@ def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
     return found
 
 
+def _with_widths(setting: Setting, field: VectorField | None = None) -> LSteps:
+    """The setting's L-steps, of its field or this one, with what an input is off: nothing yet."""
+    steps, policy = setting.steps, setting.policy
+    field = field or steps.field
+    return LSteps(
+        field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
+    )  # fmt: skip
+
+
 def _held(
-    setting: Setting, expansion: Expansion | None, hold: Hold, known: dict[float, Changes],
+    setting: Setting, expansion: Expansion | None, hold: Hold, changes: Changes | None,
     progress: Progress,
 ) -> _Found:  # fmt: skip
-    """The funnel for one hold, within scaled copies of the free one.
+    """The funnel for one hold, in the one that a sweep expects, or in a smaller copy of that.
 
-    A smaller copy has its own expansion, which leaves out less and has room for what is held.
-    known: by scale, what does not depend on the hold; it is added to.
+    changes: of the free funnel; None without a hold.
     """
-    steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
-    free = setting.free
-    assert free is not None
-    widths: FloatArray = np.zeros((len(P) - 1, field.m))
-    t = policy.t
-    reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
-    for scale in SCALES:
-        if expansion is not None and scale < 1:
-            rho = scale * free
-            field = field_of(
-                [
-                    expansion.around(policy, P, k, (rho[k], rho[k + 1]), scale**0.5 * widths[k])
-                    for k in range(len(P) - 1)
-                ],
-                policy.t,
-            )
-            policy = replace(policy, vector_field=files.digest(field.document()))
-        outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
-        held = LSteps(
-            field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            widths=np.zeros((len(P) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
-        )  # fmt: skip
-        rates: FloatArray = np.zeros(widths.shape)
-        widths = hold.widths(policy, rates)
-        if hold.period:
-            changes = known.get(scale) if field is steps.field else None
-            if changes is None:
-                changes = Changes.of(held, policy, outer)
-            if field is steps.field:
-                known[scale] = changes
-            rates, widths = fastest(changes, policy, hold)
-        held.widths = widths
-        setting = replace(setting, steps=held, policy=policy, hold=hold, rates=rates)
-        try:
-            caps = validity_caps(field, policy, P, widths)
-            return _swept(setting, np.minimum(caps, outer.rho), progress)
-        except (Infeasible, DataError) as error:
-            refusal = error
-        if isinstance(refusal, NoFunnel):
-            if refusal.diagnosis.t >= reached:  # a smaller copy gets no farther back in time
-                break
-            reached = refusal.diagnosis.t
+    policy = setting.policy
+    try:
+        rho, field = held_sweep(setting, expansion, hold, changes, progress)
+        policy = replace(policy, vector_field=files.digest(field.document()))
+        steps = _with_widths(replace(setting, policy=policy), field)
+        for scale in SCALES:
+            outer = ContinuousFunnel(policy.x, setting.P, scale * rho, policy.vector_field, "")
+            rates: FloatArray = np.zeros((len(rho) - 1, field.m))
+            widths = hold.widths(policy, rates)
+            if hold.period:
+                rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
+            steps.widths = widths
+            held = replace(setting, steps=steps, policy=policy, hold=hold, rates=rates)
+            try:
+                caps = validity_caps(field, policy, setting.P, widths)
+                return _swept(held, np.minimum(caps, outer.rho), progress)
+            except (Infeasible, DataError) as error:
+                refusal = error
+    except Infeasible as error:
+        refusal, widths = error, widths_by_size(changes, setting, hold)[-1]
     k, i = np.unravel_index(np.argmax(widths), widths.shape)
     off = f"input {i} is then off by up to {widths[k, i]:.3g} at {policy.t[k]:.3g} s"
     if not hold.period:
@@ -515,7 +506,7 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> _Found:
 
     def search(margin: float) -> tuple[Setting, FloatArray, list[Ends] | None]:
         found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
-                          progress=progress)  # fmt: skip
+                          expected=setting.rates is not None, progress=progress)  # fmt: skip
         return setting, *found
 
     return proved_for(setting, rho_final, search)

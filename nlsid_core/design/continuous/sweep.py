@@ -38,12 +38,14 @@ def sweep_rho(
     margin: float,
     rho_final: float = 1.0,
     caps: FloatArray | None = None,
+    expected: bool = False,
     progress: Progress = silent,
 ) -> tuple[FloatArray, list[Ends]]:
     """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
 
     instants: per interval its start, its end and, between them, others where ρ has to hold too.
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below;
+    expected: whether it is likely to be there, and tried there first.
     Raises Infeasible naming the time.
     """
     rho = np.empty(len(instants) + 1)
@@ -63,8 +65,8 @@ def sweep_rho(
             cap = min(cap, float(caps[k]))
         for section in between:
             share = (section.t - start.t) / h
-            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end)
-        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end)
+            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end, expected)
+        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end, expected)
         ends.append(Ends(at_start, at_end))
         duals = at_start
         progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
@@ -80,6 +82,7 @@ def _largest(
     cap: float,
     margin: float,
     duals: list[SphereSolution],
+    expected: bool,
 ) -> tuple[float, list[SphereSolution]]:
     """The largest ρ_k ≤ cap with which the L-step at s = share leaves the margin, and that L-step.
 
@@ -99,8 +102,11 @@ def _largest(
         if cap <= LOWEST * after:
             break
         known = duals
-        rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
-                    LOWEST * after, min(cap, infeasible))  # fmt: skip
+        if expected and infeasible > cap:
+            rho = cap
+        else:
+            rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
+                        LOWEST * after, min(cap, infeasible))  # fmt: skip
         if best is not None and rho <= feasible:
             break
         least = -ACCEPT * margin - slack(rho, 0.0)
