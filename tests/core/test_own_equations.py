@@ -65,8 +65,8 @@ def test_the_page_writes_a_problem_for_the_command_line(
     exec(code, {})
     ended = CliRunner().invoke(app, ["funnel", "--problem", "spring.json", "--out", "spring"])
     assert ended.exit_code == 0, ended.output
-    assert "is applied every 0.032 s or more often" in ended.output
-    assert "with a hold of 0.032 s, 0.165 of the half-widths are left" in ended.output
+    assert "is applied every 0.0452548" in ended.output
+    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in ended.output
 
 
 @pytest.mark.slow

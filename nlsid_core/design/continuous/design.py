@@ -52,6 +52,7 @@ RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
 SCALES = (1.0, 0.8, 0.5)  # of ρ as it is expected with a hold: where the input's rate is bounded
+STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 GROWTH = 4.0  # of the margin, where some piece is not proved
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
@@ -375,25 +376,26 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
     if not hold.longest:
         return held(hold.period)
-    return _longest(hold, held)
+    return _longest(held)
 
 
-def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
-    """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
-    with suppress(Infeasible):
-        return held(LONGEST)
-    period, found = hold.period, None
-    while found is None:
+def _longest(held: Callable[[float], _Found]) -> _Found:
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for.
+
+    It is looked for in larger and larger steps, and then between the last two.
+    """
+    shorter = -1
+    for step in STEPS:
         try:
-            found = held(period)
-        except Infeasible:
-            if period <= hold.shortest:
-                raise
-            period /= 2**0.5
-    if period == hold.period:
-        with suppress(Infeasible):
-            return held(2**0.5 * period)
-    return found
+            found = held(LONGEST / 2 ** (step / 2))
+        except Infeasible as error:
+            refusal, shorter = error, step
+            continue
+        for between in range(shorter + 1, step):
+            with suppress(Infeasible):
+                return held(LONGEST / 2 ** (between / 2))
+        return found
+    raise refusal
 
 
 def _with_widths(setting: Setting, field: VectorField | None = None) -> LSteps:

@@ -38,7 +38,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 
 MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
 ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
-FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
+LONGEST, SHORTEST = 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
 LARGEST_RATIO = 0.5  # of a change to the last, whose geometric series is taken in one step
 SETTLED = 1.005  # of the rates before: ROOM holds what is left
@@ -72,7 +72,7 @@ class Hold:
             bounds = np.full(n, np.nan)
         if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
             raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
-        period = hold if isinstance(hold, float) else FIRST if longest else 0.0
+        period = hold if isinstance(hold, float) else LONGEST if longest else 0.0
         return cls(period, bounds, longest)
 
     @property

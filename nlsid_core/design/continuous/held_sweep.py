@@ -24,9 +24,7 @@ from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
 SIZES = np.array([0.03, 0.25, 0.5, 0.75, 1.0])  # of half-widths: between them W is nearly linear
-MOST_BACK = (
-    2  # of ρ at an interval's end: a smaller one is no help where an input's push is too large
-)
+MOST_BACK = 2  # of ρ at an interval's end: where inputs push too much, a smaller one is no help
 
 
 class HeldSteps(LSteps):
@@ -60,8 +58,10 @@ class HeldSteps(LSteps):
         start: list[SphereSolution] | None = None,
         *,
         least: float = -np.inf,
+        enough: float = np.inf,
     ) -> list[SphereSolution]:
         """φ for the cases that `start` does not bound above one that is solved; else that bound."""
+        del enough  # of what decides, all is
         if start is None:
             return super().solve(section, rho)
         bounds = self.bounds(section, rho, start, range(self.cases))

@@ -56,7 +56,10 @@ def sweep_rho(
         start, *between, end = instants[k]
         h = end.t - start.t
         steps.bound_pushes(end, rho[k + 1])
-        at_end = steps.solve(end, rho[k + 1], duals)
+        wanted = (
+            (caps[k] / rho[k + 1] - 1) / h + margin if expected and caps is not None else np.inf
+        )
+        at_end = steps.solve(end, rho[k + 1], duals, enough=wanted)
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))
         if cap <= LOWEST * rho[k + 1]:  # ρ̇ cannot be large enough for this end
@@ -110,7 +113,8 @@ def _largest(
         if best is not None and rho <= feasible:
             break
         least = -ACCEPT * margin - slack(rho, 0.0)
-        found = steps.solve(section, here(rho), duals, least=least)
+        enough = -slack(rho, 0.0) if expected else np.inf
+        found = steps.solve(section, here(rho), duals, least=least, enough=enough)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
             if (exact and not limited) or rho >= cap:  # else `predicted` may be too low
