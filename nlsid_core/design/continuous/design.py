@@ -27,7 +27,12 @@ from nlsid_core.design.continuous.finer import (
 )
 from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
-from nlsid_core.design.continuous.held_sweep import held_sweep, widths_by_size
+from nlsid_core.design.continuous.held_sweep import (
+    changes_by_size,
+    held_sweep,
+    widths_by_size,
+    with_widths,
+)
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
@@ -51,7 +56,7 @@ from nlsid_core.progress import Progress, silent
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
-SCALES = (1.0, 0.8, 0.5)  # of ρ as it is expected with a hold: where the input's rate is bounded
+SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 GROWTH = 4.0  # of the margin, where some piece is not proved
 FINER = ("knots", "remainder")  # what is less where knots are closer
@@ -366,10 +371,7 @@ def _found(setting: Setting, progress: Progress) -> _Found:
     if hold.shortest > span:
         raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
 
-    changes = None
-    if hold.period:
-        outer = ContinuousFunnel(setting.policy.x, setting.P, free, "", "")
-        changes = Changes.of(_with_widths(setting), setting.policy, outer)
+    changes = changes_by_size(setting, expansion) if hold.period else {}
 
     def held(period: float) -> _Found:
         return _held(setting, expansion, replace(hold, period=period), changes, progress)
@@ -398,44 +400,39 @@ def _longest(held: Callable[[float], _Found]) -> _Found:
     raise refusal
 
 
-def _with_widths(setting: Setting, field: VectorField | None = None) -> LSteps:
-    """The setting's L-steps, of its field or this one, with what an input is off: nothing yet."""
-    steps, policy = setting.steps, setting.policy
-    field = field or steps.field
-    return LSteps(
-        field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
-    )  # fmt: skip
-
-
 def _held(
-    setting: Setting, expansion: Expansion | None, hold: Hold, changes: Changes | None,
+    setting: Setting, expansion: Expansion | None, hold: Hold, changes: dict[float, Changes],
     progress: Progress,
 ) -> _Found:  # fmt: skip
-    """The funnel for one hold, in the one that a sweep expects, or in a smaller copy of that.
+    """The funnel for one hold, in one that a sweep expects within scaled copies of the free one.
 
-    changes: of the free funnel; None without a hold.
+    changes: of the free funnel by size; empty without a hold.
     """
-    policy = setting.policy
-    try:
-        rho, field = held_sweep(setting, expansion, hold, changes, progress)
-        policy = replace(policy, vector_field=files.digest(field.document()))
-        steps = _with_widths(replace(setting, policy=policy), field)
-        for scale in SCALES:
-            outer = ContinuousFunnel(policy.x, setting.P, scale * rho, policy.vector_field, "")
-            rates: FloatArray = np.zeros((len(rho) - 1, field.m))
+    policy, free, t = setting.policy, setting.free, setting.policy.t
+    assert free is not None
+    reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
+    table = widths_by_size(changes, setting, hold)
+    widths = table[-1]
+    for scale in SCALES:
+        try:
+            rho, field = held_sweep(setting, expansion, table, scale * free, progress)
+            policy = replace(policy, vector_field=files.digest(field.document()))
+            outer = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, "")
+            steps = with_widths(replace(setting, policy=policy), field)
+            rates: FloatArray = np.zeros(widths.shape)
             widths = hold.widths(policy, rates)
             if hold.period:
                 rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
             steps.widths = widths
+            caps = validity_caps(field, policy, setting.P, widths)
             held = replace(setting, steps=steps, policy=policy, hold=hold, rates=rates)
-            try:
-                caps = validity_caps(field, policy, setting.P, widths)
-                return _swept(held, np.minimum(caps, outer.rho), progress)
-            except (Infeasible, DataError) as error:
-                refusal = error
-    except Infeasible as error:
-        refusal, widths = error, widths_by_size(changes, setting, hold)[-1]
+            return _swept(held, np.minimum(caps, rho), progress)
+        except (Infeasible, DataError) as error:
+            refusal = error
+        if isinstance(refusal, NoFunnel):
+            if refusal.diagnosis.t >= reached:  # a smaller copy gets no farther back in time
+                break
+            reached = refusal.diagnosis.t
     k, i = np.unravel_index(np.argmax(widths), widths.shape)
     off = f"input {i} is then off by up to {widths[k, i]:.3g} at {policy.t[k]:.3g} s"
     if not hold.period:

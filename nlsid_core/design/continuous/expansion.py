@@ -187,17 +187,18 @@ def sweep_expanded(
     *,
     margin: float,
     rho_final: float,
+    caps: FloatArray | None = None,
     most_back: int = MAX_BACK,
     progress: Progress = silent,
 ) -> Swept:
     """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
 
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. most_back: how often ρ at an interval's end is
-    lowered for its start. Raises Infeasible naming the earliest time that was reached, and why it
-    was not passed where least was missing.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below. most_back: how
+    often ρ at an interval's end is lowered for its start. Raises Infeasible naming the earliest
+    time that was reached, and why it was not passed where least was missing.
     """
     K = len(P)
-    rho, caps = np.full(K, rho_final), np.full(K, np.inf)
+    rho, caps = np.full(K, rho_final), np.full(K, np.inf) if caps is None else caps.copy()
     ends: dict[int, Ends] = {}
     k, back = K - 2, 0
     farthest, refusal, left = K, Infeasible(""), -np.inf

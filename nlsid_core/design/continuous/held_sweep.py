@@ -20,10 +20,12 @@ from nlsid_core.design.continuous.shape import validity_caps
 from nlsid_core.design.continuous.sweep import sweep_rho
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.dynamics.vector_field import VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
 SIZES = np.array([0.03, 0.25, 0.5, 0.75, 1.0])  # of half-widths: between them W is nearly linear
+EXPANDED = (1.0, 0.5, 0.25)  # of these: copies of the free funnel with cubics of their own
 MOST_BACK = 2  # of ρ at an interval's end: where inputs push too much, a smaller one is no help
 
 
@@ -76,38 +78,69 @@ class HeldSteps(LSteps):
         return found
 
 
-def widths_by_size(changes: Changes | None, setting: Setting, hold: Hold) -> FloatArray:
-    """(SIZES, intervals, m) W in copies of the funnel that `changes` is of; None if all is one."""
-    policy = setting.policy
-    if changes is None:
-        same = hold.widths(policy, np.zeros((len(policy.t) - 1, setting.steps.field.m)))
-        return np.tile(same, (len(SIZES), 1, 1))
-    return np.array([fastest(changes, policy, hold, size)[1] for size in SIZES.tolist()])
+def with_widths(setting: Setting, field: VectorField) -> LSteps:
+    """The setting's L-steps, of this field, with what an input is off: nothing yet."""
+    steps, policy = setting.steps, setting.policy
+    return LSteps(
+        field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
+    )  # fmt: skip
+
+
+def changes_by_size(setting: Setting, expansion: Expansion | None) -> dict[float, Changes]:
+    """dũ/dt in the free funnel, and in smaller copies where these have cubics of their own.
+
+    A key is a copy's half-widths over those of the free funnel.
+    """
+    free, policy, P = setting.free, setting.policy, setting.P
+    assert free is not None  # a search for a hold begins without one
+    found = {}
+    for size in (1.0,) if expansion is None else EXPANDED:
+        rho, field = size**2 * free, setting.steps.field
+        if expansion is not None and size < 1:
+            cubics = [expansion.around(policy, P, k, (rho[k], rho[k + 1]))
+                      for k in range(len(P) - 1)]  # fmt: skip
+            field = field_of(cubics, policy.t)
+        outer = ContinuousFunnel(policy.x, P, rho, "", "")
+        found[size] = Changes.of(with_widths(setting, field), policy, outer)
+    return found
+
+
+def widths_by_size(changes: dict[float, Changes], setting: Setting, hold: Hold) -> FloatArray:
+    """(SIZES, intervals, m) W in copies of the free funnel; without `changes` all is one."""
+    policy, found = setting.policy, []
+    for size in SIZES.tolist():
+        least = min((known for known in changes if known >= size), default=None)
+        if least is None:
+            found.append(hold.widths(policy, np.zeros((len(policy.t) - 1, setting.steps.field.m))))
+        else:
+            found.append(fastest(changes[least], policy, hold, size / least)[1])
+    return np.array(found)
 
 
 def held_sweep(
     setting: Setting,
     expansion: Expansion | None,
-    hold: Hold,
-    changes: Changes | None,
+    table: FloatArray,
+    caps: FloatArray,
     progress: Progress = silent,
 ) -> tuple[FloatArray, VectorField]:
     """ρ (K,) that may be expected with this hold, and the field for it, expanded around it.
 
-    changes: of the funnel without a hold, `setting.free`; None without a hold. Raises Infeasible.
+    table: see `HeldSteps`. caps: (K,) that ρ keeps below. Raises Infeasible.
     """
     free, policy, P = setting.free, setting.policy, setting.P
     assert free is not None  # a search for a hold begins without one
-    table = widths_by_size(changes, setting, hold)
     steps = HeldSteps(setting.steps, setting, free, table)
-    rho_final = min(setting.rho_final, float(free[-1]))
+    rho_final = min(setting.rho_final, float(caps[-1]))
     margin = setting.margin(rho_final)
     if expansion is not None:
         steps.field = expansion.linear()
         found = sweep_expanded(expansion, steps, policy, P, margin=margin, rho_final=rho_final,
-                               most_back=MOST_BACK, progress=progress)  # fmt: skip
+                               caps=caps, most_back=MOST_BACK, progress=progress)  # fmt: skip
         return found.rho, field_of(found.cubics, policy.t)
-    caps = np.minimum(validity_caps(steps.field, policy, P), free)
+    caps = np.minimum(validity_caps(steps.field, policy, P), caps)
+    rho_final = min(rho_final, float(caps[-1]))
     rho, _ = sweep_rho(steps, sections(steps, policy, P), margin=margin, rho_final=rho_final,
                        caps=caps, progress=progress)  # fmt: skip
     return rho, steps.field
