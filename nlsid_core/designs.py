@@ -26,6 +26,7 @@ POLICY = "policy.json"
 FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
 COMPOSITION = "composition.proof.json"  # of funnels that follow each other, its stages beside it
+HYBRID = "hybrid.proof.json"  # of funnels that jump into each other, stages and jumps beside it
 
 D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
 P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)

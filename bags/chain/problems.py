@@ -26,7 +26,8 @@ from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
 MEMBERS = ("format", "version", "shape", "gain", "search_gain", "objective", "vector_field",
-           "nominal", "goal", "Q", "R", "limits", "hold", "error", "decay", "push")  # fmt: skip
+           "nominal", "goal", "Q", "R", "limits", "hold", "error", "decay", "push",
+           "stability")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,7 @@ class FunnelProblem:
     decay: float | None = None
     push: MeasuredPush | None = None
     search_gain: bool = False
+    stability: float = 0.0
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -76,6 +78,7 @@ class FunnelProblem:
             "hold": self.hold,
             "error": None if self.error is None else self.error.tolist(),
             "decay": self.decay,
+            "stability": self.stability,
             "push": None if self.push is None else self.push.document(),
         }
 
@@ -106,7 +109,10 @@ class FunnelProblem:
         decay = document.get("decay")
         if decay is not None:
             decay = files.member(document, "decay", (int, float), source=source)
-        usual = {"shape": "rho", "gain": "constant", "search_gain": False, "objective": "volume"}
+        usual = {
+            "shape": "rho", "gain": "constant", "search_gain": False, "objective": "volume",
+            "stability": 0.0,
+        }  # fmt: skip
         words = usual | document
         return cls(
             field,
@@ -123,6 +129,7 @@ class FunnelProblem:
             decay,
             _push(document, field.n, source),
             files.member(words, "search_gain", bool, source=source),
+            float(files.member(words, "stability", (int, float), source=source)),
         )
 
     def design(
@@ -143,6 +150,7 @@ class FunnelProblem:
             hold=self.hold,
             error=self.error,
             decay=self.decay,
+            stability=self.stability,
         )
         return design(problem, executor=executor, progress=progress)
 

@@ -193,14 +193,26 @@ def compose(
         typer.Argument(help="funnel.proof.json files, in the order of time; or two of gains."),
     ],
     out_dir: OutOption,
+    jump: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="jump.json from each funnel into the next, in order; one more: into the first."
+        ),
+    ] = None,
 ) -> None:
-    """Bind proofs into one claim, for `check`: composition.proof.json or small_gain.proof.json.
+    """Bind proofs into one claim, for `check`: composition., hybrid. or small_gain.proof.json.
 
-    Funnels that follow each other; or two models, of gains by `nlsid gain`, in a loop where each
-    one's output is the other's input.
+    Funnels that follow each other, in time or, with --jump, where a guard is met; or two models, of
+    gains by `nlsid gain`, in a loop where each one's output is the other's input.
     """
-    from nlsid_core.design import compose_funnels
+    from nlsid_core.design import compose_funnels, compose_jumps
     from nlsid_core.design.loop import compose_loop, is_gain
+
+    if jump:
+        path = compose_jumps(proofs, jump, out_dir)
+        count = 4 * len(proofs) + len(jump)
+        out.print(f"wrote {path} and {count} files of its stages and jumps", soft_wrap=True)
+        return
 
     if any(map(is_gain, proofs)):
         path, verdict = compose_loop(proofs, out_dir)

@@ -61,9 +61,9 @@ def load_model(path: Path | str) -> DifferenceEquation:
 
 
 def funnel_of(folder: Path) -> Path:
-    """What `load_proved` reads in a design folder: its composition if it has one, or its funnel."""
-    composition = folder / designs.COMPOSITION
-    return composition if composition.is_file() else folder / FUNNEL
+    """What `load_proved` reads in a design folder: a proof of several funnels, or its funnel."""
+    several = (folder / name for name in (designs.COMPOSITION, designs.HYBRID))
+    return next((path for path in several if path.is_file()), folder / FUNNEL)
 
 
 def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:

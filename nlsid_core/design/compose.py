@@ -31,7 +31,7 @@ def compose_funnels(paths: Sequence[Path | str], folder: Path | str) -> Path:
     """
     if len(paths) < 2:
         raise DataError(f"a composition needs two or more funnels, got {len(paths)}")
-    stages = [_read(i, Path(path)) for i, path in enumerate(paths, start=1)]
+    stages = [read_stage(i, Path(path)) for i, path in enumerate(paths, start=1)]
     steps = enumerate(pairwise(stages), start=1)
     multipliers = [_multiplier(i, before, after) for i, (before, after) in steps]
     contents = {name: content for stage in stages for name, content in stage.contents.items()}
@@ -63,7 +63,7 @@ def write_beside(folder: Path, contents: Mapping[str, bytes], sources: Sequence[
 
 
 @dataclass(frozen=True, eq=False)
-class _Stage:
+class Stage:
     """One stage's files by their names in the composition, its proof about these names."""
 
     number: int
@@ -72,7 +72,8 @@ class _Stage:
     contents: dict[str, bytes]
 
 
-def _read(number: int, path: Path) -> _Stage:
+def read_stage(number: int, path: Path) -> Stage:
+    """The funnel of a proof file and the files beside it; raises as `compose_funnels`."""
     document = files.load_document(path)
     claim = document.get("claim")
     about = claim.get("about") if isinstance(claim, dict) else None
@@ -95,10 +96,10 @@ def _read(number: int, path: Path) -> _Stage:
     own = document | {"claim": claim | {"about": renamed}}
     contents[f"stage{number}.proof.json"] = files.encode(own)
     funnel = files.parse_document(contents[f"stage{number}.funnel.json"], source=str(path))
-    return _Stage(number, path, ContinuousFunnel.from_document(funnel, source=str(path)), contents)
+    return Stage(number, path, ContinuousFunnel.from_document(funnel, source=str(path)), contents)
 
 
-def _multiplier(number: int, before: _Stage, after: _Stage) -> float:
+def _multiplier(number: int, before: Stage, after: Stage) -> float:
     """The S-lemma's multiplier for this step."""
     a, b = before.funnel, after.funnel
     if a.n != b.n or a.tf != b.t0:

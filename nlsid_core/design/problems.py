@@ -118,6 +118,8 @@ class ContinuousTracking:
 
     decay: 1/s, λ of a claim that V falls: V̇ ≤ λ(σ - V) wherever σ ≤ V ≤ 1, for the least floor σ
     that is found; V is 1 on the funnel's boundary of that time (None: only that V stays below 1).
+    stability: 1/s, α of a prescribed degree of stability: with A + αI/2 for A in these equations V
+    of the linear closed loop falls at least as exp(-αt).
 
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
@@ -138,10 +140,14 @@ class ContinuousTracking:
     hold: float | Literal["largest"] | None = None
     error: ArrayLike | None = None
     decay: float | None = None
+    stability: float = 0.0
 
     def __post_init__(self) -> None:
+        require_at_least(self, "stability", 0.0)
         if not isinstance(self.nominal, Nominal):
             raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
+        if not isinstance(self.policy, ContinuousPolicy | None):
+            raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
         if self.decay is not None:
             require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))

@@ -12,7 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
-from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
+from nlsid_core.errors import DataError, DocumentError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial, trace, variables
 from nlsid_core.polynomial.maps import coefficient_table
@@ -127,10 +127,19 @@ class VectorField:
             traced = trace(called, {name: sizes[name] for name in given})
         except IndexError as error:
             raise no_entry(error, n, m, len(bounds)) from error
+        except ZeroDivisionError as error:
+            raise DataError(f"the dynamics divide by zero ({error})") from error
         except NotPolynomial as error:
             raise NotPolynomial(
                 f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
                 "leave out; or give a polynomial, and what it leaves out as a bounded w"
+            ) from error
+        except NlsidError:
+            raise
+        except Exception as error:
+            raise NotPolynomial(
+                f"{called.__name__} cannot be called with polynomials "
+                f"({type(error).__name__}: {error})"
             ) from error
         if traced.shape != (n,):
             raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")
@@ -296,7 +305,7 @@ class VectorField:
             "breaks": self.breaks.tolist(),
             "valid": self.valid.tolist(),
             "expansion": self.expansion,
-            "pieces": [[_written(p) for p in part] for part in self.pieces],
+            "pieces": [[equation_document(p) for p in part] for part in self.pieces],
         }
 
     @classmethod
@@ -314,7 +323,7 @@ class VectorField:
         for part in files.member(document, "pieces", list, source=source):
             if not isinstance(part, list):
                 raise DocumentError(f"{source}: a piece should be a list of equations")
-            pieces.append(tuple(_read(p, names, source=f"{source} equation") for p in part))
+            pieces.append(tuple(read_equation(p, names, source=f"{source} equation") for p in part))
         breaks = files.array(document, "breaks", (None,), source=source)
         rows = files.member(document, "valid", list, source=source)
         valid = files.array(document, "valid", (len(rows), None), source=source)
@@ -409,7 +418,7 @@ def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntAr
     return exponents, table
 
 
-def _written(p: Polynomial) -> Json:
+def equation_document(p: Polynomial) -> Json:
     """Distinct monomials in increasing order; a coefficient that is no float64 as "p/q"."""
     order = [k for k in np.lexsort(p.exponents.T[::-1]).tolist() if p.coefficients[k]]
     exact = [Fraction(p.coefficients[k]) for k in order]
@@ -422,7 +431,8 @@ def _written(p: Polynomial) -> Json:
     }
 
 
-def _read(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+def read_equation(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+    """The polynomial of an `equation_document`; DocumentError says what is wrong with it."""
     if not isinstance(document, dict):
         raise DocumentError(f"{source}: expected an object, found {type(document).__name__}")
     rows = files.member(document, "exponents", list, source=source)

@@ -22,6 +22,7 @@ KINDS = (
     "sampled_funnel",
     "continuous_funnel",
     "funnel_composition",
+    "hybrid_funnel",
     "polynomial_bound",
     "region_of_attraction",
     "falsification",

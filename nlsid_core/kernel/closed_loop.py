@@ -26,6 +26,22 @@ class Decay:
     floor: Fraction
 
 
+class FunnelPart:
+    """A funnel on part `index` of 2^level of interval k: ρ, Px̄, gap = ρ - W, states x₀ + x̄."""
+
+    def __init__(self, ring: Ring, funnel: Funnel, place: tuple[int, int, int]) -> None:
+        (k, level, index), x = place, ring.variables
+        self.in_time = in_time = partial(ring.bernstein, level=level, index=index)
+        self.rho = in_time(funnel.rho[k : k + 2])
+        ends = zip(funnel.P[k], funnel.P[k + 1], strict=True)
+        self.Px = [
+            ring.dot([in_time(pair) for pair in zip(*rows, strict=True)], x) for rows in ends
+        ]
+        self.gap = self.rho - ring.dot(x, self.Px)
+        centres = zip(*funnel.x[k], strict=True)
+        self.states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
+
+
 class ClosedLoop:
     """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it.
 
@@ -37,19 +53,14 @@ class ClosedLoop:
         self, ring: Ring, equations: list[Terms], policy: Policy, funnel: Funnel,
         place: tuple[int, int, int], mode: tuple[int, ...],
     ) -> None:  # fmt: skip
-        (self.k, level, index), self.ring, x = place, ring, ring.variables
+        self.k, self.ring, x = place[0], ring, ring.variables
         self.funnel, self.policy = funnel, policy
         k, self.h = self.k, funnel.t[self.k + 1] - funnel.t[self.k]
-        self.in_time = in_time = partial(ring.bernstein, level=level, index=index)
-        self.rho = in_time(funnel.rho[k : k + 2])
-        ends = zip(funnel.P[k], funnel.P[k + 1], strict=True)
-        self.Px = [
-            ring.dot([in_time(pair) for pair in zip(*rows, strict=True)], x) for rows in ends
-        ]
-        self.gap = self.rho - ring.dot(x, self.Px)
+        part = FunnelPart(ring, funnel, place)
+        self.in_time, self.rho, self.Px, self.gap = part.in_time, part.rho, part.Px, part.gap
         inputs, self.held = [], []
         for i, points in enumerate(zip(*policy.u[k], strict=True)):  # ũ = u₀ - Kx̄
-            inputs.append(in_time(points) - ring.dot(self._gains(i), x))
+            inputs.append(self.in_time(points) - ring.dot(self._gains(i), x))
         for side, (i, (low, high)) in zip(mode, policy.limits.items(), strict=True):
             wanted = inputs[i]
             if side:
@@ -57,9 +68,8 @@ class ClosedLoop:
                 inputs[i] = ring.made(low if side < 0 else high)
             else:
                 self.held.append((high - wanted) * (wanted - low))
-        centres = zip(*funnel.x[k], strict=True)
-        states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
-        self.field = _apart(ring, equations, [in_time(funnel.t[k : k + 2]), *states, *inputs])
+        known = [self.in_time(funnel.t[k : k + 2]), *part.states, *inputs]
+        self.field = _apart(ring, equations, known)
         self.changes: dict[int, Change] = {}
 
     def _gains(self, i: int) -> list[Polynomial]:
@@ -115,22 +125,11 @@ class ClosedLoop:
         """c(s, x̄) of a piece at a vertex of (δ, w)."""
         parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
         if "mu" in piece:
-            parts.append((1, self._multiplied(multiplier, piece["mu"])))
+            parts.append((1, read_multiplier(piece["mu"], multiplier, self.ring) * self.gap))
         parts += [(-weight, growth) for weight, growth in _at(off, self.growth)]
         if "tau" in piece:
             parts += self._taken(piece["tau"], self.shell + self.held, stated)
         return self.ring.weighted(parts)
-
-    def _multiplied(self, multiplier: list[tuple[int, ...]], mu: Node) -> Polynomial:
-        """μ (ρ - W)."""
-        ring, size, stated = self.ring, len(multiplier), mu.members("shifts start end")
-        shifts = powers_of_two(stated["shifts"], size)
-        ends = zip(stated["start"].wholes(size), stated["end"].wholes(size), strict=True)
-        lines = [
-            ring.bernstein(pair) * ring.monomial(row)
-            for pair, row in zip(ends, multiplier, strict=True)
-        ]
-        return ring.dot([Fraction(2) ** shift for shift in shifts], lines) * self.gap
 
     def rate_condition(
         self, room: Fraction, i: int, sign: int, piece: dict[str, Node], stated: dict[str, Node],
@@ -162,6 +161,17 @@ class ClosedLoop:
             tau = node.members("columns squares") | {"basis": stated["sides"]}
             parts.append((-1, expanded(read_squares(tau, self.ring), self.ring) * q))
         return parts
+
+
+def read_multiplier(node: Node, rows: list[tuple[int, ...]], ring: Ring) -> Polynomial:
+    """μ, of any sign: `shifts`, `start` and `end` of each monomial's coefficient, linear in s."""
+    size, stated = len(rows), node.members("shifts start end")
+    shifts = powers_of_two(stated["shifts"], size)
+    ends = zip(stated["start"].wholes(size), stated["end"].wholes(size), strict=True)
+    lines = [
+        ring.bernstein(pair) * ring.monomial(row) for pair, row in zip(ends, rows, strict=True)
+    ]
+    return ring.dot([Fraction(2) ** shift for shift in shifts], lines)
 
 
 def _slope(points: Sequence[Fraction]) -> list[Fraction]:

@@ -320,7 +320,7 @@ def _decide_pieces(
     names = "tau" if decays else "mu" + " tau" * bool(policy.limits)
     names += " mode" * bool(policy.limits)
     needed = list(product(range(len(spans)), range(len(vertices)), modes))
-    order, pieces = _in_order(stated["pieces"], names, needed, len(modes[0]), work)
+    order, pieces = in_order(stated["pieces"], names, needed, len(modes[0]), work)
     multiplier = [] if decays else stated["multiplier"].monomials(field.n)
     # Of the last piece: those that share a closed loop follow each other.
     loops: dict[tuple[object, ...], ClosedLoop] = {}
@@ -369,7 +369,7 @@ def _decide_rates(
     ]
     needed = list(product(range(len(spans)), range(len(vertices)), cases))
     names = "input sign tau" + " mode" * bool(limited)
-    order, pieces = _in_order(stated["rate_pieces"], names, needed, len(limited), work)
+    order, pieces = in_order(stated["rate_pieces"], names, needed, len(limited), work)
     halves = [(b - a) / 2 for a, b in field.box]
     loops: dict[tuple[object, ...], ClosedLoop] = {}  # as above
 
@@ -441,7 +441,7 @@ def _product(a: Iterable[Fraction], b: Iterable[Fraction]) -> Fraction:
     return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
 
 
-def _in_order(
+def in_order(
     node: Node, names: str, needed: Sequence[Key], limited: int, work: Work
 ) -> tuple[list[tuple[Key, int, int, int]], list[dict[str, Node]]]:
     """(key, level, index, place) of every piece, and their members, in the order of the file.

@@ -44,6 +44,13 @@ def test_a_composition_validates() -> None:
     judged(files.load_document(case / "claim.proof.json"), "proof_funnel_composition")
 
 
+@pytest.mark.parametrize("case", ["switch", "cycle"])
+def test_funnels_that_jump_and_their_jumps_validate(case: str) -> None:
+    folder = CORPUS / "hybrid_funnel" / case
+    judged(files.load_document(folder / "claim.proof.json"), "proof_hybrid_funnel")
+    judged(files.load_document(folder / "jump1.json"), "jump")
+
+
 def test_a_proof_without_a_piece_of_its_witness_does_not_validate() -> None:
     schema = files.load_document(SCHEMAS / "proof_continuous_funnel.schema.json")
     whole = CORPUS / "continuous_funnel" / "held" / "claim.proof.json"

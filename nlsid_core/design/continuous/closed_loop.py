@@ -105,8 +105,8 @@ def closed_loop_polynomial(
     """
     n, k = field.n, pieces.interval
     loop = _Loop(field, policy, funnel, pieces, end=end)
-    P = _linear(funnel.P)[k]
-    rho = _linear(funnel.rho)[k]
+    P = linear(funnel.P)[k]
+    rho = linear(funnel.rho)[k]
     x_bar: list[Graded] = [{1: pieces.T[:, i][:, None]} for i in range(n)]
     PT = _product(loop.restricted(P), pieces.T)  # (B, 2, n, n): row i is (Px̄)_i
     rates = loop.field_times_h()
@@ -255,11 +255,11 @@ class _Loop:
     def gap(self) -> Graded:
         """ρ - x̄'Px̄."""
         k, n = self.pieces.interval, self.field.n
-        PT = _product(self.restricted(_linear(self.funnel.P)[k]), self.pieces.T)
+        PT = _product(self.restricted(linear(self.funnel.P)[k]), self.pieces.T)
         W: Graded = {}
         for i in range(n):
             W = add(W, multiply({1: PT[:, :, i]}, {1: self.pieces.T[:, i][:, None]}, n))
-        return add({0: self.restricted(_linear(self.funnel.rho)[k])[:, :, None]}, negative(W))
+        return add({0: self.restricted(linear(self.funnel.rho)[k])[:, :, None]}, negative(W))
 
     def field_times_h(self) -> list[Graded]:
         """h·f_i along the closed loop."""
@@ -328,7 +328,7 @@ class _Loop:
         x = self.restricted(self.policy.x.control[k])
         u = self.restricted(self.policy.u.control[k])
         KT = _product(self.restricted(self.policy.K.control[k]), T)
-        time = self.restricted(_linear(self.funnel.t)[k])
+        time = self.restricted(linear(self.funnel.t)[k])
         forms: list[Graded] = [{0: time[:, :, None]}]
         forms += [{0: x[:, :, i][:, :, None], 1: T[:, None, i]} for i in range(self.field.n)]
         self.demands: list[Graded] = [
@@ -379,6 +379,6 @@ def _product(A: FloatArray, T: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("bsij,bjk->bsik", A, T))
 
 
-def _linear(values: FloatArray) -> FloatArray:
+def linear(values: FloatArray) -> FloatArray:
     """(K-1, 2, ...) control points of the piecewise linear function through (K, ...)."""
     return np.stack([values[:-1], values[1:]], axis=1)

@@ -112,6 +112,7 @@ def design_funnel(
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
     decay: float | None = None,
+    stability: float = 0.0,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> FunnelDesign:
@@ -125,6 +126,7 @@ def design_funnel(
     prepared = partial(
         prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain,
         limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,
+        stability=stability,
     )  # fmt: skip
     setting = prepared(nominal)
     if policy is None:

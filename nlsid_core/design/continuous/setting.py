@@ -42,6 +42,7 @@ TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback r
 DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
+AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +133,7 @@ def prepare(
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
     decay: float | None = None,
+    stability: float = 0.0,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -147,7 +149,8 @@ def prepare(
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
-    given, tracking = policy is not None, _tracking(field, nominal, wanted, policy, Q, R, gain)
+    given = policy is not None
+    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain, stability)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
@@ -237,13 +240,20 @@ def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
             f"{field.m}"
         )
     gap, t, state = nominal.defect(field)
-    scale = float(np.abs(nominal.x.derivative().control).max())
-    if gap > DEFECT * max(scale, 1e-9):
+    if gap > largest_defect(nominal):
+        scale = float(np.abs(nominal.x.derivative().control).max())
         raise DataError(
             f"the nominal does not obey the dynamics: dx{state}/dt is off by {gap:.3g} at "
             f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
             "or more knots"
         )
+
+
+def largest_defect(nominal: Nominal) -> float:
+    """By how much ẋ₀ may miss the dynamics."""
+    rate = float(np.abs(nominal.x.derivative().control).max())
+    size = float(np.abs(nominal.x.control).max()) / float(np.ptp(nominal.t))
+    return DEFECT * max(rate, AT_REST * max(size, 1.0))
 
 
 def refuse_saturated(policy: ContinuousPolicy) -> None:
@@ -295,6 +305,7 @@ def _tracking(
     Q: FloatArray,
     R: FloatArray,
     gain: str,
+    stability: float,
 ) -> Tracking:
     """ContinuousPolicy and P(t): of the LQR, or the given policy with its Lyapunov equation."""
     if goal is not None:
@@ -311,13 +322,13 @@ def _tracking(
                 "and a policy."
             ) from error
     if policy is None:
-        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain, stability=stability)
     if policy.vector_field != files.digest(field.document()):
         raise DataError("the policy was made for other dynamics")
     same = np.array_equal(policy.x.control, nominal.x.control)
     if not same or not np.array_equal(policy.t, nominal.t):
         raise DataError("the policy is around another nominal")
-    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
+    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final, stability=stability))
 
 
 def _kept(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
@@ -22,11 +23,13 @@ from nlsid_core.dynamics import (
     cubic_through,
     linear_through,
 )
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, NlsidError, SolverError
 from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
 
-RTOL, ATOL = 1e-9, 1e-10  # of the integrations; P's interpolation error is far larger
+RTOL = 1e-9  # of S between knots, to √(S_ii S_jj); P's interpolation error is far larger
+EASY, MOST_STEPS = 1e-12, 256  # of the same: then fewer steps are tried next; of an interval
+GAUSS = 15**0.5 / 10  # of a step: from its middle to the outer two of Gauss's three points
 NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
 BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
 DIFFERENCE = 1e-5  # of a knot interval, for the slope of B: errors of 1e-10
@@ -49,11 +52,13 @@ def tvlqr(
     R: ArrayLike,
     S_final: ArrayLike,
     gain: str = "constant",
+    stability: float = 0.0,
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
     Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
-    "linear" is continuous.
+    "linear" is continuous. stability: α in 1/s, A + αI/2 for A, so that linear solutions let
+    |x̄|²_S fall at least as exp(-αt) (Anderson and Moore, a prescribed degree of stability).
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
@@ -64,13 +69,13 @@ def tvlqr(
         raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
     R_inverse = np.linalg.inv(R)
 
-    def rate(t: float, S: FloatArray) -> FloatArray:
+    def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        BS = B.T @ S
-        return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q))
+        A = A + stability / 2 * np.eye(field.n)
+        return np.block([[A, -B @ R_inverse @ B.T], [-Q, -A.T]])
 
     S = _backward(
-        rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
+        hamiltonian, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
     )
 
     def gain_at(k: int, side: float) -> FloatArray:
@@ -85,25 +90,33 @@ def tvlqr(
         inner = (before[:-1] + after[1:]) / 2  # the dynamics of two intervals may differ a little
         K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
     else:
-        K = _cubic_gain(field, nominal, S, R_inverse, rate)
+        K = _cubic_gain(field, nominal, S, R_inverse, hamiltonian)
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
     return Tracking(policy, S)
 
 
 def lyapunov(
-    field: VectorField, policy: ContinuousPolicy, *, Q: ArrayLike, P_final: ArrayLike
+    field: VectorField,
+    policy: ContinuousPolicy,
+    *,
+    Q: ArrayLike,
+    P_final: ArrayLike,
+    stability: float = 0.0,
 ) -> FloatArray:
-    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
+    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2).
+
+    stability: α in 1/s, A + αI/2 for A.
+    """
     Q = definite(Q, field.n, "Q", strict=False)
     P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
 
-    def rate(t: float, P: FloatArray) -> FloatArray:
+    def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        closed = A - B @ policy.K(t)
-        return np.asarray(-(closed.T @ P + P @ closed + Q))
+        closed = A - B @ policy.K(t) + stability / 2 * np.eye(field.n)
+        return np.block([[closed, np.zeros_like(closed)], [-Q, -closed.T]])
 
-    return _backward(rate, nominal.t, P_final, "the Lyapunov equation")
+    return _backward(hamiltonian, nominal.t, P_final, "the Lyapunov equation")
 
 
 def integrate_nominal(
@@ -119,17 +132,17 @@ def integrate_nominal(
     field: or a function of some of t, x, u, named so. t: (K,) knots in s. Raises DataError unless
     one end is given and the knots increase.
     """
-    t = np.asarray(t, dtype=np.float64)
-    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
-        raise DataError("t should be two or more times that increase")
+    t = numbers(t, "t")
+    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all() or not np.isfinite(t).all():
+        raise DataError(f"t should be two or more times that increase, is {t.tolist()}")
     if (start is None) == (final is None):
         raise DataError("give the state at the start or at the end, not both")
     given = numbers(start if final is None else final, "the state")
     if given.ndim != 1 or not np.isfinite(given).all():
         raise DataError(f"the state should be n finite numbers, is {given.tolist()}")
-    m = u.control.shape[2] if isinstance(u, PiecewisePolynomial) else np.size(u(float(t[0])))
-    rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     inputs = u if isinstance(u, PiecewisePolynomial) else _cubic_input(u, t)
+    m = inputs.control.shape[2]
+    rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     values = inputs.ends()
     span, order = ((t[0], t[-1]), t) if final is None else ((t[-1], t[0]), t[::-1])
     solved = solve_ivp(
@@ -158,16 +171,28 @@ def nominal_through(t: ArrayLike, x: ArrayLike, u: ArrayLike, field: VectorField
 
 def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePolynomial:
     """Cubics through u at four Chebyshev-like points of each interval: exact for cubic u(t)."""
-    pieces = []
+    if not callable(u):
+        raise DataError(f"u should be a function of the time, is {u!r}")
+
+    def value(when: float) -> FloatArray:
+        try:
+            return np.ravel(numbers(u(when), f"u({when:.6g})"))
+        except NlsidError:
+            raise
+        except Exception as error:
+            raise DataError(
+                f"u has no value at t = {when:.6g} ({type(error).__name__}: {error})"
+            ) from error
+
     share = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+    values = [[value(float(a + s * (b - a))) for s in share] for a, b in itertools.pairwise(t)]
+    counts = {len(row) for rows in values for row in rows}
+    if len(counts) > 1:
+        raise DataError(f"u should return as many inputs at all times, returns {sorted(counts)}")
     # Values at the four points from Bernstein control points, inverted.
     to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
                           for s in share])  # fmt: skip
-    for start, end in itertools.pairwise(t):
-        values = np.array(
-            [np.ravel(np.asarray(u(float(start + s * (end - start))), float)) for s in share]
-        )
-        pieces.append(np.linalg.solve(to_values, values))
+    pieces = [np.linalg.solve(to_values, np.array(rows)) for rows in values]
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]
     return PiecewisePolynomial(t, control)
@@ -178,17 +203,18 @@ def _cubic_gain(
     nominal: Nominal,
     S: FloatArray,
     R_inverse: FloatArray,
-    rate: Callable[[float, FloatArray], FloatArray],
+    hamiltonian: Callable[[float], FloatArray],
 ) -> PiecewisePolynomial:
     """K = R⁻¹B'S with its slopes R⁻¹(B'Ṡ + Ḃ'S), Ṡ from the Riccati equation."""
-    t = nominal.t
+    t, n = nominal.t, field.n
     step = DIFFERENCE * float(np.min(np.diff(t)))
     B, ahead, behind = (
         np.array([_linearised(field, nominal, float(s) + shift)[1] for s in t])
         for shift in (0.0, step, -step)
     )
     B_rate = (ahead - behind) / (2 * step)
-    S_rate = np.array([rate(float(s), S[k]) for k, s in enumerate(t)])
+    H = np.array([hamiltonian(float(s)) for s in t])
+    S_rate = H[:, n:, :n] + H[:, n:, n:] @ S - S @ H[:, :n, :n] - S @ H[:, :n, n:] @ S
     values = R_inverse @ B.transpose(0, 2, 1) @ S
     slopes = R_inverse @ (B.transpose(0, 2, 1) @ S_rate + B_rate.transpose(0, 2, 1) @ S)
     return cubic_through(t, values, slopes)
@@ -202,31 +228,51 @@ def _linearised(
 
 
 def _backward(
-    rate: Callable[[float, FloatArray], FloatArray], t: FloatArray, final: FloatArray, what: str
+    hamiltonian: Callable[[float], FloatArray], t: FloatArray, final: FloatArray, what: str
 ) -> FloatArray:
-    n = len(final)
+    """S (K, n, n) = Y X⁻¹ at t (K,), with d[X; Y]/dt = H(t) [X; Y] and S(t_f) = final."""
+    S = np.empty((len(t), *final.shape))
+    S[-1] = final
+    most, count = BLOW_UP * float(np.abs(final).max()), 1
+    for k in range(len(t) - 2, -1, -1):
+        rough, count = _stepped(hamiltonian, t[k : k + 2], S[k + 1], count), 2 * count
+        while True:
+            S[k] = _stepped(hamiltonian, t[k : k + 2], S[k + 1], count)
+            if not np.abs(S[k]).max() <= most:  # or is not a number
+                raise Infeasible(f"no bounded solution of {what} (at {t[k]:.4g} s)")
+            sizes = np.sqrt(np.diag(S[k]))
+            gap = float((np.abs(S[k] - rough) / sizes / sizes[:, None]).max())
+            if gap <= RTOL or count >= MOST_STEPS:
+                break
+            rough, count = S[k], 2 * count
+        count = max(1, count // (4 if gap <= EASY else 2))
+    return S
 
-    def flat(s: float, S: FloatArray) -> FloatArray:
-        return rate(s, S.reshape(n, n)).ravel()
 
-    def explodes(_: float, S: FloatArray) -> float:
-        return float(BLOW_UP * np.abs(final).max() - np.abs(S).max())
+def _stepped(
+    hamiltonian: Callable[[float], FloatArray], ends: FloatArray, S: FloatArray, count: int
+) -> FloatArray:
+    """S at the start of an interval from S at its end, in `count` steps of order 6.
 
-    explodes.terminal = True  # type: ignore[attr-defined]
-    solved: Any = solve_ivp(
-        flat,
-        (t[-1], t[0]),
-        final.ravel(),
-        t_eval=t[::-1],
-        method="DOP853",
-        rtol=RTOL,
-        atol=ATOL,
-        events=explodes,
-    )
-    if not solved.success or solved.y.shape[1] != len(t):
-        raise Infeasible(f"no bounded solution of {what} ({solved.message})")
-    S = solved.y.T[::-1].reshape(-1, n, n)
-    return np.asarray((S + S.transpose(0, 2, 1)) / 2)
+    Source: Blanes, Casas, Oteo and Ros, "The Magnus expansion and some of its applications", 2009,
+    (253) to (257), with Gauss's three points.
+    """
+    n, times = len(S), np.linspace(ends[1], ends[0], count + 1)
+    for start, end in itertools.pairwise(times.tolist()):
+        h, middle = end - start, (start + end) / 2
+        first, second, third = (h * hamiltonian(middle + h * side) for side in (-GAUSS, 0, GAUSS))
+        slope, bend = (third - first) / (2 * GAUSS), (third - 2 * second + first) / (2 * GAUSS**2)
+        inner = _commutator(second, slope)
+        outer = slope - _commutator(second, 2 * bend + inner) / 60
+        omega = second + bend / 12 + _commutator(inner - 20 * second - bend, outer) / 240
+        X, Y = np.split(expm(omega) @ np.vstack([np.eye(n), S]), [n])
+        S = np.linalg.solve(X.T, Y.T)
+        S = (S + S.T) / 2
+    return S
+
+
+def _commutator(A: FloatArray, B: FloatArray) -> FloatArray:
+    return A @ B - B @ A
 
 
 def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:

@@ -206,7 +206,7 @@ def unused_columns(basis: IntArray, used: IntArray, columns: Sequence[int]) -> l
 
 
 def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:
-    squares = witness(pieces.basis, curves.fitted(pieces.basis, curves.grams[b]))
+    squares = witness(pieces.basis, fitted(pieces.basis, curves.grams[b]))
     return {
         "interval": int(pieces.interval[b]),
         "vertex": int(pieces.vertex[b]),
@@ -233,42 +233,57 @@ class _Curves:
     def of(cls, funnel: ContinuousFunnel, pieces: Pieces, polynomials: Graded) -> "_Curves":
         """Of pieces whose Gram matrices are nearly those of the polynomials."""
         basis = pieces.basis
-        c, rows = _together(polynomials, basis.shape[1])
+        c, rows = together(polynomials, basis.shape[1])
         N = c.shape[1] - 1
         c = c / np.array([comb(N, j) for j in range(N + 1)])[:, None]
-        of_pairs = positions((basis[:, None] + basis[None]).reshape(-1, basis.shape[1]), rows)
-        count = np.bincount(of_pairs, minlength=len(rows))
-        share = (np.arange(N + 1) / max(N, 1))[:, None, None]
-        grams = (1 - share) * pieces.gram[:, :1] + share * pieces.gram[:, 1:]
-        missing = (c - _sums(grams, of_pairs, len(rows))) / np.maximum(count, 1)
-        grams = grams + missing[..., of_pairs].reshape(grams.shape)
+        grams = gram_curves(basis, c, rows, pieces.gram)
+        share = np.arange(N + 1) / max(N, 1)
         ends = funnel.rho[pieces.interval], funnel.rho[pieces.interval + 1]
         first, last = ((pieces.index + end) / 2.0**pieces.level for end in (0, 1))
-        at = first[:, None] + (last - first)[:, None] * share[:, 0, 0]
+        at = first[:, None] + (last - first)[:, None] * share
         rho = (1 - at) * ends[0][:, None] + at * ends[1][:, None]
         h = np.diff(funnel.t)[pieces.interval]
         one = int(np.flatnonzero(~basis.any(axis=1))[0])
-        return cls((grams + grams.swapaxes(-1, -2)) / 2, h[:, None] * rho, one)
+        return cls(grams, h[:, None] * rho, one)
 
     def scaled(self) -> FloatArray:
         """The Gram matrices with a unit diagonal."""
         root = np.sqrt(np.maximum(np.diagonal(self.grams, axis1=2, axis2=3), 1e-300))
         return np.asarray(self.grams / root[..., :, None] / root[..., None, :])
 
-    def fitted(self, basis: IntArray, grams: FloatArray) -> FloatArray:
-        """(J+1, k, k) control points of the lowest degree that are near enough to (N+1, k, k)."""
-        N = len(grams) - 1
-        for J in range(min(N, 1), min(N, MAX_DEGREE) + 1):
-            lift = _lift(J, N)
-            points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), grams)
-            scale = Scale.of(basis, points)
-            scaled = points / scale.diagonal[:, None] / scale.diagonal
-            room = FIT * float(np.linalg.eigvalsh(scaled)[:, 0].min()) * scale.small**2
-            written = scale.diagonal / scale.small
-            gap = (grams - np.einsum("kj,jab->kab", lift, points)) / written[:, None] / written
-            if (scale.lost(gap) <= room).all():
-                return np.asarray(points)
-        raise Infeasible(f"the Gram matrices of a piece need factors of degree above {MAX_DEGREE}")
+
+def fitted(basis: IntArray, grams: FloatArray) -> FloatArray:
+    """(J+1, k, k) control points of the lowest degree that are near enough to (N+1, k, k).
+
+    Raises Infeasible if none of few enough are.
+    """
+    N = len(grams) - 1
+    for J in range(min(N, 1), min(N, MAX_DEGREE) + 1):
+        lift = _lift(J, N)
+        points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), grams)
+        scale = Scale.of(basis, points)
+        scaled = points / scale.diagonal[:, None] / scale.diagonal
+        room = FIT * float(np.linalg.eigvalsh(scaled)[:, 0].min()) * scale.small**2
+        written = scale.diagonal / scale.small
+        gap = (grams - np.einsum("kj,jab->kab", lift, points)) / written[:, None] / written
+        if (scale.lost(gap) <= room).all():
+            return np.asarray(points)
+    raise Infeasible(f"the Gram matrices of a piece need factors of degree above {MAX_DEGREE}")
+
+
+def gram_curves(basis: IntArray, c: FloatArray, rows: IntArray, ends: FloatArray) -> FloatArray:
+    """(B, N+1, k, k) control points of Q(s) with c = v'Qv, near to those linear between `ends`.
+
+    c: (B, N+1, M) control points of the coefficients of `rows` (M, n). ends: (B, 2, k, k).
+    """
+    N = c.shape[1] - 1
+    of_pairs = positions((basis[:, None] + basis[None]).reshape(-1, basis.shape[1]), rows)
+    count = np.bincount(of_pairs, minlength=len(rows))
+    share = (np.arange(N + 1) / max(N, 1))[:, None, None]
+    grams = (1 - share) * ends[:, :1] + share * ends[:, 1:]
+    missing = (c - _sums(grams, of_pairs, len(rows))) / np.maximum(count, 1)
+    grams = grams + missing[..., of_pairs].reshape(grams.shape)
+    return np.asarray((grams + grams.swapaxes(-1, -2)) / 2)
 
 
 def _sums(Q: FloatArray, of_pairs: IntArray, count: int) -> FloatArray:
@@ -292,7 +307,7 @@ def _lift(J: int, N: int) -> FloatArray:
     )  # fmt: skip
 
 
-def _together(c: Graded, n: int) -> tuple[FloatArray, IntArray]:
+def together(c: Graded, n: int) -> tuple[FloatArray, IntArray]:
     """All degrees in one array (B, N+1, M), and its monomials (M, n)."""
     degrees = range(max(c) + 1)
     rows = np.concatenate([monomials_of(n, q) for q in degrees])

@@ -25,6 +25,7 @@ from tests.core.kernel import (
     oracle_continuous,
     oracle_dissipation,
     oracle_falsification,
+    oracle_hybrid,
     oracle_polynomial,
     oracle_sampled,
     oracle_stability,
@@ -45,6 +46,7 @@ ORACLES: dict[str, Callable[[Json, Mapping[str, Json]], bool]] = {
     "sampled_funnel": oracle_sampled.agrees,
     "continuous_funnel": oracle_continuous.agrees,
     "funnel_composition": oracle_composition.agrees,
+    "hybrid_funnel": oracle_hybrid.agrees,
     "falsification": oracle_falsification.agrees,
 }
 WILD: tuple[Any, ...] = (
