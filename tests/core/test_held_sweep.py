@@ -96,7 +96,7 @@ def ankle(halved: int) -> ContinuousTracking:
 
 @pytest.mark.slow
 def test_more_knots_do_not_make_a_held_funnel_narrower() -> None:
-    """With rates in scaled copies of the funnel without a hold a knot could cost half of it."""
+    """Knots near the goal, where the feedback turns fastest."""
     widths = [design(ankle(halved)).funnel.widths(0.0)[0] for halved in (0, 1, 8)]
     assert widths[1] > 0.97 * widths[0]
     assert widths[2] > 0.97 * widths[1]
