@@ -159,7 +159,10 @@ class Controller:
         self._continuous = isinstance(model, VectorField)
         if self._continuous:
             if period is None or not period > 0.0:
-                raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+                raise DataError(
+                    "a continuous funnel names no time between samples: `period` should be s "
+                    f"above 0, is {period}"
+                )
             self._held = held or Held()
             self._held.refuse(period)
             self.period, self._origin = period, float(policy.t[0])

@@ -319,7 +319,7 @@ def _comparison(
         return SampledComparison(models[0], policies[0], funnels[0])
     if kinds == {ContinuousFunnel}:
         held = held or [Held()] * len(funnels)
-        return ContinuousComparison(models, policies, funnels, period or math.nan, held)
+        return ContinuousComparison(models, policies, funnels, period, held)
     raise DataError("several funnels at once are held against tubes of one model only")
 
 

@@ -234,9 +234,9 @@ def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limit
 
 def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
     field, policy, funnel = stage()
-    with pytest.raises(DataError, match="need a period"):
+    with pytest.raises(DataError, match="names no time between samples"):
         Monitor(field, policy, funnel)
-    with pytest.raises(DataError, match="need a period"):
+    with pytest.raises(DataError, match="names no time between samples"):
         Controller(field, policy, funnel, limits=LIMITS, settling=1.0)
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor(field, stage(limit=2.0)[1], funnel, period=HELD)
