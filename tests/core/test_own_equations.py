@@ -239,6 +239,7 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
         ({"goal": [0.2, 0.5], "uncertain": [[-1, 1]]}, "no argument w|function of some of"),
         ({"goal": [0.2, 0.5], "hold": 50.0}, "the hold of 50 s is longer than the motion"),
         ({"goal": "small"}, "the goal should be numbers, of one shape, is 'small'"),
+        ({"goal": ["0.2", "0.5"]}, "the goal should be numbers"),
         ({"goal": [0.2, 0.5], "uncertain": 0.1}, "uncertain should be rows|function of some of"),
     ],
 )
