@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from bags.commands.cli import app
 from bags.designs.bundle import Bundle
 from bags.designs.documents import funnel_of
-from examples import bouncer
+from examples import bouncer, compass_gait
 from nlsid_core import documents
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import Goal, compose_jumps, goal_before
@@ -109,6 +109,54 @@ def test_no_bounce_of_a_thousand_leaves(found: Found) -> None:
     left, V = bounced(found, 1000, 0.005)
     print("largest V after the landing", V.max())
     assert left == 0
+
+
+@pytest.fixture(scope="module")
+def gait(tmp_path_factory: pytest.TempPathFactory) -> Found:
+    """The proof of the compass gait's step, and its strike, composed into a cycle."""
+    design, strike = compass_gait.designed()
+    path = design.save(tmp_path_factory.mktemp("step"))[-1]
+    whole = compose_jumps([path], [strike], path.parent / "gait")
+    said = str(check(whole))
+    assert "stage1 jumps into stage1, so for ever" in said
+    assert "cubic Taylor models" in said
+    return path, strike
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_no_step_of_a_thousand_compass_gaits_leaves(gait: Found) -> None:
+    """The true dynamics and the true strike, from the boundary, in the states of the funnel."""
+    funnel = ContinuousFunnel.load(gait[0].with_name("funnel.json"))
+    policy = ContinuousPolicy.load(gait[0].with_name("policy.json"))
+
+    def rate(X: FloatArray, U: FloatArray) -> FloatArray:
+        return np.stack(compass_gait.shaped(X.T, U.T), axis=1)
+
+    X, t = landings(rate, policy, gait[1], boundary(funnel, 1000), 0.002)
+    V = funnel.value(
+        funnel.t0, np.stack(compass_gait.shaped_struck(X.T), axis=1) @ compass_gait.SHAPE.T
+    )
+    print("strikes from", t.min(), "to", t.max(), "s; largest V after the strike", V.max())
+    assert (t > gait[1].start).all()
+    assert int((V > 1).sum()) == 0
+    assert V.max() > 0.1, "the claim is not far from what happens"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_compass_gait_is_the_published_one(gait: Found) -> None:
+    """The swing leg is ahead, and the foot in the air, from before the guard is watched."""
+    start, seconds = compass_gait.striking()
+    assert start == pytest.approx(compass_gait.PUBLISHED, abs=6e-4)
+    assert seconds == pytest.approx(0.734, abs=5e-4)
+    funnel = ContinuousFunnel.load(gait[0].with_name("funnel.json"))
+    legs = compass_gait.BACK[:2]
+    for t in np.linspace(0.5, gait[1].start, 50):
+        centre, around = legs @ funnel.nominal(t), legs @ np.linalg.inv(funnel.shape(t)) @ legs.T
+        lift = centre.sum() + 2 * compass_gait.SLOPE
+        assert lift > np.sqrt(around.sum()), "above the ground"
+        assert centre[0] - centre[1] > 0.3, "legs apart, the swing leg ahead"
 
 
 @pytest.mark.slow
