@@ -9,8 +9,8 @@ time on at which the swing leg is ahead.
 The passive step that repeats itself is found by shooting. States are y = SHAPE (θ, dθ/dt), SHAPE a
 matrix of short binary fractions and determinant 1, in which the ellipsoids before the strike are
 nearly round: a strike multiplies some deviations by ten.
-Source: A. Goswami, B. Thuilot, B. Espiau, "A study of the passive gait of a compass-like biped
-robot", IJRR 17(12), 1998: masses, equations of motion and of the strike, and the passive gait.
+Source: A. Goswami, B. Thuilot, B. Espiau, "Compass-like biped robot, part I: stability and
+bifurcation of passive gaits", INRIA RR-2996, 1996: masses, equations, strike, and passive gait.
 """
 
 from pathlib import Path
@@ -32,14 +32,15 @@ from nlsid_core.design import (
     integrate_nominal,
     tvlqr,
 )
-from nlsid_core.dynamics import Jump, Nominal, taylor_field
+from nlsid_core.dynamics import Jump, Nominal, PiecewisePolynomial, taylor_field
 from nlsid_core.kernel import Verdict
 from nlsid_core.proofs import check
 
 HIP, LEG, A, B, GRAVITY = 10.0, 5.0, 0.5, 0.5, 9.81  # kg, kg; m from foot and hip to a leg's mass
 LENGTH = A + B
-SLOPE = 0.0525  # rad
-PUBLISHED = (-0.3238, 0.2188, -0.376, -1.093)  # rad, rad/s: the start of a step of the passive gait
+SLOPE = np.pi / 60  # rad
+GUESS = np.array([-0.32, -0.38, -1.09])  # rad, rad/s: swing leg, and both rates, after a strike
+PUBLISHED = 0.271, 0.735  # rad, half of what is between the legs at the strike; s of a step
 APART = 0.5  # s: from then on the swing leg is ahead
 WATCHED = 0.015  # s before the strike of the steady step, about
 SHAPE = np.array([
@@ -137,17 +138,22 @@ def striking() -> tuple[FloatArray, float]:
                            rtol=1e-10, atol=1e-12)  # fmt: skip
         return np.array(struck(solved.y_events[0][0]))[[0, 2, 3]], float(solved.t_events[0][0])
 
-    z = fsolve(lambda z: step(z)[0] - z, np.array(PUBLISHED)[[0, 2, 3]], xtol=1e-11)
+    z = fsolve(lambda z: step(z)[0] - z, GUESS, xtol=1e-11)
     return np.array([z[0], -2 * SLOPE - z[0], z[1], z[2]]), step(z)[1]
 
 
 def steady() -> Nominal:
-    """The passive step in y, past the strike as if there were no ground."""
+    """The passive step in y, past the strike as if there were no ground.
+
+    Parabolas through short numbers: what is decided about a jump has six times their degree in s.
+    """
     start, seconds = striking()
     end = seconds + BEYOND
     t = np.concatenate([np.linspace(0.0, end - 0.12, KNOTS), end - np.array(BEFORE_END)])
     motion = integrate_nominal(shaped, lambda _: np.zeros(1), t=t, start=SHAPE @ start)
-    short = np.ldexp(np.round(np.ldexp(motion.x.control, BITS)), -BITS)
+    ends, middle = motion.x.ends(), motion.x((t[:-1] + t[1:]) / 2)
+    control = np.stack([ends[:-1], 2 * middle - (ends[:-1] + ends[1:]) / 2, ends[1:]], axis=1)
+    short = np.ldexp(np.round(np.ldexp(control, BITS)), -BITS)
     return Nominal(PiecewisePolynomial(t, short), motion.u)
 
 
@@ -204,11 +210,12 @@ def proved(folder: Path | str) -> Verdict:
     return check(compose_jumps([path], [jump], Path(folder) / "gait"))
 
 
-def main() -> tuple[FloatArray, tuple[float, ...]]:
-    """(the start of the steady step, the published one)."""
+def main() -> tuple[tuple[float, float], tuple[float, float]]:
+    """(half the angle between the legs at the strike and the time of a step, the published)."""
     with TemporaryDirectory() as folder:
         print(proved(folder))
-    return striking()[0], PUBLISHED
+    start, seconds = striking()
+    return (float(start[1] - start[0]) / 2, seconds), PUBLISHED
 
 
 if __name__ == "__main__":

@@ -185,7 +185,7 @@ class Jump:
         """Raises DocumentError if the document is not a jump."""
         files.header(document, FORMAT, source=source)
         n = files.member(document, "states", int, source=source)
-        start = files.member(document, "start", float, source=source)
+        start = files.number(document, "start", source=source)
         rows = files.member(document, "uncertain", list, source=source)
         uncertain = files.array(document, "uncertain", (len(rows), 2), source=source)
         if not 1 <= n <= MAX_STATES:

@@ -146,9 +146,9 @@ def _decide_jump(jump: Jump, stated: Node, before: Funnel, after: Funnel, work: 
     for name, k, index, sign in (("start", first, 0, 1), ("end", last - 1, 1, -1)):
         decide_side = partial(_decide_side, jump, before, (k, index), sign, parts[name])
         at_width(jump.n, work, decide_side)
-    vertices = list(product(*jump.box))
-    if (last - first) * len(vertices) > MAX_PIECES:
+    if (last - first) << len(jump.box) > MAX_PIECES:
         raise Rejected(f"more than {MAX_PIECES} intervals and vertices")
+    vertices = list(product(*jump.box))
     needed = [(k, v, ()) for k, v in product(range(first, last), range(len(vertices)))]
     order, pieces = in_order(parts["pieces"], "tau mu", needed, 0, work)
     multiplier = parts["multiplier"].monomials(jump.n)

@@ -72,6 +72,7 @@ class Leap:
     def __init__(self, jump: Json, before: Json, after: Json, proof: Json) -> None:
         self.jump, self.before, self.after, self.proof = jump, before, after, proof
         self.n = jump["states"]
+        assert (len(before["t"]) - 1) * 2 ** len(jump["uncertain"]) <= 10**6
         self.corners = list(product(*numbers(jump["uncertain"])))
 
     def is_proved(self) -> bool:

@@ -128,6 +128,12 @@ def squared(about: Files) -> None:
     }  # fmt: skip
 
 
+def many_vertices(about: Files) -> None:
+    """32 entries of w have 2^32 vertices."""
+    about["jump1.json"]["uncertain"] = [[0.0, 0.0]] * 32
+    about["jump1.json"]["reset"][0] = {"exponents": [[1] + [0] * 32], "coefficients": [1.0]}
+
+
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (wider_slop, "jump1: piece"),
     (lifted, "jump1: piece"),
@@ -139,6 +145,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (watched_at_the_end, "1.2 s on, which is no knot"),
     (out_of_valid, "at 0.5 s x0 is not proved to be where the guard and the reset are valid"),
     (two_states, "leads from 1 states to 2, its stages have 1 and 1"),
+    (many_vertices, "more than 100000 intervals and vertices"),
     (squared, "degree above 1 in an entry of w"),
 ]
 
