@@ -353,7 +353,7 @@ def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     problem = cp.Problem(cp.Minimize(objective), constraints)
     try:
         problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
-    except cp.SolverError as error:
+    except (cp.SolverError, ValueError) as error:  # SCS raises the second where it cannot begin
         return _Outcome(f"failed ({error})")
     if x.value is None:
         return _Outcome(str(problem.status))

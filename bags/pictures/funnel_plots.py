@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, write_png
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, Goal
+from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
 OUTLINES = 80  # ellipses of a projected tube: their shadows join into one
@@ -28,7 +29,13 @@ def funnel_picture(design: FunnelDesign) -> Figure:
     """Above, the tube with its nominal: onto pairs of states, and over time where there is room.
 
     Below, the volume beside the first guess's, the widths, and the certified margin over time.
+    Raises DataError for a design that was read from files: they do not keep the search.
     """
+    if design.found is None:
+        raise DataError(
+            "the picture shows how the funnel was found, which its files do not keep: draw it of "
+            "what `design` returns, or take `nlsid report`"
+        )
     funnel = design.funnel
     figure = Figure(figsize=(12, 7), layout="constrained")
     rows: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))

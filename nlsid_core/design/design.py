@@ -4,12 +4,13 @@ Each kind has one search, which the kernel decides before anything is returned.
 """
 
 from concurrent.futures import Executor
-from typing import overload
+from typing import get_args, overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
-from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, OutputTube, Problem, SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
+from nlsid_core.errors import DataError
 from nlsid_core.progress import Progress, silent
 
 
@@ -38,6 +39,9 @@ def design(
     Raises DataError on a problem that makes no sense, Infeasible if no funnel was found or proved,
     CertificateRejected if an assumption is not one that the kernel accepts.
     """
+    if type(problem) not in get_args(Problem):
+        kinds = ", ".join(kind.__name__ for kind in get_args(Problem))
+        raise DataError(f"the problem should be one of {kinds}, is {problem!r}")
     match problem:
         case OutputTube():
             return design_output_tube(**vars(problem))

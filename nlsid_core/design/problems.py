@@ -146,6 +146,8 @@ class ContinuousTracking:
         require_at_least(self, "stability", 0.0)
         if not isinstance(self.nominal, Nominal):
             raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
+        if not isinstance(self.policy, ContinuousPolicy | None):
+            raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
         if self.decay is not None:
             require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))

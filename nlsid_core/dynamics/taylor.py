@@ -146,7 +146,7 @@ class Rates:
             raise
         except IndexError as error:
             raise no_entry(error, self.n, self.m, len(self.uncertain)) from error
-        except (ArithmeticError, TypeError, ValueError) as error:
+        except Exception as error:
             raise DataError(
                 f"the dynamics have no value at t = {t:.6g}, x = {X[0].tolist()}, u = "
                 f"{U[0].tolist()} ({type(error).__name__}: {error})"

@@ -12,7 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
-from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
+from nlsid_core.errors import DataError, DocumentError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial, trace, variables
 from nlsid_core.polynomial.maps import coefficient_table
@@ -127,10 +127,19 @@ class VectorField:
             traced = trace(called, {name: sizes[name] for name in given})
         except IndexError as error:
             raise no_entry(error, n, m, len(bounds)) from error
+        except ZeroDivisionError as error:
+            raise DataError(f"the dynamics divide by zero ({error})") from error
         except NotPolynomial as error:
             raise NotPolynomial(
                 f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
                 "leave out; or give a polynomial, and what it leaves out as a bounded w"
+            ) from error
+        except NlsidError:
+            raise
+        except Exception as error:
+            raise NotPolynomial(
+                f"{called.__name__} cannot be called with polynomials "
+                f"({type(error).__name__}: {error})"
             ) from error
         if traced.shape != (n,):
             raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")

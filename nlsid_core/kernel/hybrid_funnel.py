@@ -29,6 +29,7 @@ from .positivity import Squares, expanded, positive, read_squares, read_witness
 from .trajectory import MAX_BOUNDS, MAX_DEGREE, MAX_STATES, MAX_UNCERTAIN, Bounds, Funnel
 
 MAX_STAGES = 50  # with as many jumps
+MAX_PRODUCTS = 64  # of entries of w, in all of a reset
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ def read_jump(node: Node) -> Jump:
     ]
     if any(max(e[n:], default=0) > 1 for row in reset for e, _ in row):
         raise Rejected("the reset has degree above 1 in an entry of w")
+    if len({e[n:] for row in reset for e, _ in row}) > MAX_PRODUCTS:
+        raise Rejected(f"the reset has more than {MAX_PRODUCTS} products of entries of w")
     start, expansion = parts["start"].number(), parts["expansion"].text()
     return Jump(n, start, box, bounds, expansion, guard, reset)
 
@@ -147,7 +150,7 @@ def _decide_jump(jump: Jump, stated: Node, before: Funnel, after: Funnel, work: 
         decide_side = partial(_decide_side, jump, before, (k, index), sign, parts[name])
         at_width(jump.n, work, decide_side)
     if (last - first) << len(jump.box) > MAX_PIECES:
-        raise Rejected(f"more than {MAX_PIECES} intervals and vertices")
+        raise Rejected(f"more than {MAX_PIECES} intervals times vertices")
     vertices = list(product(*jump.box))
     needed = [(k, v, ()) for k, v in product(range(first, last), range(len(vertices)))]
     order, pieces = in_order(parts["pieces"], "tau mu", needed, 0, work)

@@ -84,6 +84,9 @@ class ContinuousPolicy:
     def __call__(self, t: float, X: ArrayLike) -> FloatArray:
         """Inputs (..., m) at time t for states X (..., n)."""
         X = np.asarray(X, dtype=np.float64)
+        n = self.x.control.shape[2]
+        if X.shape[-1:] != (n,):
+            raise ShapeError(f"the policy takes states (..., {n}), is given {X.shape}")
         return self.clipped(self.u(t) - (X - self.x(t)) @ self.K(t).T)
 
     def clipped(self, U: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
+from bags.pictures.funnel_plots import write_funnel_picture
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
@@ -22,10 +23,12 @@ from nlsid_core.design import (
     plan_motion,
 )
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
+from nlsid_core.designs import load_design
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, Rates
-from nlsid_core.errors import DataError, Infeasible, NlsidError
+from nlsid_core.errors import DataError, Infeasible, NlsidError, ShapeError
 from nlsid_core.proofs import check
 
+MASSES = {"arm": 2.0}  # in kg; a rate that asks for another mass is wrong
 PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"
 
 
@@ -100,6 +103,17 @@ def test_an_oscillator_without_an_input_is_proved() -> None:
     assert (found.funnel.widths(0.0) > [0.9, 1.1]).all()
 
 
+def test_a_design_that_is_read_again_has_its_policy_and_says_what_it_cannot_draw(
+    tmp_path: Path,
+) -> None:
+    design(ContinuousTracking(pendulum, upright(), goal=[0.2, 0.5])).save(tmp_path)
+    read = load_design(tmp_path)
+    with pytest.raises(ShapeError, match=r"states \(\.\.\., 2\), is given \(3,\)"):
+        read.policy(0.0, [1, 2, 3])
+    with pytest.raises(DataError, match="take `nlsid report`"):
+        write_funnel_picture(tmp_path / "funnel.png", read)
+
+
 # -- the motion ----------------------------------------------------------------------------------
 
 
@@ -111,6 +125,35 @@ def test_a_motion_that_stays_at_an_equilibrium_is_one() -> None:
     found = plan_motion(rate, start=[2.1, rest], end=[2.1, rest], seconds=10, u=[rest])
     assert np.abs(rate(np.array([2.1, rest]), [rest])).max() > 0  # by rounding
     np.testing.assert_allclose(found.x.control, [[[2.1, rest]] * 4] * 24, atol=1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-12, 1e-9, 1e-7])
+def test_an_equilibrium_that_is_known_to_some_digits_is_one(gap: float) -> None:
+    def rate(x: Any, u: Any) -> Any:
+        return [np.tanh(x[1]) - np.tanh(0.3) + gap, u[0] - x[1]]
+
+    found = plan_motion(rate, start=[0.3, 0.3], end=[0.3, 0.3], seconds=1, u=[0.3])
+    assert np.ptp(found.x.control, axis=(0, 1)).max() < 10 * gap
+    assert found.defect(Rates.numeric(rate, 2, 1))[0] < 1e-3 * max(10 * gap, 1e-9)
+
+
+def test_one_state_may_rest_while_another_moves() -> None:
+    def rate(x: Any, u: Any) -> Any:
+        return [u[0] - np.tanh(x[0]), np.exp(u[1]) - np.exp(x[1])]
+
+    found = plan_motion(rate, start=[0, 0.3], end=[1, 0.3], seconds=2, u=[0, 0.3])
+    np.testing.assert_allclose(found.x.control[:, :, 1], 0.3, atol=1e-12)
+    np.testing.assert_allclose(found.x.ends()[-1], [1, 0.3], atol=1e-12)
+
+
+def test_a_pressure_that_rests_is_a_motion_though_its_rate_is_rounded_coarsely() -> None:
+    def rate(x: Any, u: Any) -> Any:
+        return [1e12 * (u[0] - 1e-8 * np.sqrt(x[0])), u[1] - x[1]]
+
+    rest = [1e-8 * np.sqrt(1.1e6) * (1 + 1e-15), 0]
+    assert abs(rate([1.1e6, 0], rest)[0]) > 1e-9  # Pa/s, of 1e7
+    found = plan_motion(rate, start=[1.1e6, 0], end=[1.1e6, 0], seconds=1, u=rest, scale=[1e-5, 1])
+    np.testing.assert_allclose(found.x.control[:, :, 0], 1.1e6, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -335,11 +378,20 @@ def test_bounds_of_a_w_that_a_polynomial_does_not_have_are_refused() -> None:
         (blown, {"uncertain": 0.1}, r"rows \(low, high\) of w, is 0\.1"),
         (np.eye(2), {}, "dynamics should be a function or a VectorField"),
         (lambda x, u: [x[1], (x[0] + 2) ** 1.5 - 2**1.5 + u[0]], {}, "whatever the state"),
+        (lambda x, u: [x[1], u[0] / (x[0] - x[0])], {}, "the dynamics divide by zero"),
+        (lambda x, u: [x[1], u[0] * MASSES["load"]], {}, "cannot be expanded .KeyError: 'load'"),
+        (lambda x, u: [x[1], np.sinc(x[0]) + u[0]], {}, "cannot be expanded .AttributeError"),
+        (pendulum, {"policy": "lqr"}, "policy is 'lqr'; it should be a ContinuousPolicy"),
     ],
 )
 def test_equations_that_cannot_be_called_say_so(rate: Any, options: Any, said: str) -> None:
     with pytest.raises(NlsidError, match=said):
-        design_funnel(rate, upright(), goal=[0.2, 0.5], **options)
+        design(ContinuousTracking(rate, upright(), goal=[0.2, 0.5], **options))
+
+
+def test_what_is_no_problem_is_not_designed() -> None:
+    with pytest.raises(DataError, match="one of OutputTube, SampledTracking, ContinuousTracking"):
+        design(pendulum)  # type: ignore[call-overload]
 
 
 def test_a_design_without_a_motion_says_what_is_missing() -> None:
@@ -355,7 +407,9 @@ def test_a_design_without_a_motion_says_what_is_missing() -> None:
         ({"seconds": "2"}, "seconds should be above 0, is '2'"),
         ({"m": -1}, "m should be a whole number from 0 on, is -1"),
         ({"m": "1"}, "m should be a whole number from 0 on, is '1'"),
-        ({"knots": 1}, "knots should be a whole number from 2 on, is 1"),
+        ({"knots": 1}, "knots should be a whole number from 2 to 2000, is 1"),
+        ({"knots": 10**7}, "knots should be a whole number from 2 to 2000, is 10000000"),
+        ({"dynamics": lambda x, u: [x[1], u[0] * MASSES["load"]]}, "no value.*KeyError: 'load'"),
         ({"through": [0.5]}, r"through should be two or more states \(2,\)"),
         ({"start": [0.3], "end": [0.0]}, "an entry that is not there"),
         ({"dynamics": lambda x, u: [x[1], 1j * u[0]]}, "have no value at t = 0, x = "),
@@ -387,6 +441,22 @@ def test_a_state_to_integrate_from_that_is_no_state_is_named() -> None:
         integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[np.nan, 0])
     with pytest.raises(DataError, match="an entry that is not there"):
         integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[0.1])
+
+
+@pytest.mark.parametrize(
+    ("u", "t", "said"),
+    [
+        (None, [0, 1], "u should be a function of the time, is None"),
+        (lambda t: [1 / (t - 1)], [0, 1], "u has no value at t = 1 .ZeroDivisionError"),
+        (lambda t: [0.0] * (1 + (t > 0.5)), [0, 1], r"as many inputs at all times, returns \[1, 2"),
+        (lambda _: ["a"], [0, 1], r"u\(0\) should be numbers"),
+        (lambda _: [0.0], "0 1", "t should be numbers"),
+        (lambda _: [0.0], [0, np.inf], "two or more times that increase"),
+    ],
+)
+def test_inputs_that_cannot_be_followed_say_so(u: Any, t: Any, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        integrate_nominal(pendulum, u, t=t, start=[0.0, 0.0])
 
 
 def test_functions_of_math_are_refused_with_what_to_take() -> None:

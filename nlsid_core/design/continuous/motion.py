@@ -25,10 +25,12 @@ from nlsid_core.options import is_number, numbers
 FIRST_KNOTS = 25
 MORE_KNOTS = 3  # for one interval, at a time, where its cubic misses the dynamics
 MAX_KNOTS = 200
+MOST_GIVEN = 2000  # knots that one may ask for: programs grow with them
 KEPT = 0.9  # of the limits: the rest is there to correct with
 GOOD = 0.5  # of the defect that a funnel accepts
 MAX_STEPS, NEWTON_STEPS = 150, 20
 TRUST, SMALLEST = 1.0, 1e-7  # of the sizes of states and inputs
+LEAST_SIZE = 1e-4  # of a state's size in the guess: a smaller spread may be what programs leave
 PRICE = 1e2  # of a defect, over what the inputs may cost
 LOST = 1e6  # a defect of that size, relative to the states': the steps diverge
 SETTLED = 1e-10  # largest defect, relative to the states' sizes
@@ -75,9 +77,10 @@ def plan_motion(
         raise DataError(f"start and end should be finite, are {[e.tolist() for e in ends]}")
     if not is_number(seconds) or not 0 < seconds < np.inf:
         raise DataError(f"seconds should be above 0, is {seconds!r}")
-    for name, count, least in (("m", m, 0), ("knots", knots, 2)):
-        if count is not None and (not isinstance(count, int) or count < least):
-            raise DataError(f"{name} should be a whole number from {least} on, is {count!r}")
+    for name, count, least, most in (("m", m, 0, np.inf), ("knots", knots, 2, MOST_GIVEN)):
+        if count is not None and (not isinstance(count, int) or not least <= count <= most):
+            to = "on" if most == np.inf else f"to {most}"
+            raise DataError(f"{name} should be a whole number from {least} {to}, is {count!r}")
     if u is None and m is None and not isinstance(dynamics, VectorField):
         raise DataError("give u, the input that costs nothing, or m, how many inputs there are")
     count = dynamics.m if isinstance(dynamics, VectorField) else m
@@ -105,7 +108,9 @@ def plan_motion(
     x = np.stack([np.interp(t, share, column) for column in path.T], axis=1)
     x[0], x[-1] = ends
     straight = np.hstack([x, np.tile(rest, (len(t), 1))])
-    mesh = _Mesh(rates, t, n, rest, box, much, _held(rates, ends, rest, seconds, box))
+    spread = np.ptp(x, axis=0)
+    way = np.where(spread > 0, spread, np.maximum(np.abs(x).max(axis=0), 1))
+    mesh = _Mesh(rates, t, n, rest, box, way, much, _held(rates, ends, rest, seconds, box))
     straight[mesh.held, n:] = rest
     z = mesh.started(straight)
     while True:
@@ -152,13 +157,17 @@ def _held(
 
 @dataclass(eq=False)
 class _Mesh:
-    """Collocation on times t (K,): z (K, n + m) holds x and u; x is fixed at both ends."""
+    """Collocation on times t (K,): z (K, n + m) holds x and u; x is fixed at both ends.
+
+    way: (n,) how far each state goes in the guess, or its size where it stays. much: (m,).
+    """
 
     rates: VectorField | Rates
     t: FloatArray
     n: int
     rest: FloatArray
     box: FloatArray
+    way: FloatArray
     much: FloatArray
     held: list[int]
 
@@ -204,8 +213,9 @@ class _Mesh:
 
     def sizes(self, z: FloatArray) -> FloatArray:
         """(n + m,) what is a large change of each entry."""
-        spread = np.append(np.ptp(z[:, : self.n], axis=0), self.much)
-        return np.where(spread > 0, spread, 1.0)
+        spread = np.ptp(z[:, : self.n], axis=0)
+        spread = np.where(spread > 0, np.maximum(spread, LEAST_SIZE * self.way), self.way)
+        return np.append(spread, self.much)
 
     def defects(self, z: FloatArray) -> FloatArray:
         """(K-1, n) x₁ - x₀ - h/6 (f₀ + 4 f_middle + f₁), the middle on the cubic."""

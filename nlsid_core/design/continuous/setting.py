@@ -42,7 +42,7 @@ TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback r
 DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
-AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, in a state's unit a second
+AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +251,9 @@ def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
 
 def largest_defect(nominal: Nominal) -> float:
     """By how much ẋ₀ may miss the dynamics."""
-    return DEFECT * max(float(np.abs(nominal.x.derivative().control).max()), AT_REST)
+    rate = float(np.abs(nominal.x.derivative().control).max())
+    size = float(np.abs(nominal.x.control).max()) / float(np.ptp(nominal.t))
+    return DEFECT * max(rate, AT_REST * max(size, 1.0))
 
 
 def refuse_saturated(policy: ContinuousPolicy) -> None:

@@ -23,7 +23,7 @@ from nlsid_core.dynamics import (
     cubic_through,
     linear_through,
 )
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, NlsidError, SolverError
 from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
 
@@ -132,17 +132,17 @@ def integrate_nominal(
     field: or a function of some of t, x, u, named so. t: (K,) knots in s. Raises DataError unless
     one end is given and the knots increase.
     """
-    t = np.asarray(t, dtype=np.float64)
-    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
-        raise DataError("t should be two or more times that increase")
+    t = numbers(t, "t")
+    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all() or not np.isfinite(t).all():
+        raise DataError(f"t should be two or more times that increase, is {t.tolist()}")
     if (start is None) == (final is None):
         raise DataError("give the state at the start or at the end, not both")
     given = numbers(start if final is None else final, "the state")
     if given.ndim != 1 or not np.isfinite(given).all():
         raise DataError(f"the state should be n finite numbers, is {given.tolist()}")
-    m = u.control.shape[2] if isinstance(u, PiecewisePolynomial) else np.size(u(float(t[0])))
-    rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     inputs = u if isinstance(u, PiecewisePolynomial) else _cubic_input(u, t)
+    m = inputs.control.shape[2]
+    rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     values = inputs.ends()
     span, order = ((t[0], t[-1]), t) if final is None else ((t[-1], t[0]), t[::-1])
     solved = solve_ivp(
@@ -171,16 +171,28 @@ def nominal_through(t: ArrayLike, x: ArrayLike, u: ArrayLike, field: VectorField
 
 def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePolynomial:
     """Cubics through u at four Chebyshev-like points of each interval: exact for cubic u(t)."""
-    pieces = []
+    if not callable(u):
+        raise DataError(f"u should be a function of the time, is {u!r}")
+
+    def value(when: float) -> FloatArray:
+        try:
+            return np.ravel(numbers(u(when), f"u({when:.6g})"))
+        except NlsidError:
+            raise
+        except Exception as error:
+            raise DataError(
+                f"u has no value at t = {when:.6g} ({type(error).__name__}: {error})"
+            ) from error
+
     share = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+    values = [[value(float(a + s * (b - a))) for s in share] for a, b in itertools.pairwise(t)]
+    counts = {len(row) for rows in values for row in rows}
+    if len(counts) > 1:
+        raise DataError(f"u should return as many inputs at all times, returns {sorted(counts)}")
     # Values at the four points from Bernstein control points, inverted.
     to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
                           for s in share])  # fmt: skip
-    for start, end in itertools.pairwise(t):
-        values = np.array(
-            [np.ravel(np.asarray(u(float(start + s * (end - start))), float)) for s in share]
-        )
-        pieces.append(np.linalg.solve(to_values, values))
+    pieces = [np.linalg.solve(to_values, np.array(rows)) for rows in values]
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]
     return PiecewisePolynomial(t, control)

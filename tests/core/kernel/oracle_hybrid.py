@@ -100,6 +100,7 @@ class Leap:
             and all(low <= high for low, high in box)
             and all(len(row) == n + len(box) and sum(row) <= 7 for row in rows)
             and all(max(row[n:], default=0) <= 1 for row in rows)
+            and len({tuple(row[n:]) for row in rows}) <= 64
             and all(len(row) == n and sum(row) <= 7 for row in jump["guard"]["exponents"])
             and all(row[0] in range(n) for row in jump["valid"])
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -128,10 +129,13 @@ def squared(about: Files) -> None:
     }  # fmt: skip
 
 
-def many_vertices(about: Files) -> None:
-    """32 entries of w have 2^32 vertices."""
-    about["jump1.json"]["uncertain"] = [[0.0, 0.0]] * 32
-    about["jump1.json"]["reset"][0] = {"exponents": [[1] + [0] * 32], "coefficients": [1.0]}
+def many_products(about: Files) -> None:
+    """All 127 products of seven entries of w, each times 0."""
+    rows = [[0, *row] for row in product((0, 1), repeat=7)][1:]
+    about["jump1.json"]["uncertain"] = [[0.0, 0.0]] * 7
+    about["jump1.json"]["reset"][0] = {
+        "exponents": [*rows, [1] + [0] * 7], "coefficients": [0.0] * 127 + [1.0]
+    }  # fmt: skip
 
 
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
@@ -145,7 +149,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (watched_at_the_end, "1.2 s on, which is no knot"),
     (out_of_valid, "at 0.5 s x0 is not proved to be where the guard and the reset are valid"),
     (two_states, "leads from 1 states to 2, its stages have 1 and 1"),
-    (many_vertices, "more than 100000 intervals and vertices"),
+    (many_products, "more than 64 products of entries of w"),
     (squared, "degree above 1 in an entry of w"),
 ]
 
@@ -203,6 +207,18 @@ def test_jumps_and_stages_go_together() -> None:
     forged = case("cycle")
     forged.document["proof"]["jumps"] = []
     assert "should be a list of 1 to 50 entries" in refusal(forged)
+
+
+def test_vertices_are_counted_before_they_are_listed() -> None:
+    """32 entries of w have 2^32 vertices."""
+    forged = case("switch")
+    jump = forged.about["jump1.json"]
+    jump["uncertain"] = [[-1.0, 1.0]] * 32
+    jump["reset"] = [{"exponents": [[1] + [0] * 32], "coefficients": [1.0]}]
+    mutations.bind_again(forged)
+    contents = {name: files.encode(about) for name, about in forged.about.items()}
+    with pytest.raises(Rejected, match="jump1: more than 100000 intervals times vertices"):
+        kernel.decide(files.encode(forged.document), contents.__getitem__)
 
 
 def test_a_stage_with_a_hold_is_refused() -> None:
