@@ -8,7 +8,7 @@ from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
-from nlsid_core.errors import CertificateMismatch, DocumentError
+from nlsid_core.errors import CertificateMismatch, DataError, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
@@ -75,9 +75,17 @@ class Design(Generic[D, P, F, S]):
         return documents | {PROOF: _proof_document(documents, self.claim, self.proof)}
 
     def save(self, folder: Path | str) -> tuple[Path, ...]:
-        """Write model (or vector field), policy, funnel and proof; the paths, the proof last."""
+        """Write model (or vector field), policy, funnel and proof; the paths, the proof last.
+
+        Raises DataError if there is a file in the folder's place; other OS errors pass through.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise DataError(
+                f"{error.filename} is a file, not a folder to save a design in"
+            ) from error
         documents = self.documents()
         for name, document in documents.items():
             files.write_document(folder / name, document)

@@ -60,9 +60,11 @@ def require_at_least(owner: object, key: str, least: float) -> None:
 def numbers(value: object, name: str) -> FloatArray:
     """The value as an array of float64; DataError unless it is made of real numbers."""
     try:
-        return np.array(value, dtype=np.float64)
+        if np.array(value).dtype.kind not in "USc":  # texts of digits are none
+            return np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DataError(f"{name} should be numbers, of one shape, is {value!r}") from None
+        pass
+    raise DataError(f"{name} should be numbers, of one shape, is {value!r}")
 
 
 def is_number(value: object) -> bool:

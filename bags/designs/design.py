@@ -248,7 +248,11 @@ def read_design(
         )
     model = read_model(documents["model"])
     refuse_mismatch(model, policy, funnel)
-    held = Held.of_claim(claim or {}) if isinstance(funnel, ContinuousFunnel) else Held()
+    held = CONTINUOUSLY
+    if isinstance(funnel, ContinuousFunnel):
+        if claim is None:
+            raise DocumentError("with a continuous funnel goes the claim of its proof")
+        held = Held.of_claim(claim)
     if held.hold and wiring is not None:
         held.refuse(wiring.period)
     design: Any = WiredDesign(model, policy, funnel, wiring, held)

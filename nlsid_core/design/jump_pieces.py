@@ -126,18 +126,20 @@ class Crossing:
         }
 
     def _piece(self, part: Part, vertex: int) -> Json:
-        """The piece as the kernel reads it; Infeasible if it is not shown to be positive."""
-        ends = [self._instant(part.interval, vertex, s) for s in part.ends()]
-        worst = min(ends, key=lambda end: end.room)
-        if worst.room <= 0:
-            raise Infeasible(
-                "the reset is not shown to lead into the start of the next stage "
-                f"{self._said(part)}"
-            )
-        start, end = ends
-        for pair in ([start, end], [start, start], [end, end]):  # near an instant its own serve
-            with suppress(Infeasible):
-                return self._written(part, vertex, pair)
+        """The piece as the kernel reads it; Infeasible if it is not shown to be positive.
+
+        What w does is often little: multipliers of the first vertex are tried first.
+        """
+        for of in (0, vertex) if vertex else (0,):
+            start, end = (self._instant(part.interval, of, s) for s in part.ends())
+            if of == vertex and min(start.room, end.room) <= 0:
+                raise Infeasible(
+                    "the reset is not shown to lead into the start of the next stage "
+                    f"{self._said(part)}"
+                )
+            for pair in ([start, end], [start, start], [end, end]):  # near an instant its own serve
+                with suppress(Infeasible):
+                    return self._written(part, vertex, pair)
         raise Infeasible(f"no multipliers are found for all times {self._said(part)}")
 
     def _written(self, part: Part, vertex: int, ends: list[Multipliers]) -> Json:

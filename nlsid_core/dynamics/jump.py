@@ -1,7 +1,8 @@
 """`Jump`: a guard that falls through 0, and the reset of the state there, both polynomials."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ from nlsid_core.dynamics.vector_field import (
 )
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.options import numbers
-from nlsid_core.polynomial import Polynomial, trace
+from nlsid_core.polynomial import Polynomial, trace, variables
 
 FORMAT = "nlsid/jump"
 MAX_DEGREE, MAX_STATES = 7, 16
+DIRECTION_BITS = 6  # of the direction onto a guard
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +77,25 @@ class Jump:
         start: float,
         box: ArrayLike | None = None,
         uncertain: ArrayLike | None = None,
+        then: ArrayLike | None = None,
     ) -> "Jump":
         """Of functions guard(x), a polynomial, and reset(x) or reset(x, w), (n,).
 
         box: (n, 2) where a reset that is no polynomial of degree 3 or less is expanded, each such
         entry with a remainder as one more w; `valid` then states the box. uncertain: rows
-        (low, high) of w.
+        (low, high) of w. then: (n after, n) of what the reset is multiplied by, once it is expanded
+        (None: nothing): what is exact before that has no remainder.
 
         Raises DataError if an expansion needs a box, NlsidError on what nothing here expands.
         """
         rates = Rates.of(reset, n, 0, uncertain)
         (traced,) = np.ravel(trace(guard, {"x": n})).tolist()
+        after = np.eye(n) if then is None else numbers(then, "then")
+        if after.ndim != 2 or after.shape[1] != n:
+            raise ShapeError(f"then should have shape (states after, {n}), has {after.shape}")
         if not rates.inexact:
-            exact = tuple(p for p in rates.exact if p is not None)
-            return cls(n, start, traced, exact, rates.uncertain)
+            exact = [p for p in rates.exact if p is not None]
+            return cls(n, start, traced, _multiplied(after, exact), rates.uncertain)
         if box is None:
             raise DataError("the reset is no polynomial of degree 3 or less: give a box for it")
         rows = numbers(box, "box")
@@ -107,7 +114,32 @@ class Jump:
         valid = np.array([(j, low[j], high[j]) for j in rates.expanded])
         remainders = np.tile([-1.0, 1.0], (len(rates.inexact), 1))
         around = np.vstack([rates.uncertain, remainders])
-        return cls(n, start, traced, tuple(entries), around, valid, EXPANSION)
+        return cls(n, start, traced, _multiplied(after, entries), around, valid, EXPANSION)
+
+    def along(self, flow: ArrayLike) -> "Jump":
+        """The same jump, its reset extended off the guard so that it changes little along a flow.
+
+        flow: (n,) dx/dt at the guard, about. The reset is taken at x - flow g(x)/(g'flow), which is
+        x where g = 0: a claim about the guard is the same and is proved with fewer pieces. The
+        direction is rounded to few bits. Raises DataError for a guard that is not affine, or that
+        the flow does not cross.
+        """
+        flow, (slope, _) = np.asarray(flow, dtype=np.float64), self.slopes(np.zeros(self.n))
+        if self.guard.degree > 1 or not slope @ flow:
+            raise DataError("the guard should be affine, and the flow should cross it")
+        direction = -flow / (slope @ flow)
+        unit = 2.0 ** (np.ceil(np.log2(np.abs(direction).max())) - DIRECTION_BITS)
+        names = variable_names(self.n, 0, 0)
+        onto = {
+            name: x + Fraction(float(step)) * self.guard
+            for name, x, step in zip(
+                names,
+                (p.exact() for p in variables(names)),
+                np.round(direction / unit) * unit,
+                strict=True,
+            )
+        }
+        return replace(self, reset=tuple(p.substitute(onto) for p in self.reset))
 
     def vertices(self) -> FloatArray:
         """(2^n_w, n_w) corners of the box of w; one empty row without uncertainty."""
@@ -153,7 +185,7 @@ class Jump:
         """Raises DocumentError if the document is not a jump."""
         files.header(document, FORMAT, source=source)
         n = files.member(document, "states", int, source=source)
-        start = files.member(document, "start", float, source=source)
+        start = files.number(document, "start", source=source)
         rows = files.member(document, "uncertain", list, source=source)
         uncertain = files.array(document, "uncertain", (len(rows), 2), source=source)
         if not 1 <= n <= MAX_STATES:
@@ -177,3 +209,12 @@ class Jump:
     def save(self, path: Path | str) -> None:
         """Write the jump; the file appears whole or not at all."""
         files.write_document(path, self.document())
+
+
+def _multiplied(M: FloatArray, entries: Sequence[Polynomial]) -> tuple[Polynomial, ...]:
+    """M times polynomials, exactly."""
+    zero = 0 * entries[0].exact()
+    return tuple(
+        sum((Fraction(m) * p.exact() for m, p in zip(row, entries, strict=True) if m), zero)
+        for row in M.tolist()
+    )

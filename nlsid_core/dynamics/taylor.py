@@ -7,6 +7,7 @@ are cubics as they are written stay what they are; every other one has a bounded
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from math import inf, nextafter
 from typing import Any
 
@@ -14,11 +15,17 @@ import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
-from nlsid_core.dynamics.vector_field import VectorField, arguments, no_entry, variable_names
+from nlsid_core.dynamics.vector_field import (
+    Plan,
+    VectorField,
+    arguments,
+    no_entry,
+    variable_names,
+)
 from nlsid_core.errors import DataError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial
-from nlsid_core.polynomial.algebra import as_polynomial, variables
+from nlsid_core.polynomial.algebra import as_polynomial, constant, variables
 
 EXPANSION = (
     "cubic Taylor models with a remainder bounded in float64 arithmetic that counts every rounding "
@@ -94,6 +101,13 @@ class Rates:
     def inexact(self) -> list[int]:
         """The rates that need expanding."""
         return [i for i, p in enumerate(self.exact) if p is None]
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Of the values of the exact rates, 0 in the place of the others."""
+        names = ("t", *variable_names(self.n, self.m, len(self.uncertain)))
+        none = constant(0.0, names=names)
+        return Plan.of([none if p is None else p for p in self.exact], names)
 
     @property
     def expanded(self) -> list[int]:
@@ -236,10 +250,7 @@ class Cubic:
         z = np.hstack(
             [np.full((len(X), 1), t), X, U, np.broadcast_to(w[..., :given], (len(X), given))]
         )
-        result = np.empty((len(X), rates.n))
-        for i, p in enumerate(rates.exact):
-            if p is not None:
-                result[:, i] = p.rounded()(z)
+        result = rates.plan(z.T)
         if not self.rows:
             return result
         d = np.divide(z - self.centre, self.radius, out=np.zeros_like(z), where=self.radius > 0)

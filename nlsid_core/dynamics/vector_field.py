@@ -50,8 +50,8 @@ class VectorField:
     valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     expansion: str = ""
     names: tuple[str, ...] = field(init=False)
-    _plans: tuple["_Plan", ...] = field(init=False)
-    _slopes: dict[int, "_Plan"] = field(init=False, default_factory=dict)  # built when first asked
+    _plans: tuple["Plan", ...] = field(init=False)
+    _slopes: dict[int, "Plan"] = field(init=False, default_factory=dict)  # built when first asked
 
     def __post_init__(self) -> None:
         bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
@@ -93,7 +93,7 @@ class VectorField:
                     raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
         keep(self, {"breaks": breaks, "uncertain": bounds, "valid": valid})
         object.__setattr__(self, "pieces", tuple(pieces))
-        object.__setattr__(self, "_plans", tuple(_Plan.of(*_table(p, names)) for p in pieces))
+        object.__setattr__(self, "_plans", tuple(Plan.of(p, names) for p in pieces))
 
     @classmethod
     def from_function(
@@ -288,7 +288,7 @@ class VectorField:
         if span not in self._slopes:
             names = self.names[1 : 1 + self.n + self.m]
             slopes = [p.derivative(name) for p in self.pieces[span] for name in names]
-            self._slopes[span] = _Plan.of(*_table(slopes, self.names))
+            self._slopes[span] = Plan.of(slopes, self.names)
         w = self.uncertain.mean(axis=1)
         point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float), w])
         J = self._slopes[span](point[:, None]).reshape(self.n, self.n + self.m)
@@ -332,8 +332,8 @@ class VectorField:
 
 
 @dataclass(frozen=True, eq=False)
-class _Plan:
-    """Monomials as products of two earlier ones, a row of points each: fast for many points.
+class Plan:
+    """Values of polynomials, monomials as products of two earlier ones: fast for many points.
 
     products: (L, 2) rows of the stack [1, variables, products so far]. table: (n, stack size).
     """
@@ -342,7 +342,9 @@ class _Plan:
     table: FloatArray
 
     @classmethod
-    def of(cls, exponents: IntArray, table: FloatArray) -> "_Plan":
+    def of(cls, equations: Sequence[Polynomial], names: Sequence[str]) -> "Plan":
+        """Of n polynomials in the variables `names`."""
+        exponents, table = _table(equations, names)
         size = exponents.shape[1]
         known = {(0,) * size: 0}
         known |= {tuple(row): j + 1 for j, row in enumerate(np.eye(size, dtype=int).tolist())}

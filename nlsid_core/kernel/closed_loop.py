@@ -69,7 +69,7 @@ class ClosedLoop:
             else:
                 self.held.append((high - wanted) * (wanted - low))
         known = [self.in_time(funnel.t[k : k + 2]), *part.states, *inputs]
-        self.field = _apart(ring, equations, known)
+        self.field = apart(ring, equations, known)
         self.changes: dict[int, Change] = {}
 
     def _gains(self, i: int) -> list[Polynomial]:
@@ -126,7 +126,7 @@ class ClosedLoop:
         parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
         if "mu" in piece:
             parts.append((1, read_multiplier(piece["mu"], multiplier, self.ring) * self.gap))
-        parts += [(-weight, growth) for weight, growth in _at(off, self.growth)]
+        parts += [(-weight, growth) for weight, growth in at_vertex(off, self.growth)]
         if "tau" in piece:
             parts += self._taken(piece["tau"], self.shell + self.held, stated)
         return self.ring.weighted(parts)
@@ -139,7 +139,7 @@ class ClosedLoop:
         if i not in self.changes:
             self.changes[i] = self._change(i)
         parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.ring.made(self.h * room))]
-        parts += [(-sign * weight, change) for weight, change in _at(off, self.changes[i])]
+        parts += [(-sign * weight, change) for weight, change in at_vertex(off, self.changes[i])]
         parts += self._taken(piece["tau"], [self.gap, *self.held], stated)
         return self.ring.weighted(parts)
 
@@ -179,7 +179,7 @@ def _slope(points: Sequence[Fraction]) -> list[Fraction]:
     return [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
 
 
-def _at(off: Sequence[Fraction], parts: Change) -> list[tuple[Fraction, Polynomial]]:
+def at_vertex(off: Sequence[Fraction], parts: Change) -> list[tuple[Fraction, Polynomial]]:
     """What multiplies each polynomial at a vertex of (δ, w)."""
     return [
         (prod((value for value, e in zip(off, used, strict=False) if e), start=Fraction(1)), part)
@@ -187,10 +187,10 @@ def _at(off: Sequence[Fraction], parts: Change) -> list[tuple[Fraction, Polynomi
     ]
 
 
-def _apart(
+def apart(
     ring: Ring, equations: list[Terms], forms: list[Polynomial]
 ) -> dict[tuple[int, ...], list[Polynomial]]:
-    """f by its monomials in (δ, w), for t, x, u as forms in x̄ and s."""
+    """`equations` by their monomials in what comes after the variables that are `forms`."""
     rates: dict[tuple[int, ...], list[Terms]] = {}
     n, known = len(equations), len(forms)
     for i, equation in enumerate(equations):

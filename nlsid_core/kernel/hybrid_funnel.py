@@ -16,18 +16,20 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from itertools import chain, product
+from math import prod
 
 from . import text
-from .closed_loop import FunnelPart, read_multiplier
+from .closed_loop import FunnelPart, apart, read_multiplier
 from .continuous_funnel import MAX_PIECES, decide_funnel, in_order
 from .decision import Decision
 from .exact import inverse_forms
 from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import Polynomial, Ring, Work, at_width
-from .positivity import expanded, positive, read_squares, read_witness
+from .positivity import Squares, expanded, positive, read_squares, read_witness
 from .trajectory import MAX_BOUNDS, MAX_DEGREE, MAX_STATES, MAX_UNCERTAIN, Bounds, Funnel
 
 MAX_STAGES = 50  # with as many jumps
+MAX_PRODUCTS = 64  # of entries of w, in all of a reset
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,8 @@ def read_jump(node: Node) -> Jump:
     ]
     if any(max(e[n:], default=0) > 1 for row in reset for e, _ in row):
         raise Rejected("the reset has degree above 1 in an entry of w")
+    if len({e[n:] for row in reset for e, _ in row}) > MAX_PRODUCTS:
+        raise Rejected(f"the reset has more than {MAX_PRODUCTS} products of entries of w")
     start, expansion = parts["start"].number(), parts["expansion"].text()
     return Jump(n, start, box, bounds, expansion, guard, reset)
 
@@ -145,28 +149,64 @@ def _decide_jump(jump: Jump, stated: Node, before: Funnel, after: Funnel, work: 
     for name, k, index, sign in (("start", first, 0, 1), ("end", last - 1, 1, -1)):
         decide_side = partial(_decide_side, jump, before, (k, index), sign, parts[name])
         at_width(jump.n, work, decide_side)
-    if (last - first) * 2 ** len(jump.box) > MAX_PIECES:
+    if (last - first) << len(jump.box) > MAX_PIECES:
         raise Rejected(f"more than {MAX_PIECES} intervals times vertices")
     vertices = list(product(*jump.box))
     needed = [(k, v, ()) for k, v in product(range(first, last), range(len(vertices)))]
     order, pieces = in_order(parts["pieces"], "tau mu", needed, 0, work)
     multiplier = parts["multiplier"].monomials(jump.n)
 
+    crossings: dict[tuple[object, ...], Crossing] = {}  # of the last piece: others share it
+
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, _), level, index, i = order[number]
-        part, piece = FunnelPart(ring, before, (k, level, index)), pieces[i]
-        known = [*part.states, *map(ring.made, vertices[v])]
-        guard, *reached = ring.substituted([jump.guard, *jump.reset], known)
+        key = ring.width, k, level, index
+        if key not in crossings:
+            crossings.clear()
+            crossings[key] = Crossing(ring, jump, before, after, key[1:])
+        crossing, piece = crossings[key], pieces[i]
         tau = piece["tau"].members("columns squares") | {"basis": parts["sides"]}
-        taken = expanded(read_squares(tau, ring), ring) * part.gap
-        taken += read_multiplier(piece["mu"], multiplier, ring) * guard
-        away = [r - b for r, b in zip(reached, after.x[0][0], strict=True)]
-        c: Polynomial = after.rho[0] - ring.form(after.P[0], away) - taken
-        squares = read_squares(piece | {"basis": parts["basis"]}, ring)
-        positive(c, squares, ring, f"piece {i} (interval {k}, vertex {v})")
+        mu = read_multiplier(piece["mu"], multiplier, crossing.ring)
+        c = crossing.condition(read_squares(tau, crossing.ring), mu, vertices[v])
+        squares = read_squares(piece | {"basis": parts["basis"]}, crossing.ring)
+        positive(c, squares, crossing.ring, f"piece {i} (interval {k}, vertex {v})")
 
     for number in range(len(order)):
         at_width(jump.n, work, partial(decide_piece, number=number))
+
+
+class Crossing:
+    """What pieces of one part of time share: polynomials in x̄, and in s on it.
+
+    rooms: ρ_b - |R - b|²_{P_b} by monomials in w, each a product of two that R has.
+    """
+
+    def __init__(
+        self, ring: Ring, jump: Jump, before: Funnel, after: Funnel, place: tuple[int, int, int]
+    ) -> None:
+        self.ring, part = ring, FunnelPart(ring, before, place)
+        self.gap = part.gap
+        (self.guard,) = ring.substituted([jump.guard], part.states)
+        reached = apart(ring, jump.reset, part.states)
+        none = (0,) * len(jump.box)
+        centre = reached.setdefault(none, [ring.made(0) for _ in jump.reset])
+        reached[none] = [r - b for r, b in zip(centre, after.x[0][0], strict=True)]
+        self.rooms = [((none, none), ring.made(after.rho[0]))]
+        for i, (used, left) in enumerate(reached.items()):
+            weighed = ring.product(after.P[0], left)
+            for other, right in list(reached.items())[i:]:
+                twice = 1 if other == used else 2
+                self.rooms.append(((used, other), -twice * ring.dot(right, weighed)))
+
+    def condition(self, tau: Squares, mu: Polynomial, w: tuple[Fraction, ...]) -> Polynomial:
+        """c(s, x̄) of a piece at a vertex of w."""
+        parts: list[tuple[Fraction | int, Polynomial]] = [
+            (prod((value for used in pair for value, e in zip(w, used, strict=True) if e),
+                  start=Fraction(1)), room)
+            for pair, room in self.rooms
+        ]  # fmt: skip
+        taken = expanded(tau, self.ring) * self.gap
+        return self.ring.weighted([*parts, (-1, taken), (-1, mu * self.guard)])
 
 
 def _decide_valid(jump: Jump, funnel: Funnel, intervals: range, work: Work) -> None:

@@ -331,11 +331,14 @@ class ContinuousComparison:
         fields: Sequence[VectorField],
         policies: Sequence[ContinuousPolicy],
         funnels: Sequence[ContinuousFunnel],
-        period: float,
+        period: float | None,
         held: Sequence[Held],
     ) -> None:
-        if not period > 0.0:
-            raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+        if period is None or not period > 0.0:
+            raise DataError(
+                "a continuous funnel names no time between samples: `period` should be s "
+                f"above 0, is {period}"
+            )
         for each in held:
             each.refuse(period)
         self._held = tuple(held)

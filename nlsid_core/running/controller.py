@@ -120,7 +120,7 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
-        held: Held | None = None,
+        held: Held,
     ) -> "Controller":
         """The policies of a composition, one stage after another; `stage` is which.
 
@@ -137,7 +137,7 @@ class Controller:
     ) -> "Controller":
         """A policy of which nothing is proved, to be commissioned: it runs from any state."""
         controller = cls.__new__(cls)
-        controller._follow([(model, policy, None)], limits, 0.0, period, None)
+        controller._follow([(model, policy, None)], limits, 0.0, period, Held())
         return controller
 
     def _follow(
@@ -159,8 +159,11 @@ class Controller:
         self._continuous = isinstance(model, VectorField)
         if self._continuous:
             if period is None or not period > 0.0:
-                raise DataError(f"the samples of a continuous funnel need a period: {period} s")
-            self._held = held or Held()
+                raise DataError(
+                    "a continuous funnel names no time between samples: `period` should be s "
+                    f"above 0, is {period}"
+                )
+            self._held = Held.given(held)
             self._held.refuse(period)
             self.period, self._origin = period, float(policy.t[0])
             self._end = stages[-1][1].last - (1.0 - TOLERANCE) * period  # an input is held so long

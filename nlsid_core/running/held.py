@@ -28,6 +28,16 @@ class Held:
             return cls(float(hold))
         return cls(float(hold), files.array(claim, "error", (None,), source="claim"))
 
+    @classmethod
+    def given(cls, held: "Held | None") -> "Held":
+        """`held`; DataError if it is None, of a continuous funnel, whose file does not say it."""
+        if held is None:
+            raise DataError(
+                "a continuous funnel does not say how its policy may be applied, its claim does: "
+                "give `held`, Held.of_claim(design.claim)"
+            )
+        return held
+
     def refuse(self, period: float) -> None:
         """DataError if samples so many s apart are not covered though a hold is proved."""
         if self.hold and period > self.hold:

@@ -51,7 +51,7 @@ class Monitor:
     model: the model, or the vector field, that the policy and the funnel were made for. u: the
     input applied from t on (the latest command with a stamp not after t); it may be None at the
     last sample. centre: of a tube with a policy. Of a continuous funnel only, period: s between
-    samples, held: how its proof lets the policy be applied (None: continuously).
+    samples, held: how its proof lets the policy be applied, `Held.of_claim` of its claim.
 
     Tubes around a model's simulation are held for ever: see `TubeRun`. Around a plan, a run starts
     with the first sample, or at the stamp given to `restart`. It ends at the first sample that is
@@ -72,7 +72,7 @@ class Monitor:
         period: float | None = None,
         held: Held | None = None,
     ) -> None:
-        self._hold([model], [policy], [funnel], centre, period, [held or Held()])
+        self._hold([model], [policy], [funnel], centre, period, [held])
 
     @classmethod
     def of_several(
@@ -100,12 +100,12 @@ class Monitor:
         stages: Sequence[tuple[VectorField, AnyPolicy, AnyFunnel]],
         *,
         period: float,
-        held: Sequence[Held] = (),
+        held: Sequence[Held],
     ) -> "Monitor":
         """The continuous funnels of a composition, one stage after another; readings say which.
 
-        held: of each stage, its errors (none if empty). None has a hold: what is held into the
-        next stage is covered by no proof.
+        held: of each stage, its errors. None has a hold: what is held into the next stage is
+        covered by no proof.
         """
         if not stages:
             raise DataError("no stage to hold the state against")
@@ -123,7 +123,7 @@ class Monitor:
         funnels: list[AnyFunnel],
         centre: Centre,
         period: float | None,
-        held: Sequence[Held] = (),
+        held: Sequence[Held | None] = (),
     ) -> None:
         for parts in zip(models, policies, funnels, strict=True):
             refuse_mismatch(*parts)
@@ -309,7 +309,7 @@ def _comparison(
     policies: list[Any],
     funnels: list[Any],
     period: float | None,
-    held: Sequence[Held],
+    held: Sequence[Held | None],
 ) -> Comparison:
     """The arithmetic for funnels of this kind."""
     kinds = {type(funnel) for funnel in funnels}
@@ -318,8 +318,8 @@ def _comparison(
     if kinds == {SampledFunnel} and len(funnels) == 1:
         return SampledComparison(models[0], policies[0], funnels[0])
     if kinds == {ContinuousFunnel}:
-        held = held or [Held()] * len(funnels)
-        return ContinuousComparison(models, policies, funnels, period or math.nan, held)
+        given = [Held.given(each) for each in held]
+        return ContinuousComparison(models, policies, funnels, period, given)
     raise DataError("several funnels at once are held against tubes of one model only")
 
 

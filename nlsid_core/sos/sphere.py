@@ -125,11 +125,18 @@ class SphereProgram:
         })  # fmt: skip
 
     def solve(
-        self, g: ArrayLike, *, tolerance: float = 1e-8, start: SphereSolution | None = None
+        self,
+        g: ArrayLike,
+        *,
+        tolerance: float = 1e-8,
+        start: SphereSolution | None = None,
+        enough: float = np.inf,
     ) -> SphereSolution:
         """Maximise m for g (N,), the values at `points`, until `gap` ≤ tolerance.
 
-        start: the solution of a similar problem. Clarabel is the fallback, and `iterations` then 0.
+        start: the solution of a similar problem. enough: where m is above it by more than by what
+        it may still grow, it is not maximised further. Clarabel is the fallback, and `iterations`
+        then 0.
         Raises ShapeError or DataError on bad values, SolverError if nothing works. Rounding may
         stop a large program at a gap above the tolerance (1e-6 at n = 12): `gap` says so.
         """
@@ -144,7 +151,8 @@ class SphereProgram:
             return SphereSolution(
                 middle, middle, 0 * self._unit, self._centre, 0.0, 0, middle_point
             )
-        found = _solved(self, (values - middle) / spread, tolerance, start)
+        wanted = (enough - middle) / spread
+        found = _solved(self, (values - middle) / spread, tolerance, start, wanted)
         return SphereSolution(
             m=middle + spread * found.m,
             upper=middle + spread * found.upper,
@@ -166,12 +174,16 @@ class SphereProgram:
 
 
 def _solved(
-    program: SphereProgram, g: FloatArray, tolerance: float, start: SphereSolution | None
+    program: SphereProgram,
+    g: FloatArray,
+    tolerance: float,
+    start: SphereSolution | None,
+    enough: float,
 ) -> SphereSolution:
     """Warm; cold if that fails; Clarabel if that fails too."""
     for first in (start, None) if start is not None else (None,):
         try:
-            return _interior_point(program, g, tolerance, first)
+            return _interior_point(program, g, tolerance, first, enough)
         except SolverError:
             continue
     return _through_conic(program, g, tolerance)
@@ -200,7 +212,11 @@ def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> S
 
 
 def _interior_point(
-    program: SphereProgram, g: FloatArray, tolerance: float, start: SphereSolution | None
+    program: SphereProgram,
+    g: FloatArray,
+    tolerance: float,
+    start: SphereSolution | None,
+    enough: float,
 ) -> SphereSolution:
     """Predictor-corrector along the HKM direction, for g of spread 1."""
     V, ones = program._V, np.ones(len(g))
@@ -213,13 +229,13 @@ def _interior_point(
         upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
         if upper - m >= WARM_GAP or iteration == 0:
             centred = (X, y, m)
-        if upper - m <= max(tolerance, CERTIFY_FROM):
+        if upper - m <= max(tolerance, CERTIFY_FROM, m - enough):
             found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
             found = _certified(program, g, found)
             if best is not None and found.gap >= best.gap:
                 return best
             best = found
-            if upper - m <= tolerance:
+            if upper - m <= max(tolerance, found.m - enough):
                 return best
         Lx, Lz = _factor(X), _factor(Z)
         if Lx is None or Lz is None:

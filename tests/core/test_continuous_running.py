@@ -41,8 +41,10 @@ def driven(
 
 def test_a_held_policy_stays_inside_and_ends_before_an_input_would_act_beyond_the_proof() -> None:
     field, policy, funnel = stage()
-    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
-    monitor = Monitor(field, policy, funnel, period=HELD)
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
+    )
+    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
     states, said = driven(controller, monitor, 0.15)
     assert set(said) == {Status.INSIDE}
     assert controller.ended == "the proof is over"
@@ -55,7 +57,9 @@ def test_a_held_policy_stays_inside_and_ends_before_an_input_would_act_beyond_th
 def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() -> None:
     field, policy, funnel = stage()
     x = np.array([0.1])
-    reading = Monitor(field, policy, funnel, period=HELD).update(0.0, x, policy(0.0, x))
+    reading = Monitor(field, policy, funnel, period=HELD, held=Held()).update(
+        0.0, x, policy(0.0, x)
+    )
     assert (
         reading.assuming == "the policy is applied continuously; here each input is held for 0.02 s"
     )
@@ -67,7 +71,9 @@ def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() ->
     funnel = replace(
         funnel, vector_field=policy.vector_field, policy=files.digest(policy.document())
     )
-    reading = Monitor(pushed, policy, funnel, period=HELD).update(0.0, x, policy(0.0, x))
+    reading = Monitor(pushed, policy, funnel, period=HELD, held=Held()).update(
+        0.0, x, policy(0.0, x)
+    )
     assert reading.assuming.endswith("held for 0.02 s, and w stays in its box")
 
 
@@ -114,11 +120,15 @@ def test_a_state_that_may_be_wrong_is_inside_only_if_all_that_it_may_be_is() -> 
 
 def test_a_push_is_outside_and_another_input_is_not_the_policys() -> None:
     field, policy, funnel = stage()
-    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
-    _, said = driven(controller, Monitor(field, policy, funnel, period=HELD), 0.0, push=0.5)
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
+    )
+    _, said = driven(
+        controller, Monitor(field, policy, funnel, period=HELD, held=Held()), 0.0, push=0.5
+    )
     assert said[20] is Status.INSIDE
     assert said[21] is Status.OUTSIDE
-    monitor, x = Monitor(field, policy, funnel, period=HELD), np.array([0.0])
+    monitor, x = Monitor(field, policy, funnel, period=HELD, held=Held()), np.array([0.0])
     reading = monitor.update(0.0, x, policy(0.0, x) + 0.1)
     assert reading.status is Status.ASSUMPTION_VIOLATED
     assert "u0 1.1 is not the policy's 1" in reading.reason
@@ -139,7 +149,7 @@ def test_what_cannot_be_judged_ends_the_run(
     t: float, x: list[float], u: list[float] | None, reason: str
 ) -> None:
     field, policy, funnel = stage()
-    monitor = Monitor(field, policy, funnel, period=HELD)
+    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
     assert monitor.update(0.0, [0.0], [1.0]).status is Status.INSIDE
     for reading in (monitor.update(t, x, u), monitor.update(2 * HELD, [0.0], [1.0])):
         assert reading.status is Status.UNKNOWN
@@ -148,7 +158,7 @@ def test_what_cannot_be_judged_ends_the_run(
 
 def test_after_the_end_nothing_is_claimed() -> None:
     field, policy, funnel = stage()
-    monitor = Monitor(field, policy, funnel, period=0.25)
+    monitor = Monitor(field, policy, funnel, period=0.25, held=Held())
     for k in range(4):
         assert monitor.update(0.25 * k, [0.25 * k], [1.0]).status is Status.INSIDE
     assert monitor.update(1.0, [1.0], None).status is Status.INSIDE
@@ -162,7 +172,7 @@ def test_after_the_end_nothing_is_claimed() -> None:
 def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     """At 0.8 s of the first stage 0.15 m is outside, at the second's start it is inside."""
     first, second = stage(), stage(1.0, 0.3)
-    monitor = Monitor.of_stages([first, second], period=0.2)
+    monitor = Monitor.of_stages([first, second], period=0.2, held=[Held(), Held()])
     said, stages = [], []
     for k in range(11):
         t = 0.2 * k
@@ -177,23 +187,31 @@ def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     assert outside == [4]
     assert stages == ["stage 1 of 2"] * 5 + ["stage 2 of 2"] * 6
     assert set(said) == {Status.INSIDE, Status.OUTSIDE}
-    controller = Controller.of_stages([first, second], limits=LIMITS, settling=1.0, period=HELD)
+    controller = Controller.of_stages(
+        [first, second], limits=LIMITS, settling=1.0, period=HELD, held=Held()
+    )
     assert (controller.stage, controller.stages) == (1, 2)
-    states, said = driven(controller, Monitor.of_stages([first, second], period=HELD), 0.1)
+    states, said = driven(
+        controller, Monitor.of_stages([first, second], period=HELD, held=[Held(), Held()]), 0.1
+    )
     assert controller.ended == "the proof is over"
     assert controller.stage == 2
     assert len(states) == round(2.0 / HELD) + 1
     assert set(said) == {Status.INSIDE}
     with pytest.raises(CertificateMismatch, match="do not follow"):
-        Monitor.of_stages([second, first], period=HELD)
+        Monitor.of_stages([second, first], period=HELD, held=[Held(), Held()])
 
 
 def test_a_clipped_policy_is_proved_as_it_is_and_other_limits_end_the_run() -> None:
     field, policy, funnel = stage(limit=1.2)
-    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
+    )
     assert controller.update(0.0, np.array([-0.15])) == pytest.approx(1.2)
     narrow = Limits(lowest=-1.1, highest=1.1, stop_rate=1.0)
-    controller = Controller(field, policy, funnel, limits=narrow, settling=1.0, period=HELD)
+    controller = Controller(
+        field, policy, funnel, limits=narrow, settling=1.0, period=HELD, held=Held()
+    )
     controller.update(0.0, np.array([-0.15]))
     assert "is not proved" in controller.ended
     with pytest.raises(DataError, match="beyond the limits"):
@@ -204,12 +222,15 @@ def test_a_clipped_policy_is_proved_as_it_is_and_other_limits_end_the_run() -> N
             limits=Limits(lowest=0.0, highest=0.5, stop_rate=1.0),
             settling=1.0,
             period=HELD,
+            held=Held(),
         )
 
 
 def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
     field, policy, funnel = stage()
-    controller = Controller(field, policy, funnel, limits=LIMITS, settling=0.1, period=HELD)
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=0.1, period=HELD, held=Held()
+    )
     for k in range(10):
         controller.update(k * HELD, np.array([0.5]))
     assert "not at the start of the plan after 0.1 s" in controller.ended
@@ -234,14 +255,20 @@ def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limit
 
 def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
     field, policy, funnel = stage()
-    with pytest.raises(DataError, match="need a period"):
-        Monitor(field, policy, funnel)
-    with pytest.raises(DataError, match="need a period"):
+    with pytest.raises(DataError, match="names no time between samples"):
+        Monitor(field, policy, funnel, held=Held())
+    with pytest.raises(DataError, match="names no time between samples"):
         Controller(field, policy, funnel, limits=LIMITS, settling=1.0)
+    for unsaid in (
+        lambda: Monitor(field, policy, funnel, period=HELD),
+        lambda: Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD),
+    ):
+        with pytest.raises(DataError, match="does not say how its policy may be applied"):
+            unsaid()
     with pytest.raises(CertificateMismatch, match="another policy"):
-        Monitor(field, stage(limit=2.0)[1], funnel, period=HELD)
+        Monitor(field, stage(limit=2.0)[1], funnel, period=HELD, held=Held())
     with pytest.raises(ShapeError):
-        Monitor(field, policy, funnel, period=HELD).update(0.0, [0.0, 0.0], [1.0])
+        Monitor(field, policy, funnel, period=HELD, held=Held()).update(0.0, [0.0, 0.0], [1.0])
 
 
 def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
@@ -278,7 +305,7 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
     write_run(tmp_path / "bag", design, samples)
     replayed = [entry.reading for entry in replay_messages(design, tmp_path / "bag")]
     assert replayed[0].reason == "waiting for the controller to announce its start"
-    monitor = Monitor(field, policy, funnel, period=HELD)
+    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
     direct = [monitor.update(k * period_ns / 1e9, x, u) for k, (x, u) in enumerate(samples)]
     assert [r.margin for r in replayed[1:]] == [r.margin for r in direct]
     assert {r.status for r in replayed[1:]} == {Status.INSIDE}

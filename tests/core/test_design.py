@@ -128,6 +128,14 @@ def test_a_design_is_loaded_as_it_was_saved(any_design: AnyDesign, tmp_path: Pat
     assert [p.read_bytes() for p in paths] == [p.read_bytes() for p in again]
 
 
+def test_a_design_is_not_saved_over_a_file(any_design: AnyDesign, tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    for folder in (tmp_path / "notes", tmp_path / "notes" / "inside"):
+        with pytest.raises(DataError, match="is a file, not a folder"):
+            any_design.save(folder)
+    assert (tmp_path / "notes").read_text() == "mine"
+
+
 @pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
 def test_a_file_of_another_design_is_not_loaded(
     any_design: AnyDesign, tmp_path: Path, name: str

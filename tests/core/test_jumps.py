@@ -11,13 +11,19 @@ from typer.testing import CliRunner
 from bags.commands.cli import app
 from bags.designs.bundle import Bundle
 from bags.designs.documents import funnel_of
-from examples import bouncer
+from examples import bouncer, compass_gait
 from nlsid_core import documents
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import Goal, compose_jumps, goal_before
 from nlsid_core.designs import HYBRID
 from nlsid_core.dynamics import Jump
-from nlsid_core.errors import CertificateRejected, DataError, DocumentError, Infeasible
+from nlsid_core.errors import (
+    CertificateRejected,
+    DataError,
+    DocumentError,
+    Infeasible,
+    ShapeError,
+)
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.proofs import check
@@ -109,6 +115,54 @@ def test_no_bounce_of_a_thousand_leaves(found: Found) -> None:
     left, V = bounced(found, 1000, 0.005)
     print("largest V after the landing", V.max())
     assert left == 0
+
+
+@pytest.fixture(scope="module")
+def gait(tmp_path_factory: pytest.TempPathFactory) -> Found:
+    """The proof of the compass gait's step, and its strike, composed into a cycle."""
+    design, strike = compass_gait.designed()
+    path = design.save(tmp_path_factory.mktemp("step"))[-1]
+    whole = compose_jumps([path], [strike], path.parent / "gait")
+    said = str(check(whole))
+    assert "stage1 jumps into stage1, so for ever" in said
+    assert "cubic Taylor models" in said
+    return path, strike
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_no_step_of_a_thousand_compass_gaits_leaves(gait: Found) -> None:
+    """The true dynamics and the true strike, from the boundary, in the states of the funnel."""
+    funnel = ContinuousFunnel.load(gait[0].with_name("funnel.json"))
+    policy = ContinuousPolicy.load(gait[0].with_name("policy.json"))
+
+    def rate(X: FloatArray, U: FloatArray) -> FloatArray:
+        return np.stack(compass_gait.shaped(X.T, U.T), axis=1)
+
+    X, t = landings(rate, policy, gait[1], boundary(funnel, 1000), 0.002)
+    V = funnel.value(
+        funnel.t0, np.stack(compass_gait.shaped_struck(X.T), axis=1) @ compass_gait.SHAPE.T
+    )
+    print("strikes from", t.min(), "to", t.max(), "s; largest V after the strike", V.max())
+    assert (t > gait[1].start).all()
+    assert int((V > 1).sum()) == 0
+    assert V.max() > 0.02, "starts are not all the same"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_compass_gait_is_the_published_one(gait: Found) -> None:
+    """The swing leg is ahead, and the foot in the air, from before the guard is watched."""
+    start, seconds = compass_gait.striking()
+    apart = (start[1] - start[0]) / 2
+    assert (apart, seconds) == pytest.approx(compass_gait.PUBLISHED, abs=7e-4)
+    funnel = ContinuousFunnel.load(gait[0].with_name("funnel.json"))
+    legs = compass_gait.BACK[:2]
+    for t in np.linspace(0.5, gait[1].start, 50):
+        centre, around = legs @ funnel.nominal(t), legs @ np.linalg.inv(funnel.shape(t)) @ legs.T
+        lift = centre.sum() + 2 * compass_gait.SLOPE
+        assert lift > np.sqrt(around.sum()), "above the ground"
+        assert centre[0] - centre[1] > 0.3, "legs apart, the swing leg ahead"
 
 
 @pytest.mark.slow
@@ -218,6 +272,41 @@ def test_a_reset_that_is_no_polynomial_is_covered_by_its_remainder() -> None:
     assert again.document() == jump.document()
     with pytest.raises(DataError, match="give a box"):
         Jump.of(lambda x: [x[0]], reset, 2, start=0.0)
+
+
+def test_a_reset_that_is_extended_along_a_flow_is_the_same_on_the_guard() -> None:
+    def reset(x: Any) -> list[Any]:
+        return [x[1] * x[2], x[0] + x[2] ** 3, x[0] * x[1] - 2.0]
+
+    jump = Jump.of(lambda x: [x[0] + 2 * x[1] - 0.3], reset, 3, start=0.0)
+    flow = np.array([1.0, -3.0, 0.7])
+    along = jump.along(flow)
+    rng = np.random.default_rng(3)
+    X = rng.normal(size=(50, 3))
+    X[:, 0] = 0.3 - 2 * X[:, 1]
+    assert along(X) == pytest.approx(jump(X), abs=1e-12)
+    assert along(X) == pytest.approx(np.array([reset(x) for x in X]), abs=1e-12)
+    moved = X + 0.01 * flow
+    by_flow, by_itself = np.abs(along(moved) - jump(X)), np.abs(jump(moved) - jump(X))
+    assert by_flow.max() < 0.05 * by_itself.max(), "direction is rounded to few bits only"
+    with pytest.raises(DataError, match="should be affine, and the flow should cross it"):
+        jump.along([2.0, -1.0, 5.0])
+
+
+def test_what_is_multiplied_after_an_expansion_has_no_more_remainders() -> None:
+    def reset(x: Any) -> list[Any]:
+        return [x[1], np.sin(x[0])]
+
+    M = np.array([[1.0, -2.0], [0.5, 3.0], [0.0, 1.0]])
+    box = [[-0.3, 0.3], [-1.0, 1.0]]
+    jump = Jump.of(lambda x: [x[0]], reset, 2, start=0.0, box=box, then=M)
+    assert (len(jump.uncertain), len(jump.reset)) == (1, 3)
+    X = np.random.default_rng(1).uniform(-0.3, 0.3, (200, 2))
+    true = np.stack(reset(X.T), axis=1) @ M.T
+    spread = np.abs(jump(X, [1.0]) - jump(X, [-1.0])) / 2
+    assert (np.abs(true - jump(X)) <= spread + 1e-12).all()
+    with pytest.raises(ShapeError, match="then should have shape"):
+        Jump.of(lambda x: [x[0]], reset, 2, start=0.0, box=box, then=np.eye(3))
 
 
 def test_a_damaged_jump_is_refused(found: Found) -> None:

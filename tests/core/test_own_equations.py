@@ -68,8 +68,8 @@ def test_the_page_writes_a_problem_for_the_command_line(
     exec(code, {})
     ended = CliRunner().invoke(app, ["funnel", "--problem", "spring.json", "--out", "spring"])
     assert ended.exit_code == 0, ended.output
-    assert "is applied every 0.032 s or more often" in ended.output
-    assert "with a hold of 0.032 s, 0.165 of the half-widths are left" in ended.output
+    assert "is applied every 0.0452548" in ended.output
+    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in ended.output
 
 
 @pytest.mark.slow
@@ -239,6 +239,7 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
         ({"goal": [0.2, 0.5], "uncertain": [[-1, 1]]}, "no argument w|function of some of"),
         ({"goal": [0.2, 0.5], "hold": 50.0}, "the hold of 50 s is longer than the motion"),
         ({"goal": "small"}, "the goal should be numbers, of one shape, is 'small'"),
+        ({"goal": ["0.2", "0.5"]}, "the goal should be numbers"),
         ({"goal": [0.2, 0.5], "uncertain": 0.1}, "uncertain should be rows|function of some of"),
     ],
 )

@@ -204,3 +204,18 @@ def test_values_of_the_wrong_shape_or_not_finite_are_refused() -> None:
         program.solve(np.full(len(program.points), np.nan))
     with pytest.raises(DataError, match="expected indices"):
         SphereProgram(3, nonlinear=(5,))
+
+
+def test_a_program_ends_where_half_of_what_is_left_is_enough() -> None:
+    program = SphereProgram(6)
+    g = random_quartic(6, 4)(program.points)
+    whole = program.solve(g, tolerance=1e-8)
+    spread = float(np.ptp(g))
+    for share in (0.3, 0.03):
+        enough = whole.m - share * spread
+        found = program.solve(g, tolerance=1e-8, enough=enough)
+        assert found.iterations < whole.iterations
+        assert enough + (found.upper - found.m) <= found.m <= whole.upper
+        gram = program.gram(found)
+        assert np.linalg.eigvalsh(gram)[0] > -1e-9 * spread
+    assert program.solve(g, tolerance=1e-8, enough=whole.upper + spread).gap <= 1e-8

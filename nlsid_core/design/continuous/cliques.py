@@ -140,10 +140,11 @@ class CliqueSteps(LSteps):
         return self.cliques
 
     def solved_case(
-        self, section: Section, rho: float, case: int, start: SphereSolution | None
-    ) -> SphereSolution:
-        """φ, of the only case; `start` changes nothing."""
-        del case, start
+        self, section: Section, rho: float, case: int, start: SphereSolution | None,
+        enough: float = np.inf,
+    ) -> SphereSolution:  # fmt: skip
+        """φ, of the only case; `start` and `enough` change nothing."""
+        del case, start, enough
         P, g = self._posed(section, rho)
         found = self.cliques.small.solve(P, g, tolerance=FINER * self.tolerance)
         basis = self.cliques.basis

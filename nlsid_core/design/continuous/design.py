@@ -27,6 +27,12 @@ from nlsid_core.design.continuous.finer import (
 )
 from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
+from nlsid_core.design.continuous.held_sweep import (
+    changes_by_size,
+    held_sweep,
+    widths_by_size,
+    with_widths,
+)
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
@@ -50,7 +56,8 @@ from nlsid_core.progress import Progress, silent
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
-SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
+SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
+STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 GROWTH = 4.0  # of the margin, where some piece is not proved
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
@@ -366,79 +373,62 @@ def _found(setting: Setting, progress: Progress) -> _Found:
     if hold.shortest > span:
         raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
 
-    known: dict[float, Changes] = {}
+    changes = changes_by_size(setting, expansion) if hold.period else {}
 
     def held(period: float) -> _Found:
-        return _held(setting, expansion, replace(hold, period=period), known, progress)
+        return _held(setting, expansion, replace(hold, period=period), changes, progress)
 
     if not hold.longest:
         return held(hold.period)
-    return _longest(hold, held)
+    return _longest(held)
 
 
-def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
-    """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
-    with suppress(Infeasible):
-        return held(LONGEST)
-    period, found = hold.period, None
-    while found is None:
+def _longest(held: Callable[[float], _Found]) -> _Found:
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for.
+
+    It is looked for in larger and larger steps, and then between the last two.
+    """
+    shorter = -1
+    for step in STEPS:
         try:
-            found = held(period)
-        except Infeasible:
-            if period <= hold.shortest:
-                raise
-            period /= 2**0.5
-    if period == hold.period:
-        with suppress(Infeasible):
-            return held(2**0.5 * period)
-    return found
+            found = held(LONGEST / 2 ** (step / 2))
+        except Infeasible as error:
+            refusal, shorter = error, step
+            continue
+        for between in range(shorter + 1, step):
+            with suppress(Infeasible):
+                return held(LONGEST / 2 ** (between / 2))
+        return found
+    raise refusal
 
 
 def _held(
-    setting: Setting, expansion: Expansion | None, hold: Hold, known: dict[float, Changes],
+    setting: Setting, expansion: Expansion | None, hold: Hold, changes: dict[float, Changes],
     progress: Progress,
 ) -> _Found:  # fmt: skip
-    """The funnel for one hold, within scaled copies of the free one.
+    """The funnel for one hold, in one that a sweep expects within scaled copies of the free one.
 
-    A smaller copy has its own expansion, which leaves out less and has room for what is held.
-    known: by scale, what does not depend on the hold; it is added to.
+    changes: of the free funnel by size; empty without a hold.
     """
-    steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
-    free = setting.free
+    policy, free, t = setting.policy, setting.free, setting.policy.t
     assert free is not None
-    widths: FloatArray = np.zeros((len(P) - 1, field.m))
-    t = policy.t
     reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
+    table = widths_by_size(changes, setting, hold)
+    widths = table[-1]
     for scale in SCALES:
-        if expansion is not None and scale < 1:
-            rho = scale * free
-            field = field_of(
-                [
-                    expansion.around(policy, P, k, (rho[k], rho[k + 1]), scale**0.5 * widths[k])
-                    for k in range(len(P) - 1)
-                ],
-                policy.t,
-            )
-            policy = replace(policy, vector_field=files.digest(field.document()))
-        outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
-        held = LSteps(
-            field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            widths=np.zeros((len(P) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
-        )  # fmt: skip
-        rates: FloatArray = np.zeros(widths.shape)
-        widths = hold.widths(policy, rates)
-        if hold.period:
-            changes = known.get(scale) if field is steps.field else None
-            if changes is None:
-                changes = Changes.of(held, policy, outer)
-            if field is steps.field:
-                known[scale] = changes
-            rates, widths = fastest(changes, policy, hold)
-        held.widths = widths
-        setting = replace(setting, steps=held, policy=policy, hold=hold, rates=rates)
         try:
-            caps = validity_caps(field, policy, P, widths)
-            return _swept(setting, np.minimum(caps, outer.rho), progress)
+            rho, field = held_sweep(setting, expansion, table, scale * free, progress)
+            policy = replace(policy, vector_field=files.digest(field.document()))
+            outer = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, "")
+            steps = with_widths(replace(setting, policy=policy), field)
+            rates: FloatArray = np.zeros(widths.shape)
+            widths = hold.widths(policy, rates)
+            if hold.period:
+                rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
+            steps.widths = widths
+            caps = validity_caps(field, policy, setting.P, widths)
+            held = replace(setting, steps=steps, policy=policy, hold=hold, rates=rates)
+            return _swept(held, np.minimum(caps, rho), progress)
         except (Infeasible, DataError) as error:
             refusal = error
         if isinstance(refusal, NoFunnel):
@@ -517,7 +507,7 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> _Found:
 
     def search(margin: float) -> tuple[Setting, FloatArray, list[Ends] | None]:
         found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
-                          progress=progress)  # fmt: skip
+                          expected=setting.rates is not None, progress=progress)  # fmt: skip
         return setting, *found
 
     return proved_for(setting, rho_final, search)

@@ -187,15 +187,18 @@ def sweep_expanded(
     *,
     margin: float,
     rho_final: float,
+    caps: FloatArray | None = None,
+    most_back: int = MAX_BACK,
     progress: Progress = silent,
 ) -> Swept:
     """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
 
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the earliest time that
-    was reached, and why it was not passed where least was missing.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below. most_back: how
+    often ρ at an interval's end is lowered for its start. Raises Infeasible naming the earliest
+    time that was reached, and why it was not passed where least was missing.
     """
     K = len(P)
-    rho, caps = np.full(K, rho_final), np.full(K, np.inf)
+    rho, caps = np.full(K, rho_final), np.full(K, np.inf) if caps is None else caps.copy()
     ends: dict[int, Ends] = {}
     k, back = K - 2, 0
     farthest, refusal, left = K, Infeasible(""), -np.inf
@@ -215,7 +218,7 @@ def sweep_expanded(
                 if k < farthest or (k == farthest and found.diagnosis.left > left):
                     farthest, refusal, left = k, found, found.diagnosis.left
                 back += 1
-                if back > MAX_BACK:
+                if back > most_back:
                     raise refusal from None
                 share = BACK
         # What ρ_{k+1} leaves at the end of this interval is too much for its box or its feedback.
@@ -241,7 +244,8 @@ class _Interval:
     def expand(self, rho: float) -> bool:
         """Take the cubics around the funnel with this ρ at the start; False if there are none."""
         try:
-            cubic = self.expansion.around(self.policy, self.P, self.k, (rho, self.after))
+            held = None if self.steps.widths is None else self.steps.widths[self.k]
+            cubic = self.expansion.around(self.policy, self.P, self.k, (rho, self.after), held)
         except NoExpansion:
             return False
         self.steps.local[self.k] = cubic

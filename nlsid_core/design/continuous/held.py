@@ -38,7 +38,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 
 MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
 ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
-FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
+LONGEST, SHORTEST = 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
 LARGEST_RATIO = 0.5  # of a change to the last, whose geometric series is taken in one step
 SETTLED = 1.005  # of the rates before: ROOM holds what is left
@@ -72,7 +72,7 @@ class Hold:
             bounds = np.full(n, np.nan)
         if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
             raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
-        period = hold if isinstance(hold, float) else FIRST if longest else 0.0
+        period = hold if isinstance(hold, float) else LONGEST if longest else 0.0
         return cls(period, bounds, longest)
 
     @property
@@ -207,15 +207,21 @@ class Changes:
             np.diff(funnel.t), curving,
         )  # fmt: skip
 
-    def rates(self, widths: FloatArray) -> FloatArray:
-        """(intervals, m) the largest at the ends of intervals, for δ in these widths."""
+    def rates(self, widths: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
+        """(intervals, m) the largest at the ends of intervals, for δ in these widths.
+
+        size: (K,) at the knots, of a funnel's half-widths over those of the one this is of.
+        """
         result = np.zeros(widths.shape)
         weights = np.prod(np.where(self.chosen == 1, widths[:, None], 1.0), axis=2)[self.interval]
         place = np.repeat(np.column_stack([self.interval, self.entry]), len(self.signs), axis=0)
         pushed = self.taken + (self.shoved * widths[self.interval]).sum(axis=1)
         h, taken = self.h[place[:, 0]], np.repeat(pushed, len(self.signs))
-        for products in self.products:
-            p = [self.signs @ (weights[..., None] * part) for part in products]
+        sizes = np.broadcast_to(size, len(self.h) + 1)
+        for end, products in enumerate(self.products):
+            scale = sizes[self.interval + end, None, None]
+            p = [self.signs @ (weights[..., None] * part) * scale**q
+                 for q, part in enumerate(products)]  # fmt: skip
             for sign in (-1, 1):
                 flat = [sign * part.reshape(len(h), -1) for part in p]
                 least = least_rates(flat, self.curving).least
@@ -224,14 +230,16 @@ class Changes:
 
 
 def fastest(
-    changes: Changes, policy: ContinuousPolicy, hold: Hold
+    changes: Changes, policy: ContinuousPolicy, hold: Hold, size: FloatArray | float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
-    """(intervals, m) R and W for a funnel: each for the other, R with room."""
+    """(intervals, m) R and W for a funnel: each for the other, R with room; size: see
+    `Changes.rates`.
+    """
     rates = np.zeros((len(policy.t) - 1, changes.chosen.shape[1]))
     last = np.zeros_like(rates)
     for _ in range(MAX_ROUNDS):
         before = rates
-        rates = np.maximum(before, ROOM * changes.rates(hold.widths(policy, before)))
+        rates = np.maximum(before, ROOM * changes.rates(hold.widths(policy, before), size))
         if (rates <= SETTLED * before).all():
             break
         change = rates - before

@@ -27,10 +27,15 @@ class LineProgram:
     points: FloatArray = field(default_factory=lambda: np.array([[1.0], [-1.0]]))
 
     def solve(
-        self, g: ArrayLike, *, tolerance: float = 1e-8, start: SphereSolution | None = None
+        self,
+        g: ArrayLike,
+        *,
+        tolerance: float = 1e-8,
+        start: SphereSolution | None = None,
+        enough: float = np.inf,
     ) -> SphereSolution:
-        """Maximise m for the two values g; exact, whatever the tolerance."""
-        del tolerance, start
+        """Maximise m for the two values g; exact, whatever the tolerance and what is enough."""
+        del tolerance, start, enough
         high, low = np.asarray(g, dtype=np.float64)
         a, b = (high + low) / 2, (high - low) / 2
         X = abs(b) / 2 * np.array([[1.0, np.sign(b)], [np.sign(b), 1.0]])

@@ -265,32 +265,34 @@ class LSteps:
         start: list[SphereSolution] | None = None,
         *,
         least: float = -np.inf,
+        enough: float = np.inf,
     ) -> list[SphereSolution]:
         """φ for every case; or, once one is below `least`, `start` for those not solved yet.
 
-        Then the cases that `start` bounds lowest are solved first.
+        Then the cases that `start` bounds lowest are solved first. enough: see `SphereProgram`.
         """
         cases = np.arange(self.cases)
         if start is not None and len(cases) > 1 and least > -np.inf:
             cases = np.argsort(self.bounds(section, rho, start, cases.tolist()), kind="stable")
         found = {} if start is None else dict(enumerate(start))
         for case in cases.tolist():
-            found[case] = self.solved_case(section, rho, case, found.get(case))
+            found[case] = self.solved_case(section, rho, case, found.get(case), enough)
             self.solved += 1
             if start is not None and found[case].m < least:
                 break
         return [found[case] for case in range(len(cases))]
 
     def solved_case(
-        self, section: Section, rho: float, case: int, start: SphereSolution | None
-    ) -> SphereSolution:
+        self, section: Section, rho: float, case: int, start: SphereSolution | None,
+        enough: float = np.inf,
+    ) -> SphereSolution:  # fmt: skip
         """φ of one case."""
         (g,) = self.values(section, rho, [case])
         tau: FloatArray = np.zeros((0, 0, 0))
         if len(self.limits):
             tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
             g = g - products
-        solved = self.program.solve(g, tolerance=self.tolerance, start=start)
+        solved = self.program.solve(g, tolerance=self.tolerance, start=start, enough=enough)
         return replace(solved, tau=tau)
 
     def predicted(

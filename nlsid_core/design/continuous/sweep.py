@@ -38,12 +38,14 @@ def sweep_rho(
     margin: float,
     rho_final: float = 1.0,
     caps: FloatArray | None = None,
+    expected: bool = False,
     progress: Progress = silent,
 ) -> tuple[FloatArray, list[Ends]]:
     """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
 
     instants: per interval its start, its end and, between them, others where ρ has to hold too.
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below;
+    expected: whether it is likely to be there, and tried there first.
     Raises Infeasible naming the time.
     """
     rho = np.empty(len(instants) + 1)
@@ -54,7 +56,10 @@ def sweep_rho(
         start, *between, end = instants[k]
         h = end.t - start.t
         steps.bound_pushes(end, rho[k + 1])
-        at_end = steps.solve(end, rho[k + 1], duals)
+        wanted = (
+            (caps[k] / rho[k + 1] - 1) / h + margin if expected and caps is not None else np.inf
+        )
+        at_end = steps.solve(end, rho[k + 1], duals, enough=wanted)
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))
         if cap <= LOWEST * rho[k + 1]:  # ρ̇ cannot be large enough for this end
@@ -63,8 +68,8 @@ def sweep_rho(
             cap = min(cap, float(caps[k]))
         for section in between:
             share = (section.t - start.t) / h
-            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end)
-        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end)
+            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end, expected)
+        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end, expected)
         ends.append(Ends(at_start, at_end))
         duals = at_start
         progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
@@ -80,6 +85,7 @@ def _largest(
     cap: float,
     margin: float,
     duals: list[SphereSolution],
+    expected: bool,
 ) -> tuple[float, list[SphereSolution]]:
     """The largest ρ_k ≤ cap with which the L-step at s = share leaves the margin, and that L-step.
 
@@ -99,12 +105,16 @@ def _largest(
         if cap <= LOWEST * after:
             break
         known = duals
-        rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
-                    LOWEST * after, min(cap, infeasible))  # fmt: skip
+        if expected and infeasible > cap:
+            rho = cap
+        else:
+            rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
+                        LOWEST * after, min(cap, infeasible))  # fmt: skip
         if best is not None and rho <= feasible:
             break
         least = -ACCEPT * margin - slack(rho, 0.0)
-        found = steps.solve(section, here(rho), duals, least=least)
+        enough = -slack(rho, 0.0) if expected else np.inf
+        found = steps.solve(section, here(rho), duals, least=least, enough=enough)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
             if (exact and not limited) or rho >= cap:  # else `predicted` may be too low

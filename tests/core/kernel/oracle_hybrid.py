@@ -72,6 +72,7 @@ class Leap:
     def __init__(self, jump: Json, before: Json, after: Json, proof: Json) -> None:
         self.jump, self.before, self.after, self.proof = jump, before, after, proof
         self.n = jump["states"]
+        assert (len(before["t"]) - 1) * 2 ** len(jump["uncertain"]) <= 10**6
         self.corners = list(product(*numbers(jump["uncertain"])))
 
     def is_proved(self) -> bool:
@@ -99,6 +100,7 @@ class Leap:
             and all(low <= high for low, high in box)
             and all(len(row) == n + len(box) and sum(row) <= 7 for row in rows)
             and all(max(row[n:], default=0) <= 1 for row in rows)
+            and len({tuple(row[n:]) for row in rows}) <= 64
             and all(len(row) == n and sum(row) <= 7 for row in jump["guard"]["exponents"])
             and all(row[0] in range(n) for row in jump["valid"])
         )

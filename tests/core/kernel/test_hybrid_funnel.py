@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +167,15 @@ def squared(about: Files) -> None:
     }  # fmt: skip
 
 
+def many_products(about: Files) -> None:
+    """All 127 products of seven entries of w, each times 0."""
+    rows = [[0, *row] for row in product((0, 1), repeat=7)][1:]
+    about["jump1.json"]["uncertain"] = [[0.0, 0.0]] * 7
+    about["jump1.json"]["reset"][0] = {
+        "exponents": [*rows, [1] + [0] * 7], "coefficients": [0.0] * 127 + [1.0]
+    }  # fmt: skip
+
+
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (wider_slop, "jump1: piece"),
     (lifted, "jump1: piece"),
@@ -177,6 +187,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (watched_at_the_end, "1.2 s on, which is no knot"),
     (out_of_valid, "at 0.5 s x0 is not proved to be where the guard and the reset are valid"),
     (two_states, "leads from 1 states to 2, its stages have 1 and 1"),
+    (many_products, "more than 64 products of entries of w"),
     (squared, "degree above 1 in an entry of w"),
 ]
 
