@@ -1,5 +1,6 @@
 """Funnels that jump into each other: what a bouncing body does, the files, and what is refused."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from examples import bouncer, compass_gait
 from nlsid_core import documents
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import Goal, compose_jumps, goal_before
-from nlsid_core.designs import HYBRID
+from nlsid_core.designs import COMPOSITION, HYBRID
 from nlsid_core.dynamics import Jump
 from nlsid_core.errors import (
     CertificateRejected,
@@ -193,7 +194,11 @@ def test_what_runs_beside_a_robot_refuses_it_with_the_reason(found: Found, tmp_p
     assert check(path).margin > 0
     with pytest.raises(CertificateRejected, match="are proved and not run"):
         Bundle.load(funnel_of(tmp_path))
-    names = [p.name for p in tmp_path.iterdir() if p.name != HYBRID]
+    shutil.copytree(tmp_path, tmp_path / "renamed")
+    renamed = (tmp_path / "renamed" / HYBRID).rename(tmp_path / "renamed" / COMPOSITION)
+    with pytest.raises(CertificateRejected, match="are proved and not run"):
+        Bundle.load(renamed)
+    names = [p.name for p in tmp_path.glob("*.json") if p.name != HYBRID]
     roles = {n.removesuffix(".json").removesuffix(".proof"): n for n in names}
     contents = {role: (tmp_path / name).read_bytes() for role, name in roles.items()}
     forged = Bundle(contents | {"proof": path.read_bytes()})
