@@ -85,7 +85,7 @@ def test_a_guard_that_is_watched_where_it_may_be_met_names_what_would_do(tmp_pat
 def test_a_goal_before_a_jump_takes_w_at_its_centre() -> None:
     field = VectorField.from_function(falling, 1, 0)
     motion = integrate_nominal(field, lambda _: np.zeros(0), t=[0.0, 0.5, 1.2], start=[1.0])
-    inlet = Goal([1.0], [[1e4]])
+    inlet = Goal(np.ones(1), 1e4 * np.eye(1))
     alone = goal_before(jump(1.0), field, motion, inlet)
     pushed = goal_before(
         jump(1.0), lambda x, w: [falling(x)[0] + w[0]], motion, inlet, uncertain=[[-0.1, 0.1]]
