@@ -161,19 +161,20 @@ class Crossing:
         } | {key: found[key] for key in ("columns", "squares")}
 
     def _elsewhere(self) -> str:
-        """To first order: a knot at which it is above 0, or how narrow the funnel has to be."""
+        """To first order: another knot where it is above 0, or how narrow the funnel has to be."""
         funnel = self.before
         shares = []
         for points, P, rho in zip(funnel.x.control, funnel.P, funnel.rho, strict=False):
             slope = self.jump.slopes(points[0])[0]
             reach = np.sqrt(rho * (slope @ np.linalg.solve(P, slope)))
             shares.append(float(self.jump.height(points[:1])[0]) / max(float(reach), 1e-300))
+        shares[self.first()] = -1.0  # it was tried
         above = np.flatnonzero(np.array(shares) > 1)
         if len(above):
             return f"; to first order it is at {float(funnel.t[above[-1]])!r} s"
         best = int(np.argmax(shares))
         if shares[best] <= 0:
-            return "; nor is it on the motion at any knot"
+            return "; nor is it on the motion at any other knot"
         return (
             f"; to first order a funnel {shares[best]:.2g} times as wide would do at "
             f"{float(funnel.t[best])!r} s: take a goal so much narrower"

@@ -78,7 +78,7 @@ def test_a_guard_that_is_watched_where_it_may_be_met_names_what_would_do(tmp_pat
     with pytest.raises(Infeasible, match=rf"a funnel {share:.2g} times as wide would do at 0\.0 s"):
         compose_jumps([first], [higher], tmp_path / "whole")
     beyond = Jump.of(lambda x: [x[0] - 2], lambda x: [x[0]], 1, start=0.5)
-    with pytest.raises(Infeasible, match="nor is it on the motion at any knot"):
+    with pytest.raises(Infeasible, match="nor is it on the motion at any other knot"):
         compose_jumps([first], [beyond], tmp_path / "whole")
 
 
