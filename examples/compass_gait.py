@@ -50,7 +50,7 @@ SHAPE = np.array([
     [0.0, 0.0, 0.0, 1.0],
 ])  # fmt: skip
 BACK = np.linalg.inv(SHAPE)  # exact: binary fractions
-SIZE = 0.0005  # of the funnel, in the cost-to-go's unit
+SIZE = 0.002  # of the funnel, in the cost-to-go's unit
 Q = np.diag([10.0, 1.0, 10.0, 0.1])  # of angles and rates
 R = np.array([[0.03]])
 STABILITY = 4.0  # 1/s

@@ -9,7 +9,13 @@ import pytest
 
 from benchmarks.thesis.soundness import simulate_held
 from nlsid_core import proofs
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    design,
+    integrate_nominal,
+    plan_motion,
+)
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
 from nlsid_core.running.held import Held
@@ -147,6 +153,16 @@ def test_without_an_input_there_is_nothing_to_hold() -> None:
 
 
 @pytest.mark.slow
+def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
+    def rate(x: Any, u: Any) -> Any:
+        return [x[1], 5 * x[0] + u[0]]
+
+    motion = plan_motion(rate, start=[0, 0], end=[0, 0], seconds=1, m=1)
+    with pytest.raises(Infeasible, match="Because of an input that is held") as refusal:
+        design(ContinuousTracking(rate, motion, goal=[0.1, 0.3], limits=[[-50, 50]], hold=0.1))
+    assert "the inputs' limits" not in str(refusal.value)
+
+
 def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
     with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
         design(tracking(hold=1.0))

@@ -447,11 +447,11 @@ def _held(
         * np.abs(np.diff(policy.u.control, axis=1)).sum(axis=1)
         / np.diff(policy.t)[:, None]
     )
+    shorter = "" if hold.longest else "a shorter hold (hold='largest' looks for one), "
     raise Infeasible(
         f"no funnel in which the input may be {hold.period:g} s old and the state wrong by "
         f"{hold.error.tolist()}: {off}, of which {plan[k, i]:.3g} is the plan's own change. Take "
-        "a shorter hold (hold='largest' finds one), a smoother plan, a larger goal, or Q and R "
-        f"that decay faster ({refusal})"
+        f"{shorter}a smoother plan, a larger goal, or Q and R that decay faster ({refusal})"
     ) from refusal
 
 

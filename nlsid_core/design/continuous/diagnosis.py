@@ -166,7 +166,11 @@ def _terms(
     parts["disturbance"] = pushed[:, :own].sum(axis=1)
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning
-    rest = steps.values(section, rho, [case])[0] - linear - sum(parts.values())
-    cause = "saturation" if len(steps.limits) else "hold" if steps.widths is not None else "motion"
+    # The same vertex and corner where no input is at a limit: modes come in that order.
+    free = case % (len(steps.vertices) * len(steps.corners))
+    here, unlimited = steps.values(section, rho, [case, free])
+    parts["saturation"] = here - unlimited
+    cause = "motion" if steps.widths is None else "hold"
+    rest = unlimited - linear - sum(parts.values()) + parts["saturation"]
     parts[cause] = parts.get(cause, 0.0) + np.asarray(rest)
     return linear, parts
