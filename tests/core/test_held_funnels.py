@@ -153,6 +153,12 @@ def test_without_an_input_there_is_nothing_to_hold() -> None:
 
 
 @pytest.mark.slow
+def test_errors_of_0_are_none() -> None:
+    found = design(tracking(error=[0.0, 0.0]))
+    assert "error" not in found.claim
+    assert (found.funnel.rho == design(tracking()).funnel.rho).all()
+
+
 def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
     def rate(x: Any, u: Any) -> Any:
         return [x[1], 5 * x[0] + u[0]]

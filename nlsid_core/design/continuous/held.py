@@ -73,7 +73,7 @@ class Hold:
         if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
             raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
         period = hold if isinstance(hold, float) else LONGEST if longest else 0.0
-        return cls(period, bounds, longest)
+        return cls(period, bounds, longest) if period or bounds.any() else None
 
     @property
     def shortest(self) -> float:
