@@ -135,7 +135,7 @@ class Crossing:
             if of == vertex and min(start.room, end.room) <= 0:
                 raise Infeasible(
                     "the reset is not shown to lead into the start of the next stage "
-                    f"{self._said(part)}"
+                    f"{self._said(part)}: design the stage before for a narrower goal"
                 )
             for pair in ([start, end], [start, start], [end, end]):  # near an instant its own serve
                 with suppress(Infeasible):

@@ -10,7 +10,7 @@ from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
 from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics import Jump, Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.models import StableModel
@@ -120,6 +120,8 @@ class ContinuousTracking:
     that is found; V is 1 on the funnel's boundary of that time (None: only that V stays below 1).
     stability: 1/s, α of a prescribed degree of stability: with A + αI/2 for A in these equations V
     of the linear closed loop falls at least as exp(-αt).
+    jump: what the motion ends with (None: nothing). The funnel is then above its guard where that
+    begins to be watched, to first order in the guard; a hold is refused.
 
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
@@ -141,6 +143,7 @@ class ContinuousTracking:
     error: ArrayLike | None = None
     decay: float | None = None
     stability: float = 0.0
+    jump: Jump | None = None
 
     def __post_init__(self) -> None:
         require_at_least(self, "stability", 0.0)
@@ -148,6 +151,8 @@ class ContinuousTracking:
             raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
         if not isinstance(self.policy, ContinuousPolicy | None):
             raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
+        if not isinstance(self.jump, Jump | None):
+            raise OptionError("jump", self.jump, "a Jump, or None")
         if self.decay is not None:
             require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))

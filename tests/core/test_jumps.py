@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,14 @@ from bags.designs.documents import funnel_of
 from examples import bouncer, compass_gait
 from nlsid_core import documents
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import Goal, compose_jumps, goal_before
+from nlsid_core.design import (
+    ContinuousTracking,
+    Goal,
+    compose_jumps,
+    design,
+    goal_before,
+    integrate_nominal,
+)
 from nlsid_core.designs import COMPOSITION, HYBRID
 from nlsid_core.dynamics import Jump
 from nlsid_core.errors import (
@@ -23,6 +31,7 @@ from nlsid_core.errors import (
     DataError,
     DocumentError,
     Infeasible,
+    OptionError,
     ShapeError,
 )
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -322,3 +331,58 @@ def test_a_damaged_jump_is_refused(found: Found) -> None:
     square = [{"exponents": [[0, 0, 2]], "coefficients": [1.0]}] * 2
     with pytest.raises(DataError, match="not affine in each uncertain w"):
         Jump.from_document(document | {"uncertain": [[0.0, 1.0]], "reset": square})
+
+
+def draining(x: Any, u: Any, w: Any) -> list[Any]:
+    """The level of a tank in m, under a flow that is not known to 0.01 m/s."""
+    return [-0.6 * np.sqrt(x[0]) + u[0] + w[0]]
+
+
+def drained(start: float = 0.0, **options: Any) -> tuple[ContinuousTracking, Jump]:
+    """From 1 m to below 0.4 m, where another stage begins, and the guard of that."""
+    still = lambda x, u: draining(x, u, [0.0])  # noqa: E731
+    motion = integrate_nominal(still, lambda _: [0.0], t=np.linspace(0, 1.6, 9), start=[1.0])
+    low = Jump.of(lambda x: [x[0] - 0.4], lambda x: [x[0]], 1, start=start)
+    goal = goal_before(low, still, motion, Goal(np.array([0.4]), np.array([[400.0]])))
+    goal = Goal(goal.centre, goal.P / 0.8**2)
+    return ContinuousTracking(
+        draining, motion, goal=goal, uncertain=[[-0.01, 0.01]], **options
+    ), low
+
+
+def test_a_funnel_keeps_above_the_guard_where_it_begins_to_be_watched() -> None:
+    problem, low = drained()
+    free = design(problem).funnel
+    assert free.widths(0.0)[0] > 0.6  # the motion begins 0.6 m above the guard
+    kept = design(replace(problem, jump=low)).funnel
+    assert kept.widths(0.0)[0] == pytest.approx(0.9 * 0.6)
+    assert kept.widths(1.6) == pytest.approx(free.widths(1.6))
+
+
+@pytest.mark.parametrize(
+    ("start", "options", "reason"),
+    [
+        (0.1, {}, "which is no knot of the motion: take"),
+        (1.4, {}, "the motion is not above the guard at 1.4 s"),
+        (0.0, {"hold": 0.01}, "held into the next stage"),
+        (0.0, {"shape": "P"}, "without hold, error, decay or jump"),
+    ],
+)
+def test_a_stage_that_cannot_end_with_its_jump_is_refused(
+    start: float, options: Any, reason: str
+) -> None:
+    problem, low = drained(**options)
+    t = problem.nominal.t
+    near = float(t[np.abs(t - start).argmin()])
+    start = near if abs(near - start) < 1e-9 else start
+    with pytest.raises(DataError, match=reason):
+        design(replace(problem, jump=replace(low, start=start)))
+
+
+def test_a_jump_of_other_states_or_none_is_refused() -> None:
+    problem, _ = drained()
+    other = Jump.of(lambda x: [x[0]], lambda x: [x[0], x[1]], 2, start=0.0)
+    with pytest.raises(DataError, match="the jump is of 2 states, the motion of 1"):
+        design(replace(problem, jump=other))
+    with pytest.raises(OptionError, match="a Jump, or None"):
+        replace(problem, jump="landing")  # type: ignore[arg-type]

@@ -45,7 +45,7 @@ from nlsid_core.design.continuous.shape import (
 )
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
-from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
+from nlsid_core.dynamics import Jump, Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
@@ -113,6 +113,7 @@ def design_funnel(
     error: ArrayLike | None = None,
     decay: float | None = None,
     stability: float = 0.0,
+    jump: Jump | None = None,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> FunnelDesign:
@@ -126,7 +127,7 @@ def design_funnel(
     prepared = partial(
         prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain,
         limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,
-        stability=stability,
+        stability=stability, jump=jump,
     )  # fmt: skip
     setting = prepared(nominal)
     if policy is None:
@@ -135,8 +136,8 @@ def design_funnel(
         refuse_decay(setting.steps)
     if shape == "P":
         refuse_shape(setting.steps)
-        if setting.hold is not None or decay is not None:
-            raise DataError("V-steps search without hold, error or decay: take shape rho")
+        if setting.hold is not None or decay is not None or jump is not None:
+            raise DataError("V-steps search without hold, error, decay or jump: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     try:
@@ -458,7 +459,7 @@ def _held(
 def _free(setting: Setting, progress: Progress) -> FloatArray:
     """ρ (K,) as it is found if nothing is held."""
     steps, policy, P = setting.steps, setting.policy, setting.P
-    caps = validity_caps(steps.field, policy, P)
+    caps = np.minimum(validity_caps(steps.field, policy, P), setting.above_guard())
     rho_final = min(setting.rho_final, float(caps[-1]))
     rho, _ = sweep_rho(
         steps, sections(steps, policy, P), margin=setting.margin(rho_final),
@@ -471,7 +472,9 @@ def _unheld(setting: Setting, progress: Progress) -> _Found:
     """The funnel if nothing is held."""
     if setting.expansion is not None:
         return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
-    caps = validity_caps(setting.steps.field, setting.policy, setting.P)
+    caps = np.minimum(
+        validity_caps(setting.steps.field, setting.policy, setting.P), setting.above_guard()
+    )
     cliques = CliqueSteps.of(setting.steps)
     if cliques is not None:
         with suppress(Infeasible, SolverError):  # then with every product
@@ -520,7 +523,8 @@ def _expanded(
     assert setting.expansion is not None
     steps, policy = setting.steps, setting.policy
     found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
-                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
+                           rho_final=setting.rho_final, caps=setting.above_guard(),
+                           progress=progress)  # fmt: skip
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,

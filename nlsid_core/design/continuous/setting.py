@@ -26,7 +26,7 @@ from nlsid_core.design.continuous.lstep import (
 from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
-from nlsid_core.dynamics import Nominal, Rates, VectorField
+from nlsid_core.dynamics import Jump, Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
 from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import DataError, Infeasible, NotPolynomial
@@ -41,6 +41,7 @@ MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread t
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
+GUARD_ROOM = 0.9  # of the guard's height: what the funnel may take of it
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
@@ -68,7 +69,8 @@ class Setting:
     searches_gain: whether gains are looked for with which the funnel is larger. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
     (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved. free:
-    (K,) ρ as it was found without the hold, of which nothing may be proved.
+    (K,) ρ as it was found without the hold, of which nothing may be proved. jump: what the motion
+    ends with.
     """
 
     steps: LSteps
@@ -83,12 +85,27 @@ class Setting:
     rates: FloatArray | None = None
     needed: float = 0.0
     free: FloatArray | None = None
+    jump: Jump | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
         t = self.policy.t
         rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
         return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
+
+    def above_guard(self) -> FloatArray:
+        """(K,) ρ with which the funnel is above the guard, by its slope, where it is first watched.
+
+        Infinite at all other knots.
+        """
+        caps = np.full(len(self.P), np.inf)
+        if self.jump is not None:
+            k = int(np.flatnonzero(self.policy.t == self.jump.start)[0])
+            x = self.policy.x.ends()[k]
+            slope, _ = self.jump.slopes(x)
+            away = slope @ np.linalg.solve(self.P[k], slope)
+            caps[k] = (GUARD_ROOM * float(self.jump.height(x[None])[0])) ** 2 / away
+        return caps
 
     def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
         """The members of a proof about how fast the input changes in the funnel.
@@ -134,6 +151,7 @@ def prepare(
     error: ArrayLike | None = None,
     decay: float | None = None,
     stability: float = 0.0,
+    jump: Jump | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -144,6 +162,8 @@ def prepare(
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
+    if jump is not None:
+        _refuse_jump(jump, nominal, held)
     wanted = _wanted_goal(goal, nominal, field.n)
     weights = default_weights(field, nominal, wanted)
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
@@ -166,7 +186,30 @@ def prepare(
     why = unchanged_gain(field, policy, given=given) if search_gain else ""
     if why:
         raise DataError(f"no other gains are looked for: {why}")
-    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held, search_gain)
+    return Setting(
+        steps, policy, S, rho_final, target, (Q, R), expansion, held, search_gain, jump=jump
+    )
+
+
+def _refuse_jump(jump: Jump, nominal: Nominal, held: Hold | None) -> None:
+    """Raise DataError unless the motion is above the guard at the knot where it is watched from."""
+    if held is not None and held.period:
+        raise DataError("an input that is held into the next stage is covered by no proof")
+    t, x = nominal.t, nominal.x.ends()
+    if jump.n != x.shape[1]:
+        raise DataError(f"the jump is of {jump.n} states, the motion of {x.shape[1]}")
+    if jump.start not in t[:-1]:
+        nearest = float(t[np.abs(t[:-1] - jump.start).argmin()])
+        raise DataError(
+            f"the guard is watched from {jump.start!r} s on, which is no knot of the motion: take "
+            f"{nearest!r} s"
+        )
+    height = float(jump.height(x[t == jump.start])[0])
+    if height <= 0:
+        raise DataError(
+            f"the motion is not above the guard at {jump.start:g} s, from where it is watched: the "
+            f"guard is {height:.3g} there"
+        )
 
 
 def default_weights(
