@@ -103,6 +103,9 @@ def load_design(folder: Path | str) -> AnyDesign:
     proof itself pass through.
     """
     path = Path(folder) / PROOF
+    for name in (COMPOSITION, HYBRID):
+        if not path.exists() and path.with_name(name).exists():
+            raise DocumentError(f"{path.with_name(name)} is about several funnels, not about one")
     verdict = proofs.check(path)
     document = _read(path, verdict.digests["proof"])
     about = document["claim"]["about"]

@@ -71,6 +71,8 @@ def read(document: Json, *, source: str) -> Noun:
     files.refuse_old_kind(document, source=source)
     kind = document.get("kind")
     reader = READERS.get((name, kind if isinstance(kind, str) else None))
+    if reader is None and name == "nlsid/proof":
+        raise DocumentError(f"{source} is a proof: give one of the files that its claim is about")
     if reader is None:
         known = ", ".join(sorted({f"{f} {k or ''}".strip() for f, k in READERS}))
         raise DocumentError(f"{source}: no '{name}' of kind {kind!r} is known; known: {known}")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from nlsid_core import files
+from nlsid_core import documents, files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import (
     ContinuousTracking,
@@ -21,7 +21,17 @@ from nlsid_core.design import (
 from nlsid_core.design.continuous.design import design_funnel
 from nlsid_core.design.sampled.design import design_state_funnel
 from nlsid_core.design.tube import design_output_tube
-from nlsid_core.designs import FUNNEL, MODEL, POLICY, PROOF, AnyDesign, Design, load_design
+from nlsid_core.designs import (
+    COMPOSITION,
+    FUNNEL,
+    HYBRID,
+    MODEL,
+    POLICY,
+    PROOF,
+    AnyDesign,
+    Design,
+    load_design,
+)
 from nlsid_core.errors import (
     CertificateMismatch,
     CertificateRejected,
@@ -157,6 +167,18 @@ def test_a_folder_without_a_proof_is_an_error_of_the_files(
     (tmp_path / PROOF).unlink()
     with pytest.raises(FileNotFoundError):
         load_design(tmp_path)
+
+
+@pytest.mark.parametrize("name", [COMPOSITION, HYBRID])
+def test_a_claim_about_several_funnels_is_no_design(
+    any_design: AnyDesign, tmp_path: Path, name: str
+) -> None:
+    any_design.save(tmp_path)
+    (tmp_path / PROOF).rename(tmp_path / name)
+    with pytest.raises(DocumentError, match=f"{name} is about several funnels, not about one"):
+        load_design(tmp_path)
+    with pytest.raises(DocumentError, match=f"{name} is a proof: give one of the files"):
+        documents.load(tmp_path / name)
 
 
 def test_a_proof_of_something_else_is_no_design(
