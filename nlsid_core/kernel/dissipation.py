@@ -15,9 +15,9 @@ from fractions import Fraction
 
 from . import text
 from .decision import Decision
-from .exact import Matrix, combined, congruence, definite, transposed
+from .exact import Matrix, block_diagonal, combined, congruence, definite, scaled, transposed, zero
 from .files import Node, Read, Rejected, bound_files
-from .increments import MAX_WORK, Model, block_diagonal, positive, read_model, scaled, zero
+from .increments import MAX_WORK, Model, positive, read_model
 from .polynomials import Work
 from .signals import Signal, apart, within
 

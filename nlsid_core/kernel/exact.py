@@ -120,3 +120,24 @@ def _spend(rows: list[list[int]], more: list[list[int]], what: str) -> None:
     left[0] -= size**2 * (size + len(more)) * (1 + (longest**2 >> LONG))
     if left[0] < 0:
         raise Rejected(f"{what}: order {size} with entries of {bits} bits takes too long to decide")
+
+
+def block_diagonal(*blocks: Matrix) -> Matrix:
+    """The blocks along the diagonal of a matrix that is zero elsewhere."""
+    size, rows, start = sum(map(len, blocks)), [], 0
+    for block in blocks:
+        for row in block:
+            end = size - start - len(block)
+            rows.append([Fraction(0)] * start + list(row) + [Fraction(0)] * end)
+        start += len(block)
+    return rows
+
+
+def scaled(M: Matrix, weight: Fraction) -> Matrix:
+    """Weight M."""
+    return [[weight * entry for entry in row] for row in M]
+
+
+def zero(size: int) -> Matrix:
+    """A square matrix of zeros."""
+    return [[Fraction(0)] * size for _ in range(size)]

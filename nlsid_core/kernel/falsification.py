@@ -15,9 +15,18 @@ from math import ceil, floor, prod
 
 from . import text
 from .decision import Decision
-from .exact import Matrix, combined, congruence, inverse_forms, product
+from .exact import (
+    Matrix,
+    block_diagonal,
+    combined,
+    congruence,
+    inverse_forms,
+    product,
+    scaled,
+    zero,
+)
 from .files import Node, Read, Rejected, bound_files
-from .increments import MAX_POWER, block_diagonal, scaled, zero
+from .increments import MAX_POWER
 from .levels import CommandLevel, Term
 from .polynomials import Work
 from .signals import name_label

@@ -121,27 +121,6 @@ def positive(
                 definite(combined(M, combined(cross, transposed(cross))), what)
 
 
-def block_diagonal(*blocks: Matrix) -> Matrix:
-    """The blocks along the diagonal of a matrix that is zero elsewhere."""
-    size, rows, start = sum(map(len, blocks)), [], 0
-    for block in blocks:
-        for row in block:
-            end = size - start - len(block)
-            rows.append([Fraction(0)] * start + list(row) + [Fraction(0)] * end)
-        start += len(block)
-    return rows
-
-
-def scaled(M: Matrix, weight: Fraction) -> Matrix:
-    """Weight M."""
-    return [[weight * entry for entry in row] for row in M]
-
-
-def zero(size: int) -> Matrix:
-    """A square matrix of zeros."""
-    return [[Fraction(0)] * size for _ in range(size)]
-
-
 def _leaves(node: Node, box: Box, whole: int, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
     parts = node.members("", "N ends split parts")
     if set(parts) == {"N"} or (set(parts) == {"N", "ends"} and box):

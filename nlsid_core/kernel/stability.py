@@ -9,9 +9,9 @@ from fractions import Fraction
 
 from . import text
 from .decision import Decision
-from .exact import combined, congruence, definite
+from .exact import block_diagonal, combined, congruence, definite, scaled, zero
 from .files import Node, Read, Rejected, bound_files
-from .increments import MAX_WORK, block_diagonal, positive, read_model, scaled, zero
+from .increments import MAX_WORK, positive, read_model
 from .polynomials import Work
 
 

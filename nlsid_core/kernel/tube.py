@@ -14,9 +14,9 @@ from fractions import Fraction
 
 from . import text
 from .decision import Decision
-from .exact import Matrix, at_most, combined, congruence, definite
+from .exact import Matrix, at_most, block_diagonal, combined, congruence, definite, scaled, zero
 from .files import Node, Read, Rejected, bound_files
-from .increments import MAX_WORK, Model, block_diagonal, positive, read_model, scaled, zero
+from .increments import MAX_WORK, Model, positive, read_model
 from .levels import CommandLevel, formula, read_level
 from .polynomials import Work
 from .signals import Signal, apart, within

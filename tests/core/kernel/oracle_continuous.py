@@ -528,13 +528,15 @@ def is_covered(oracle: "Oracle", pieces: list[Document], *, rates: bool) -> bool
         case = (piece["input"], piece["sign"], *case) if rates else case
         length = Fraction(1, 2**level)
         parts[piece["interval"], piece["vertex"], case].append((index * length, length))
-    for found in parts.values():
-        until = Fraction(0)
-        for start, length in sorted(found):
-            until = max(until, start + length) if start <= until else until
-        if until < 1:
-            return False
-    return True
+    return all(covers(found) for found in parts.values())
+
+
+def covers(parts: list[tuple[Fraction, Fraction]]) -> bool:
+    """Whether parts of time (start, length) leave nothing of [0, 1] out."""
+    until = Fraction(0)
+    for start, length in sorted(parts):
+        until = max(until, start + length) if start <= until else until
+    return until >= 1
 
 
 def is_followed(oracle: "Oracle") -> bool:

@@ -17,6 +17,7 @@ from tests.core.kernel.oracle_continuous import (
     add,
     bernstein,
     bound,
+    covers,
     degree_of,
     dot,
     numbers,
@@ -154,13 +155,7 @@ class Leap:
             assert 0 <= index < 2**level
             length = Fraction(1, 2**level)
             parts[piece["interval"], piece["vertex"]].append((index * length, length))
-        for found in parts.values():
-            until = Fraction(0)
-            for start, length in sorted(found):
-                until = max(until, start + length) if start <= until else until
-            if until < 1:
-                return False
-        return True
+        return all(covers(found) for found in parts.values())
 
     def c(self, piece: Json, sigma: Any, e: list[Any]) -> Any:
         """ρ_b - |R - b|²_{P_b} - τ (ρ - W) - μ g at sigma along the piece and e = x - x₀."""
