@@ -401,8 +401,7 @@ class ContinuousComparison:
         self._proved = self._proved or (size <= 1.0 and (starts or not hold))
         if not self._proved:
             broken = "the run did not start in the funnel: nothing is proved of it"
-        if hold and not age <= hold * (1.0 + COMMAND_TOLERANCE):
-            broken = f"the input was held for {age:.6g} s at t = {t:g} s; proved for {hold:g} s"
+        broken = held.overdue(age, t) or broken
         return Compared(
             [size],
             [age / hold if self._measures else np.nan],
