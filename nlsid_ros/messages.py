@@ -94,7 +94,9 @@ class SignalMessage:
     def _on_other(self, message: Any) -> None:
         """Take the fields of a message, if all that are numbers are finite."""
         numbers = {name: SignalPath.parse(f"/others:{name}").value(message) for name in self.rest}
-        unfit = [f"{name} is {value}" for name, value in numbers.items() if not math.isfinite(value)]
+        unfit = [
+            f"{name} is {value}" for name, value in numbers.items() if not math.isfinite(value)
+        ]
         self._unfit = f"on {self._topic}, {', '.join(unfit)}" if unfit else ""
         self._base, self._heard = message, time.monotonic()
 

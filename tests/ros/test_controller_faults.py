@@ -235,7 +235,6 @@ def test_verdicts_of_another_run_are_none(stack: ExitStack, funnel: Path) -> Non
 def test_a_second_node_that_publishes_verdicts_ends_it(stack: ExitStack, funnel: Path) -> None:
     robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
     robot.watch()
-    robot.feed(20, margin_at=0.0)
     robot.node.create_publisher(JointState, "/funnel_monitor/margin", qos.STREAM)
     robot.feed(40, margin_at=0.0)
     robot.expect_stop("2 nodes publish /funnel_monitor/margin")
