@@ -228,16 +228,11 @@ def check(
     second: Annotated[
         bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
     ] = False,
-    recording: Annotated[
-        Path | None,
-        typer.Option(help="Of a falsification: the bag, whose digest and samples are compared."),
-    ] = None,
 ) -> None:
-    """Decide proofs without a solver: PROVED or FALSIFIED (status 0), or REJECTED (status 1).
+    """Decide proofs without a solver: PROVED (status 0), or REJECTED (status 1).
 
-    FALSIFIED: of what a tube assumes, by `nlsid monitor --falsify`. Status 2 if a proof cannot be
-    read, so that nothing was decided about it, or if the second kernel was asked and has no opinion
-    of it.
+    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
+    kernel was asked and has no opinion of it.
     """
     status = 0
     for path in proofs:
@@ -246,10 +241,6 @@ def check(
             said = str(kernel.check(path))
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
-            if recording is not None:
-                from bags.monitoring.falsify import recorded
-
-                typer.echo(f"  compared: {recorded(path, recording)}")
             if second:
                 opinion = second_kernel.opinion(path)
                 typer.echo(f"  {opinion}")
