@@ -301,7 +301,7 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
 
 
 def _unreadable(error: Exception) -> DataError:
-    """What ROS cannot use of the arguments or names it was given, without where its code says so."""
+    """What ROS cannot use of arguments or names, without where its code says so."""
     said = str(error).partition(". Error:")[0].partition(", at /")[0]
     hint = "; a namespace begins with a slash: /robot1" if "__ns" in said else ""
     return DataError(f"ROS refuses: {' '.join(said.split())}{hint}")

@@ -89,10 +89,11 @@ class Controller:
 
     Before sample 0 the plan's first input is held until the state is where the funnel may start, at
     most for `settling` s. `k` is the number of the next sample, negative before. `ended` says why
-    it is over, empty while it runs: the sample is missing, not finite, off the grid of the start, or
+    it is over, empty while it runs: the sample is missing, not finite, off the grid of the start or
     later than an input may be held, the input would not be finite or not one that the proof covers,
-    or the proof ends. Stopping is the caller's then. `lead`: s from a sample to the stamp of its input, not quite a period where
-    the input is that of the next sample, so that a sample off the grid still finds it in force.
+    or the proof ends. Stopping is the caller's then. `lead`: s from a sample to the stamp of its
+    input, not quite a period where the input is that of the next sample, so that a sample off the
+    grid still finds it in force.
 
     model, policy, funnel, period, held: as for `Monitor`. Raises CertificateMismatch if the parts
     do not belong together, DataError if the limits cut off an input of the plan, or if the hold

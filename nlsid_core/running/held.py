@@ -41,7 +41,7 @@ class Held:
         return held
 
     def refuse(self, period: float) -> None:
-        """DataError if samples so many s apart, and some of them late, are not covered by a hold."""
+        """DataError if the hold does not cover samples so many s apart, some of them late."""
         needed = (1.0 + TOLERANCE) * period
         if self.hold and needed > self.hold * ON_TIME:
             raise DataError(

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.factor import MOST_ROUNDING, STEPS, UNIT, refuse_coarse
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
@@ -520,7 +520,7 @@ class _Judged(NamedTuple):
     away: list[float]
 
 
-def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Sequence[Trajectory]) -> None:
+def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
     """DataError if a run on such trials (y, u) could not be judged in float64."""
     for trial in trials:
         most = np.spacing(np.abs(trial.y).max(axis=0))
