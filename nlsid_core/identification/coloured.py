@@ -17,7 +17,7 @@ import numpy as np
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible, OptionError, SolverError
 from nlsid_core.identification.fit import Candidate, History, Step
-from nlsid_core.identification.methods import LeastSquares, Rie
+from nlsid_core.identification.methods.options import LeastSquares, Rie
 from nlsid_core.identification.noise import Noise
 from nlsid_core.identification.prediction import Model, history, simulate_trials
 from nlsid_core.identification.trail import Task, Trail

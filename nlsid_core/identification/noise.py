@@ -10,7 +10,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification.banded import Diagonals, shift
+from nlsid_core.identification.methods.banded import Diagonals, shift
 
 MOST_NOISE_LAGS = 200
 WHITE = 1e-3  # of the noise, so that no frequency is taken for free of it

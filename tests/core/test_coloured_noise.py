@@ -12,10 +12,10 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import OptionError, SolverError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
-from nlsid_core.identification.banded import sparse
-from nlsid_core.identification.linear import build_regression
+from nlsid_core.identification.methods.banded import sparse
+from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.noise import Noise
-from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.linear import build_regression
 
 TRUE = np.array([1.5, -0.7, 0.0, 1.0, 0.5])  # a_1, a_2, b_0, b_1, b_2
 RSE = Rse(iterations=20)

@@ -8,7 +8,7 @@ import numpy as np
 from examples import matrix_positivstellensatz, moore_greitzer, motzkin, six_hump_camel
 from examples import too_large_a_level as level
 from nlsid_core.arrays import Json
-from nlsid_core.identification.implicit_proof import prove_implicit, prove_well_posed
+from nlsid_core.identification.proofs.stable_sets import prove_implicit, prove_well_posed
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.sos import SphereProgram, sphere_proof

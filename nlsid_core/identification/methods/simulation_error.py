@@ -15,7 +15,7 @@ from scipy.linalg import LinAlgError, cho_solve, cholesky_banded
 from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.banded import (
+from nlsid_core.identification.methods.banded import (
     Diagonals,
     Rows,
     diagonals_of,
@@ -24,7 +24,7 @@ from nlsid_core.identification.banded import (
     shift,
     sparse,
 )
-from nlsid_core.identification.newton import Point, Root, project
+from nlsid_core.identification.methods.newton import Point, Root, project
 
 
 class SimulationError:
