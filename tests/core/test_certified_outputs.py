@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from nlsid_core.identification import certified, prove_stability
+from nlsid_core.identification import prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial import certified
 from nlsid_core.identification.polynomial.certified import (
     certified_simulation_error,
     descend_certified,
