@@ -361,7 +361,7 @@ class TrackingController(ManagedNode):
             self._halt(f"outside: {self._monitor} says margin {margin:.3g}")
         elif assumption > 1.0:
             self._halt(f"assumption violated: {self._monitor} says {assumption:.3g} of it is used")
-        elif margin >= 0.0:
+        elif 0.0 <= margin <= 1.0:
             self._judged = time.monotonic()
 
     def _look(self) -> None:
