@@ -28,7 +28,7 @@ BANDS = {
     "run": {"running"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs", "designs"},
-    "base": {"errors", "arrays", "files", "options", "progress"},
+    "base": {"errors", "arrays", "files", "options", "progress", "native"},
     "kernel": {"kernel"},
 }
 BELOW = {
