@@ -39,7 +39,7 @@ class NativeStderr:
             if self._inside > 1:
                 return
 
-            self._kept = self._kept or tempfile.TemporaryFile()
+            self._kept = self._kept or tempfile.TemporaryFile()  # noqa: SIM115 - open to the end
             with suppress(OSError):  # it is closed: nothing can be written there
                 self._saved = os.dup(STDERR)
                 os.dup2(self._kept.fileno(), STDERR)

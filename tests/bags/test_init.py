@@ -533,7 +533,7 @@ def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) 
     median = config.read_text().replace(f"period: {grid.period}", "period: 0.022")
     config.write_text(median)
     out = tmp_path / "median"
-    told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 74 new runs"
+    told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 33 new runs"
     assert told in nlsid("identify", tmp_path / "bags", "--config", config, "--out", out)
     model = out / documents.MODEL
     assert told in nlsid("funnel", "--model", model, "--config", config, "--out", out)
