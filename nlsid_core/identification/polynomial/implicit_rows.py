@@ -18,8 +18,8 @@ from scipy.linalg import solve_triangular
 from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification.implicit_sets import Names
-from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.banded import Factor, Rows, shift, sparse, symmetric_product
-from nlsid_core.identification.newton import Point, minimise, project
+from nlsid_core.identification.methods.banded import Factor, Rows, shift, sparse, symmetric_product
+from nlsid_core.identification.methods.newton import Point, minimise, project
 
 WORK = 5e10  # rows times squared left parameters, of all Newton steps together: a minute
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.options import MOST_LAGS
 from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
 from nlsid_core.models import StateAffineModel
 from nlsid_core.models.polynomials import Polynomials

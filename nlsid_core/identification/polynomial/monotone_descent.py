@@ -16,10 +16,10 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification.certified_descent import Outputs, Step, descend
-from nlsid_core.identification.moment_rie import Problem, equation
-from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
-from nlsid_core.identification.monotone import sensitivities, simulate_banded
+from nlsid_core.identification.methods.descent import Outputs, Step, descend
+from nlsid_core.identification.polynomial.moment_rie import Problem, equation
+from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.identification.polynomial.monotone import sensitivities, simulate_banded
 from nlsid_core.models import MonotoneEquation
 
 

@@ -22,8 +22,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.inequalities import MatrixInequality
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.inequalities import MatrixInequality
 
 DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of the minimiser
 PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding

@@ -20,17 +20,21 @@ from numpy.typing import NDArray
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.identification import conditions
-from nlsid_core.identification.conditions import GAP, Inequality, constraint
-from nlsid_core.identification.implicit_class import (
+from nlsid_core.identification.polynomial.implicit_rows import (
     DELAYED,
     FARTHEST,
     LARGEST_BLOCK,
     SLOW,
     ImplicitRows,
 )
-from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit, storage_template
-from nlsid_core.identification.implicit_sets import Names
+from nlsid_core.identification.proofs import conditions
+from nlsid_core.identification.proofs.conditions import GAP, Inequality, constraint
+from nlsid_core.identification.proofs.sets import Names
+from nlsid_core.identification.proofs.stable_sets import (
+    ImplicitProof,
+    prove_implicit,
+    storage_template,
+)
 from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
-from nlsid_core.identification.conditions import Inequality, constraint
-from nlsid_core.identification.implicit_sets import (
+from nlsid_core.identification.proofs.conditions import Inequality, constraint
+from nlsid_core.identification.proofs.sets import (
     SETS,
     STORAGE,
     Names,

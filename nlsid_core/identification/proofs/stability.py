@@ -21,7 +21,7 @@ from scipy.linalg import LinAlgError, block_diag, solve_discrete_lyapunov
 from nlsid_core import conic, files, kernel, proofs
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import CertificateRejected, SolverError
-from nlsid_core.identification.leading_bounds import leading_bounds
+from nlsid_core.identification.proofs.leading_bounds import leading_bounds
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import parse
 from nlsid_core.kernel.matrix_polynomials import Box

@@ -15,9 +15,9 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import ShapeError
-from nlsid_core.identification.inequalities import MatrixInequality, centre, traceless
-from nlsid_core.identification.stability import StabilityProof
-from nlsid_core.identification.state_affine import StateAffineRows
+from nlsid_core.identification.methods.inequalities import MatrixInequality, centre, traceless
+from nlsid_core.identification.polynomial.rows import StateAffineRows
+from nlsid_core.identification.proofs.stability import StabilityProof
 from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values
 

@@ -23,7 +23,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
 from nlsid_core.identification.fit import Step
-from nlsid_core.identification.stability import StabilityProof, prove_stability
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_one_of, require_whole

@@ -18,8 +18,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification.moment_rie import MomentFit, equation, minimise_moment_rie
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.polynomial.moment_rie import MomentFit, equation, minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import (
     Moments,
     MonotoneClass,
     Offsets,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core.errors import DataError
-from nlsid_core.identification import conditions
-from nlsid_core.identification.conditions import GAP, Domain, Inequality
+from nlsid_core.identification.proofs import conditions
+from nlsid_core.identification.proofs.conditions import GAP, Domain, Inequality
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import Polynomial

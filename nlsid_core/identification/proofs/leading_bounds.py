@@ -3,7 +3,7 @@
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.identification.inequalities import MatrixInequality, minimise_linear
+from nlsid_core.identification.methods.inequalities import MatrixInequality, minimise_linear
 from nlsid_core.models import StateAffineModel
 
 BOUNDS_GAP = 1e-6  # relative to |G_0|, how tightly its bounds are found

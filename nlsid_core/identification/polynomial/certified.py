@@ -13,14 +13,14 @@ from scipy.linalg import LinAlgError
 
 from nlsid_core import conic
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.bounded_set import BoundedSet
-from nlsid_core.identification.certified_descent import Outputs, Step, descend
-from nlsid_core.identification.matrix_set import MatrixSet
-from nlsid_core.identification.newton import INEQUALITY_GAP, Point, minimise
-from nlsid_core.identification.rse import Bound, affordable_steps
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.stability import StabilityProof, prove_stability
-from nlsid_core.identification.state_affine import StateAffineRows
+from nlsid_core.identification.methods.descent import Outputs, Step, descend
+from nlsid_core.identification.methods.newton import INEQUALITY_GAP, Point, minimise
+from nlsid_core.identification.methods.rse import Bound, affordable_steps
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial.bounded_set import BoundedSet
+from nlsid_core.identification.polynomial.matrix_set import MatrixSet
+from nlsid_core.identification.polynomial.rows import StateAffineRows
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import StateAffineModel
 
 IN_ONE_SET = 8  # steps of the descent before the set is renewed

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.damped import descend
+from nlsid_core.identification.methods.damped import descend
 from nlsid_core.models import Spline
 
 FIRST_DAMPING, PATIENCE = 1e-1, 3

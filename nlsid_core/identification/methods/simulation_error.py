@@ -15,13 +15,13 @@ from scipy.linalg import LinAlgError, cho_solve
 from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.banded import (
+from nlsid_core.identification.methods.banded import (
     Diagonals,
     Rows,
     lower_band,
     shift,
 )
-from nlsid_core.identification.newton import Point, Root, project
+from nlsid_core.identification.methods.newton import Point, Root, project
 
 
 class SimulationError:

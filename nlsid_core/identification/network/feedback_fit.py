@@ -17,7 +17,7 @@ from scipy.linalg import solve_banded
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.damped import descend
+from nlsid_core.identification.methods.damped import descend
 from nlsid_core.models import Spline
 
 KNOTS = 48  # intervals of the piecewise linear map, whatever the spline's

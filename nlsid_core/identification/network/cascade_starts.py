@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.cascade_fit import (
+from nlsid_core.identification.network.cascade_fit import (
     Minimum,
     Parameters,
     Trial,

@@ -14,10 +14,8 @@ from scipy.linalg import solve_triangular
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification.certified_descent import Outputs, Step, descend
-from nlsid_core.identification.implicit_class import ImplicitRows, delayed_states
-from nlsid_core.identification.implicit_proof import ImplicitProof
-from nlsid_core.identification.implicit_search import (
+from nlsid_core.identification.methods.descent import Outputs, Step, descend
+from nlsid_core.identification.polynomial.implicit_rie import (
     indeterminates_of,
     kept_in_set,
     left_coefficients,
@@ -25,7 +23,9 @@ from nlsid_core.identification.implicit_search import (
     set_constraints,
     unknowns,
 )
-from nlsid_core.identification.rollout import DIVERGED, Rollout
+from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, delayed_states
+from nlsid_core.identification.polynomial.rollout import DIVERGED, Rollout
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof
 from nlsid_core.models import ImplicitModel, Signal
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables

@@ -17,9 +17,9 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.inequalities import MatrixInequality
-from nlsid_core.identification.newton import Point, minimise, project_columns
-from nlsid_core.identification.state_affine import StateAffineRows
+from nlsid_core.identification.methods.inequalities import MatrixInequality
+from nlsid_core.identification.methods.newton import Point, minimise, project_columns
+from nlsid_core.identification.polynomial.rows import StateAffineRows
 from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values
 

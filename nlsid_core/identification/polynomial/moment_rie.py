@@ -25,8 +25,8 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, Infeasible, ShapeError
-from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
-from nlsid_core.identification.stability import StabilityProof, prove_stability
+from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.signal import signals_of
 

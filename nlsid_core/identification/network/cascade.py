@@ -13,15 +13,15 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
-from nlsid_core.identification.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
-from nlsid_core.identification.cascade_starts import (
+from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.identification.network.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
+from nlsid_core.identification.network.cascade_starts import (
     best_start,
     mean_square,
     with_intervals,
     with_phases,
 )
-from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.stability import StabilityProof, prove_stability
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import BlockCascade
 from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_one_of, require_whole

@@ -14,16 +14,16 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import ShapeError
-from nlsid_core.identification.inequalities import (
+from nlsid_core.identification.methods.inequalities import (
     MatrixInequality,
     centre,
     minimise_linear,
     traceless,
 )
-from nlsid_core.identification.leading_bounds import box_inequalities, leading_bounds
-from nlsid_core.identification.matrix_set import SLOWEST_RATE
-from nlsid_core.identification.stability import StabilityProof
-from nlsid_core.identification.state_affine import StateAffineRows
+from nlsid_core.identification.polynomial.matrix_set import SLOWEST_RATE
+from nlsid_core.identification.polynomial.rows import StateAffineRows
+from nlsid_core.identification.proofs.leading_bounds import box_inequalities, leading_bounds
+from nlsid_core.identification.proofs.stability import StabilityProof
 from nlsid_core.models import StateAffineModel
 
 START_BOUNDS = (0.9, 1.1)  # of G_0 around the first iterate's start G = I

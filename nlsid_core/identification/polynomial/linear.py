@@ -12,12 +12,12 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.newton import Descent
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.newton import Descent
+from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.proofs.stability import prove_stability
 from nlsid_core.identification.regressors import lagged, signal_scale
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.stability import prove_stability
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_whole

@@ -19,7 +19,8 @@ from scipy.linalg import cholesky, solve_triangular
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
-from nlsid_core.identification.feedback_fit import (
+from nlsid_core.identification.fit import Step
+from nlsid_core.identification.network.feedback_fit import (
     DIVERGED,
     KNOTS,
     Basis,
@@ -33,9 +34,8 @@ from nlsid_core.identification.feedback_fit import (
     simulate_stages,
     stage_errors,
 )
-from nlsid_core.identification.fit import Step
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.regressors import signal_scale
-from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.identification.starts import autoregression, reflected
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from nlsid_core.models.cell_network import MAX_MAPS, PRIOR

@@ -14,9 +14,9 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.conditions import constraint, linear
-from nlsid_core.identification.implicit_class import with_signals
-from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
+from nlsid_core.identification.polynomial.implicit_rows import with_signals
+from nlsid_core.identification.proofs.conditions import constraint, linear
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.identification.regressors import refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials

@@ -22,7 +22,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.methods.options import MOST_LAGS
 from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.options import require_delays, require_one_of, require_whole
