@@ -8,6 +8,7 @@ import numpy as np
 from bags.setup.candidates import LONGEST_DELAY, Found
 from bags.setup.proposal import Proposal
 from bags.signals.delays import Delay, delay
+from bags.signals.expressions import factors
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
@@ -26,6 +27,8 @@ def say_direction(proposal: Proposal, found: Found, trials: Dataset) -> None:
     for i, response in enumerate(signals["response"]):
         for j, excitation in enumerate(signals["excitation"]):
             y, u = response["path"], excitation["path"]
+            if len(factors(u)) > 1:  # a person made it, of what is measured too
+                continue
             is_named_so = shares.get(u, 0.5) + ROLES_APART <= shares.get(y, 0.5)
             lead = lead_of_response(trials, i, j)
             if not (is_named_so or lead):
