@@ -282,7 +282,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
     named += [argument for u in excitations for argument in ("-u", u)]
-    nlsid("init", *f1tenth()[:4], "--out", config, *named)
+    nlsid("init", *f1tenth()[:6], "--out", config, *named)
     signals = load_config(config).signals
     assert [signal.unit for signal in signals.response] == ["m/s", "cm/s", "m"]
     assert [signal.name for signal in signals.response] == [
@@ -291,7 +291,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
     again = nlsid(
-        "init", *f1tenth()[:4], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
+        "init", *f1tenth()[:6], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
     )
     assert "is named twice" in again
 
