@@ -1,14 +1,17 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
 import gc
+import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import traceback
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, ClassVar, NamedTuple
 
 import rclpy
 from lifecycle_msgs.msg import Transition
@@ -19,6 +22,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -31,6 +35,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
+from nlsid_ros import shared_memory, watchdog
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -63,8 +68,11 @@ class ManagedNode(LifecycleNode):
 
     Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
-    those instead of the process's.
+    those instead of the process's. is_watched: it ends if its executor stands still
+    (`nlsid_ros.watchdog`); so it must not sleep for long.
     """
+
+    is_watched: ClassVar[bool] = False
 
     def __init__(self, name: str, arguments: Arguments = None) -> None:
         super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
@@ -220,6 +228,11 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
+    def create_subscription(self, *given: Any, **named: Any) -> Subscription:
+        """As rclpy does it, without the middleware's events: to take one can wait for ever."""
+        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return super().create_subscription(*given, event_callbacks=silent, **named)
+
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """As rclpy does it; what had arrived is let go (see `_let_go`)."""
         subscription.callback = _let_go
@@ -274,6 +287,7 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
     the node could send a last command. Raises what made the node fail to start.
     """
     woken = _wake_on_signals()
+    shared_memory.avoid_what_is_stale()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[ManagedNode] = []
     try:
@@ -283,12 +297,28 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
                 nodes[-1].start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        _spin_until_signalled(nodes, woken)
+        with _watched(nodes):
+            _spin_until_signalled(nodes, woken)
     finally:
         with ExitStack() as ending:  # each is stopped, also if another cannot be
             ending.callback(try_shutdown)
             for node in reversed(nodes):
                 ending.callback(node.destroy_node)
+
+
+@contextmanager
+def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
+    """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
+    if not all(node.is_watched for node in nodes):
+        yield
+        return
+    names = ", ".join(node.get_name() for node in nodes)
+    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
+        try:
+            yield
+        finally:
+            watching.kill()
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:

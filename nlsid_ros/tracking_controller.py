@@ -36,7 +36,7 @@ from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
-from nlsid_ros import qos
+from nlsid_ros import graph, qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import (
     CHECKING,
@@ -213,7 +213,7 @@ class TrackingController(ManagedNode):
             self._commands = self.create_publisher(
                 message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
-            self.create_subscription(
+            self._responses = self.create_subscription(
                 message_class(self._response_type),
                 self.signal_topic(response.topic),
                 partial(self._on_response, response),
@@ -235,7 +235,7 @@ class TrackingController(ManagedNode):
         if self._controller is not None or self._stopping:
             return "a run is on"
         assert self._command is not None
-        if lacking := self._command.lacking():
+        if lacking := self._command.lacking() or self._doubt():
             return lacking
         if self._commissioning and not self._brake.service_is_ready():
             return f"{self._stop_service} is not there: nothing unproved runs without it"
@@ -284,6 +284,16 @@ class TrackingController(ManagedNode):
                 self._tell(self._tracking(controller))
         self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
         self._on_due()
+
+    def _doubt(self) -> str:
+        """Why nobody knows whose responses come; empty if it is known."""
+        topic = self._responses.topic_name
+        publishers = [
+            publisher
+            for publisher in self.get_publishers_info_by_topic(topic)
+            if publisher.topic_type == self._response_type
+        ]
+        return graph.several(topic, publishers)
 
     def _tracking(self, controller: Controller) -> str:
         """What is being done, and of a composition in which stage."""
@@ -344,7 +354,7 @@ class TrackingController(ManagedNode):
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")
-        elif lacking := self._command.lacking():
+        elif lacking := self._command.lacking() or self._doubt():
             self._halt(lacking)
         elif self._is_unwatched(now):
             self._halt(f"{self._monitor} has judged nothing for {self._monitor_patience:g} s")
@@ -417,6 +427,8 @@ class TrackingController(ManagedNode):
             text = "; ".join(part for part in (self._text, self._funnel.state) if part)
         if self._funnel.refusal:
             level = DiagnosticStatus.ERROR
+        if named := self._others_here():
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {named}"
         if self._commissioning:
             level, text = max(level, DiagnosticStatus.WARN), f"COMMISSIONING, not proved: {text}"
         values = {
@@ -427,6 +439,13 @@ class TrackingController(ManagedNode):
         }
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, name_of(self), level, text, values))
+
+    def _others_here(self) -> str:
+        """Who else commands the robot or has this node's name, and who cannot hear it."""
+        said = [graph.namesakes(self)]
+        if self._design is not None:
+            said.append(graph.rivals(self, self._commands))
+        return "; ".join(filter(None, said))
 
 
 def main(args: list[str] | None = None) -> None:
