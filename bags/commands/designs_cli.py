@@ -160,24 +160,9 @@ def compose(
         typer.Argument(help="funnel.proof.json files, in the order of time."),
     ],
     out_dir: OutOption,
-    jump: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="jump.json from each funnel into the next, in order; one more: into the first."
-        ),
-    ] = None,
 ) -> None:
-    """Bind proofs into one claim, for `check`: composition. or hybrid.proof.json.
-
-    Funnels that follow each other, in time or, with --jump, where a guard is met.
-    """
-    from nlsid_core.design import compose_funnels, compose_jumps
-
-    if jump:
-        path = compose_jumps(proofs, jump, out_dir)
-        count = 4 * len(proofs) + len(jump)
-        out.print(f"wrote {path} and {count} files of its stages and jumps", soft_wrap=True)
-        return
+    """Bind proofs of funnels that follow each other into one claim, for `check`."""
+    from nlsid_core.design import compose_funnels
 
     path = compose_funnels(proofs, out_dir)
     out.print(f"wrote {path} and {4 * len(proofs)} files of its stages", soft_wrap=True)
