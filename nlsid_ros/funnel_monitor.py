@@ -379,11 +379,10 @@ class FunnelMonitor(ManagedNode):
         wanted = self._frames.setdefault(topic, self._frame or frame)
         if frame != wanted:
             return f"the response is in frame '{frame}', not in '{wanted}'"
-        if unfit := next(filter(None, self._unfit_commands.values()), ""):
-            return unfit
-        if self._allow_old_stamps:
-            return ""
-        return off_clock(stamp_ns, self.get_clock(), self._patient_for)
+        off = ""
+        if not self._allow_old_stamps:
+            off = off_clock(stamp_ns, self.get_clock(), self._patient_for)
+        return off or next(filter(None, self._unfit_commands.values()), "")
 
     def _off_clock(self, topic: str, stamp_ns: int) -> str:
         """Why the stamp of a command is none; empty if it is one, or a recording is played."""
