@@ -22,12 +22,14 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -234,10 +236,26 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def create_subscription(self, *given: Any, **named: Any) -> Subscription:
+    def create_subscription(  # type: ignore[override]
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[..., None],
+        qos_profile: QoSProfile | int,
+        *,
+        callback_group: CallbackGroup | None = None,
+        raw: bool = False,
+    ) -> Subscription:
         """As rclpy does it, without the middleware's events: to take one can wait for ever."""
-        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
-        return super().create_subscription(*given, event_callbacks=silent, **named)
+        return super().create_subscription(
+            msg_type,
+            topic,
+            callback,
+            qos_profile,
+            callback_group=callback_group,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=raw,
+        )
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """As rclpy does it; what had arrived is let go (see `_let_go`)."""
