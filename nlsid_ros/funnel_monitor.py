@@ -49,7 +49,7 @@ from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wi
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
-from nlsid_ros.subscribing import Informed
+from nlsid_ros.subscribing import Informed, Silence
 
 NAME = "funnel_monitor"
 LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signals' types
@@ -138,6 +138,8 @@ class FunnelMonitor(ManagedNode):
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._doubts: dict[str, str] = {}  # topic -> who publishes on it, if several do
+        self._unheard: dict[str, str] = {}  # response topic -> who publishes on it in vain
+        self._silences: dict[str, Silence] = {}
         self._numbers: dict[str, Sequence] = {}  # topic -> its publisher's count
         self._unfit_commands: dict[str, str] = {}  # topic -> what is wrong with the newest command
         self._unfit = ""
@@ -202,8 +204,9 @@ class FunnelMonitor(ManagedNode):
         self._watch, self._digest = watch, digest
         self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
         self._kinds, self._unfit = {}, ""
-        for known in (self._doubts, self._numbers, self._unfit_commands):
+        for known in (self._doubts, self._numbers, self._unfit_commands, self._unheard):
             known.clear()
+        self._silences.clear()
         self._frames.clear()
         self._heard_ns.clear()
         self._deadlines.clear()
@@ -278,6 +281,7 @@ class FunnelMonitor(ManagedNode):
                 heard = [each for each in publishers if each.topic_type == kind]
                 self._subscribe(topic, name, kind, heard)
                 self._doubt(topic, graph.several(name, heard))
+                self._unheard[topic] = graph.unheard(name, heard) if self._is_silent(topic) else ""
 
     def _kind(self, topic: str, kinds: list[str]) -> str:
         """The type to subscribe with: the one in use, or the first that fits; empty if none."""
@@ -304,6 +308,7 @@ class FunnelMonitor(ManagedNode):
         profile = qos.subscription_to(offered)
         if not publishers:
             return
+        self._silences.setdefault(topic, Silence())
         if now is not None:
             if self._kinds[topic] == kind and now.qos_profile == profile:
                 return
@@ -315,6 +320,11 @@ class FunnelMonitor(ManagedNode):
         self._signals[topic] = self.create_subscription(
             message_class(kind), name, callback, profile
         )
+
+    def _is_silent(self, topic: str) -> bool:
+        """Whether a response should be heard and is not; commands may rest."""
+        assert self._watch is not None
+        return topic in self._watch.pairing.response_topics and self._silences[topic].is_odd
 
     def _doubt(self, topic: str, reason: str) -> None:
         """Remember why nobody knows whose messages are on a topic; a response is unknown then.
@@ -352,6 +362,7 @@ class FunnelMonitor(ManagedNode):
         logged = watch.pairing.clock == "log"
         stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
         responds = topic in watch.pairing.response_topics
+        self._silences[topic].end(1)
         if watch.pairing.measures(topic, message):
             self._numbers.setdefault(topic, Sequence()).update(info["publication_sequence_number"])
         if not responds:
@@ -583,9 +594,9 @@ class FunnelMonitor(ManagedNode):
         if reading.alarm:  # no verdict: it warns, and latches nothing
             level = max(level, DiagnosticStatus.WARN)
             text += f"; {reading.alarm}"
-        if named := [*filter(None, self._doubts.values()), *filter(None, [graph.namesakes(self)])]:
-            level = max(level, DiagnosticStatus.WARN)
-            text += "".join(f"; {each}" for each in named if each not in text)
+        named = [*self._doubts.values(), *self._unheard.values(), graph.namesakes(self)]
+        if named := [each for each in named if each and each not in text]:
+            level, text = max(level, DiagnosticStatus.WARN), "; ".join([text, *named])
         if self._latched is not None:
             level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
             text += "".join(f"; {name}: {why}" for name, why in self._failures.items())
@@ -605,6 +616,7 @@ class FunnelMonitor(ManagedNode):
             self._unanswered.clear()
             self._failures.clear()
             self._frames.clear()
+            self._numbers.clear()
             self._deadlines.clear()
             self._tell("restarted")
         return answer

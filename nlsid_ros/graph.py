@@ -11,6 +11,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+SILENT = 2.0  # s without a message of a publisher that is there
 LEASE = 20.0  # s: Fast DDS forgets a participant that was killed
 
 
@@ -22,6 +23,13 @@ def several(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
         f"{topic} has {len(publishers)} publishers: {names(publishers)}; stop all but one (one "
         f"that was killed counts for {LEASE:g} s)"
     )
+
+
+def unheard(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Say that nothing comes on a topic that has publishers; empty if it has none."""
+    if not publishers:
+        return ""
+    return f"nothing on {topic} for {SILENT:g} s, though {names(publishers)} publishes it"
 
 
 def names(endpoints: Sequence[TopicEndpointInfo]) -> str:

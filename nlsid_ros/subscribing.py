@@ -21,7 +21,6 @@ from nlsid_ros.message_classes import message_class
 from nlsid_ros.type_descriptions import TypeDescriptions
 
 Received = Callable[[bytes, dict[str, int]], None]
-SILENT = 2.0  # s without a message of a publisher that is there
 STREAMED = 10  # messages, after which a topic's pace is known
 OVERDUE = 5.0  # times the longest time between two messages of a topic
 SHARED = {"diagnostic_msgs/msg/DiagnosticArray", "visualization_msgs/msg/Marker"}  # by many nodes
@@ -83,15 +82,15 @@ class Silence:
         self._count += count
 
     @property
-    def odd(self) -> float:
-        """S without a message, if that is at least SILENT and more than is usual; else 0.
+    def is_odd(self) -> bool:
+        """Whether nothing came for 2 s, and for longer than is usual.
 
         Of a topic that had a few messages nobody knows what is usual.
         """
         past = time.monotonic() - self._since
-        if 0 < self._count < STREAMED or past < max(SILENT, OVERDUE * self._longest):
-            return 0.0
-        return past
+        if 0 < self._count < STREAMED:
+            return False
+        return past > max(graph.SILENT, OVERDUE * self._longest)
 
 
 @dataclass
@@ -114,7 +113,7 @@ class Source:
     lost: int = 0
     followed: str = ""
     _waiting: deque[tuple[bytes, dict[str, int]]] = field(default_factory=deque)
-    _silence: Silence = field(default_factory=Silence)
+    silence: Silence = field(default_factory=Silence)
 
     def keep(self, data: bytes, info: dict[str, int]) -> None:
         """Keep a message until `take`."""
@@ -126,16 +125,11 @@ class Source:
     def take(self) -> None:
         """Call back for every message that waits."""
         if self._waiting:
-            self._silence.end(len(self._waiting))
+            self.silence.end(len(self._waiting))
         if self.callback is None:
             return
         while self._waiting:
             self.callback(*self._waiting.popleft())
-
-    @property
-    def silent_for(self) -> float:
-        """S without a message where that is odd; else 0."""
-        return self._silence.odd
 
 
 class _Undefined(NamedTuple):
@@ -208,9 +202,8 @@ class Subscriptions:
             ]
             self._match(topic, source, publishers)
             said = [source.followed]
-            if publishers and (silent := source.silent_for):
-                by = graph.names(publishers)
-                said.append(f"nothing on {topic} for {silent:.0f} s, which {by} publishes")
+            if source.silence.is_odd:
+                said.append(graph.unheard(topic, publishers))
             if _has_one_publisher(source):
                 said.append(graph.several(topic, publishers))
             if text := "; ".join(filter(None, said)):
@@ -223,7 +216,8 @@ class Subscriptions:
         if not publishers or wanted == source.profile:
             return
         source.followed = "; ".join(
-            f"{topic}: {graph.names([publisher])} came later and is {why}: subscribed to anew"
+            f"{topic}: {graph.names([publisher])} came later and offers less ({why}): subscribed "
+            "to anew"
             for publisher in publishers
             if (why := graph.mismatch(publisher.qos_profile, source.profile))
         )

@@ -26,6 +26,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
@@ -158,6 +159,7 @@ class TrackingController(ManagedNode):
         self._run: Run | None = None  # as it was announced
         self._last_ns = 0  # the stamp of the last response under the policy's own input
         self._stamped_ns = 0  # the newest stamp of a response or command
+        self._began = math.inf  # when a run did, s of the wall's time
         self._sent = -math.inf  # when the last command went out, s of the wall's time
         self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
         self._ramp = self._limits
@@ -256,6 +258,7 @@ class TrackingController(ManagedNode):
             return f"require_monitor is set and {judging} {self._margin.topic_name}"
         self._first_ns, self._run, self._stage = None, None, 1
         self._stamped_ns, self._accompanied = 0, not self._watched
+        self._began = time.monotonic()
         self._tell("waiting for the response")
         return ""
 
@@ -299,13 +302,12 @@ class TrackingController(ManagedNode):
 
     def _doubt(self) -> str:
         """Why nobody knows whose responses come; empty if it is known."""
-        topic = self._responses.topic_name
-        publishers = [
-            publisher
-            for publisher in self.get_publishers_info_by_topic(topic)
-            if publisher.topic_type == self._response_type
-        ]
-        return graph.several(topic, publishers)
+        return graph.several(self._responses.topic_name, self._responders())
+
+    def _responders(self) -> list[TopicEndpointInfo]:
+        """Who publishes responses."""
+        publishers = self.get_publishers_info_by_topic(self._responses.topic_name)
+        return [each for each in publishers if each.topic_type == self._response_type]
 
     def _say_run(self, run: Run) -> None:
         self._run = run
@@ -479,6 +481,9 @@ class TrackingController(ManagedNode):
         said = [graph.namesakes(self)]
         if self._design is not None:
             said.append(graph.rivals(self, self._commands))
+        waiting = time.monotonic() - self._began if self._controller is not None else 0.0
+        if self._first_ns is None and waiting > graph.SILENT:
+            said.append(graph.unheard(self._responses.topic_name, self._responders()))
         return "; ".join(filter(None, said))
 
 

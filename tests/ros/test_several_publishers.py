@@ -95,6 +95,12 @@ def test_a_second_publisher_of_commands_is_named_and_if_both_send_the_state_is_u
     robot.spin_until(lambda: robot.has_said("unknown: messages of several publishers come in turn"))
 
 
+def test_a_publisher_that_is_there_and_says_nothing_is_named(made: Callable[..., Robot]) -> None:
+    robot = made(MONITOR, "no speed yet")
+    robot.spin_until(lambda: robot.has_said("nothing on /odom for 2 s, though /test_robot publish"))
+    assert robot.levels[NAME] in (DiagnosticStatus.WARN, DiagnosticStatus.STALE)
+
+
 def test_a_driver_that_comes_back_best_effort_is_heard_again(made: Callable[..., Robot]) -> None:
     robot = watched(made)
     robot.node.destroy_publisher(robot.odom)
@@ -110,6 +116,7 @@ def test_a_driver_that_was_killed_and_replaced_counts_for_the_lease_of_dds(
 ) -> None:
     robot = watched(made)
     robot.node.destroy_publisher(robot.odom)
+    robot.spin_until(lambda: robot.node.count_publishers("/odom") == 0)
     code = (
         "import rclpy, time; from nav_msgs.msg import Odometry; rclpy.init(); "
         "n = rclpy.create_node('driver'); p = n.create_publisher(Odometry, '/odom', 10); "
@@ -200,8 +207,8 @@ def test_a_recorder_names_publishers_in_turn_and_one_that_says_nothing_and_follo
         for text in (
             "/odom has 2 publishers: /test_robot, /test_robot; stop all but one",
             "lost messages are not counted: several publishers send on it",
-            "/driver: /test_robot came later and is Best effort publisher",
-            "nothing on /silent for 2 s, which /test_robot publishes",
+            "/driver: /test_robot came later and offers less (Best effort publisher and reliable",
+            "nothing on /silent for 2 s, though /test_robot publishes it",
         ):
             spin_until(lambda text=text: robot.has_said(text, name))  # type: ignore[misc]
         stop(recorder)
