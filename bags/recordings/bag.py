@@ -65,13 +65,19 @@ class Bag:
         self._storage = Storage(self.files, salvage=salvage)
         release = self._described.release or self._storage.release
         self._storage.channels = [
-            defined(channel, definitions or {}, release) for channel in self._storage.channels
+            defined(self._encoded(channel), definitions or {}, release)
+            for channel in self._storage.channels
         ]
         if self._storage.ending is not None:  # of a bag that is one file that is said already
             self.ending = self._storage.ending.removeprefix(f"{self.path}: ")
         if self.ending is not None and not (unfinished or salvage):
             self.close()
             raise BagError(self._unfinished())
+
+    def _encoded(self, channel: Channel) -> Channel:
+        """The channel, with the encoding that the metadata state where its file says CDR."""
+        stated = self._described.encodings.get(channel.topic, "cdr")
+        return replace(channel, encoding=stated) if channel.encoding == "cdr" else channel
 
     def close(self) -> None:
         """Close the bag's files."""

@@ -35,6 +35,7 @@ class BagFiles:
 
     files: tuple[Path, ...]
     counts: dict[str, int] | None = None
+    encodings: dict[str, str] = field(default_factory=dict)
     offered: dict[str, tuple[Profile, ...]] = field(default_factory=dict)
     custom: dict[str, str] = field(default_factory=dict)
     finished: bool = True
@@ -166,11 +167,13 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         there = ", ".join(found.name for found in files if found)
         notes.append(f"{METADATA} names {', '.join(missing)}, which is not there; read: {there}")
     counts: dict[str, int] = {}
+    encodings: dict[str, str] = {}
     profiles: dict[str, tuple[Profile, ...]] = {}
     try:
         for entry in metadata["topics_with_message_count"] or ():
             topic = str(entry["topic_metadata"]["name"])
             counts[topic] = counts.get(topic, 0) + int(entry["message_count"])
+            encodings[topic] = str(entry["topic_metadata"].get("serialization_format", "cdr"))
             found = offered(entry["topic_metadata"].get(KEY))
             profiles[topic] = (*profiles.get(topic, ()), *found)
     except (KeyError, TypeError, ValueError) as error:
@@ -181,6 +184,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
     return BagFiles(
         tuple(found for found in files if found),
         counts=counts,
+        encodings=encodings,
         offered=profiles,
         custom={str(key): str(value) for key, value in custom.items()},
         release=str(metadata.get("ros_distro") or ""),

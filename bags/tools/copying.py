@@ -74,7 +74,7 @@ def copy_messages(
                 if channel.topic not in writer.counts:
                     writer.add_copy(channel, (n, bags[n].strand(channel)))
     for bag in bags:
-        copied.notes += [*bag.disagreements, *bag.lost]
+        copied.notes += [*bag.lost, *bag.disagreements]
     for (topic, why), count in unreadable.items():
         copied.notes.append(f"{topic}: {count} messages are left out: {why}")
     return copied

@@ -90,8 +90,7 @@ def _refuse_another_type(topic: str, first: Bag, second: Bag) -> None:
         )
     if not are_same(defined, redefined):
         raise BagError(
-            f"{topic} comes with two definitions of '{one}', in {first.path} and in "
-            f"{second.path}; keep them in two bags"
+            f"{second.path}: {topic} comes with two definitions of '{one}'; keep them in two bags"
         )
 
 

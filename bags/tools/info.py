@@ -151,7 +151,7 @@ def bag_info(
             ending=bag.ending,
             custom=bag.custom,
             topics=tuple(collector.info() for collector in found.values()),
-            notes=(*bag.disagreements, *bag.lost),
+            notes=(*bag.lost, *bag.disagreements),
         )
 
 

@@ -11,6 +11,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
@@ -21,7 +22,7 @@ from typer.testing import CliRunner
 
 from bags.commands.bag_cli import bag_app
 from bags.recordings.bag import Bag
-from bags.recordings.message_types import decode, standard_types
+from bags.recordings.message_types import decode, standard_types, types_in_bag
 from bags.signals.reader import read_signals
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
@@ -418,7 +419,7 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
             "uv_coordinates": [], "text": "", "mesh_resource": "",
             "mesh_use_embedded_materials": False,
         }  # fmt: skip
-        marker = made["visualization_msgs/msg/Marker"]
+        marker: Any = made["visualization_msgs/msg/Marker"]
         known = marker.__dataclass_fields__
         if "texture" in known:
             image = made["sensor_msgs/msg/CompressedImage"](header, "", np.zeros(0, np.uint8))
@@ -539,16 +540,10 @@ def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
     found = []
     with Bag(tmp_path / ("copy_01" if how == "split" else "copy")) as copy:
         for channel, batch in copy.batches():
-            types = types_of(channel)
+            types = types_in_bag(channel.msgtype, channel.definition)
             messages = [decode(batch.data(k), channel.msgtype, types) for k in range(len(batch))]
             found += [(message.a, message.b) for message in messages]  # type: ignore[attr-defined]
     assert found == [(1.0, 2.0)] * 20
-
-
-def types_of(channel: object) -> object:
-    from bags.recordings.message_types import types_in_bag
-
-    return types_in_bag(channel.msgtype, channel.definition)  # type: ignore[attr-defined]
 
 
 def test_a_schema_that_is_not_read_is_copied_as_it_is(tmp_path: Path) -> None:
