@@ -45,12 +45,6 @@ def monitor(
     forecast: Annotated[
         float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
     ] = 0.0,
-    falsify: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for certificates that bags break what a tube assumes, for `nlsid check`."
-        ),
-    ] = None,
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
@@ -67,7 +61,6 @@ def monitor(
     from bags.designs import documents
     from bags.designs.design import Wiring
     from bags.fleet.monitor import judged_of
-    from bags.monitoring.falsify import falsified, refuse_unfalsifiable
     from bags.monitoring.replay import replay_bag, to_judge
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
@@ -80,8 +73,6 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
-    if falsify is not None:
-        refuse_unfalsifiable(proved.design.model)
     folders = expand_bags(bags)
     if settings is not None:
         chosen = to_judge(proved.design, folders, validation=settings.split.validation)
@@ -113,10 +104,6 @@ def monitor(
             out.print(line, soft_wrap=True, markup=False, highlight=False)
     for line in () if as_json else show.paced_lines(replays):
         out.print(line, soft_wrap=True, markup=False, highlight=False)
-    if falsify is not None:
-        bad = [f for f, r in zip(folders, replays, strict=True) if r.first_bad is not None]
-        for said in (line for f in bad for line in falsified(funnel, f, falsify, types)):
-            (err if as_json else out).print(said, soft_wrap=True, markup=False, highlight=False)
     if drawn and not as_json:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
@@ -175,15 +162,10 @@ def view(
     bag: Annotated[
         Path | None, typer.Argument(help="A recording to replay; none: the live robot.")
     ] = None,
-    page: Annotated[
-        bool, typer.Option("--page", help="A page for any browser; else a server for Foxglove.")
-    ] = False,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(help="Port; 0: 8765 for Foxglove, 8080 for the page.", min=0, max=65535)
-    ] = 0,
+    port: Annotated[int, typer.Option(help="Port; 0: one that is free.", min=0, max=65535)] = 8080,
     monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
     funnel: Annotated[
         Path | None, typer.Option(help="For a recording: the funnel it is held against.")
@@ -198,13 +180,13 @@ def view(
     command: CommandOption = None,
     period: PeriodOption = 0.0,
 ) -> None:
-    """Show tube, signals, margin, assumption and events, live or of a recording, until Ctrl-C."""
+    """Serve a page of tube, signals, margin and events, live or of a recording, until Ctrl-C."""
     from bags.commands.viewing import view_live, view_recording
 
     if bag is None:
         if importlib.util.find_spec("rclpy") is None:
             raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
-        raise typer.Exit(view_live(monitor, page=page, host=host, port=port))
+        raise typer.Exit(view_live(monitor, host=host, port=port))
     if funnel is None:
         raise typer.BadParameter("a recording is held against a funnel: give --funnel")
     from bags.chain.config import load_config
@@ -216,7 +198,7 @@ def view(
     centre = show.centre_of(load_config(config) if config is not None else None)
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     recording = Recording(documents.load_proved(funnel, wiring=wiring), bag, centre=centre)
-    view_recording(recording, rate, page=page, host=host, port=port)
+    view_recording(recording, rate, host=host, port=port)
 
 
 def demo(
