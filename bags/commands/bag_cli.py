@@ -3,7 +3,6 @@
 A command imports what it runs when it is called.
 """
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,7 +26,7 @@ bag_app = typer.Typer(
     help="Look into recordings, check, repair, convert and cut them.",
     no_args_is_help=True,
 )
-out = Console() if sys.stdout.isatty() else Console(width=WIDTH_IN_FILES)
+out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
 err = Console(stderr=True)
 
 
