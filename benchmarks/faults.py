@@ -454,34 +454,41 @@ def hold_faults(folder: Path, only: str) -> Iterator[Seen]:
     rest = integrate_nominal(field, lambda _: [0.0], t=t, start=[0.0])
     design(ContinuousTracking(field, rest, goal=[0.2], hold=HOLD)).save(folder)
     text = Bundle.load(folder / FUNNEL).text()
+    slow = dict.fromkeys((MONITOR, CONTROLLER), "design refused: samples come .* hold=")
+    late = {MONITOR: "^assumption violated: the input was held", CONTROLLER: "the input was held"}
+    cases = (("samples too far apart", PERIOD_NS * 1e-9, late), ("hold = period", HOLD, slow))
+    for number, (name, period, said) in enumerate(cases):
+        if only in name:
+            os.environ["ROS_DOMAIN_ID"] = own_domain(50 + number)
+            with robot() as rig:
+                yield from _held(rig, name, text, period, said)
+
+
+def _held(rig: Rig, name: str, text: str, period: float, said: dict[str, str]) -> Iterator[Seen]:
+    """Samples of which two are 1.48 periods apart, to monitor and controller of this design."""
     wired = {"response": "/odom:twist.twist.linear.x", "command": "/cmd_vel:twist.linear.x"}
-    names = {MONITOR: "^assumption violated: the input was held", CONTROLLER: "the input was held"}
-    for period, said in ((PERIOD_NS * 1e-9, names), (HOLD, dict.fromkeys(names, "hold="))):
-        wanted = {who: f"{said[who]}, {who}" for who in names}
-        if not any(only in name for name in wanted.values()):
-            continue
-        os.environ["ROS_DOMAIN_ID"] = own_domain(len(said[MONITOR]))
-        with robot() as rig, ExitStack() as stack:
-            for who, limits in ((MONITOR, {}), (CONTROLLER, {"lowest": -9.0, "highest": 9.0})):
-                given: dict[str, object] = {**wired, **limits, "period": period}
-                stack.enter_context(python(*node(who, stale_after=PATIENT, **given)))
-            rig.design.publish(String(data=text))
-            ready = "^idle$" if said is names else "design refused"
-            rig.need("the controller", lambda r=ready: rig.has_said(CONTROLLER, r) >= 0)
-            rig.need("the monitor", lambda: len(rig.said.get(MONITOR, Said()).lines) > 2)
-            since = time.monotonic()
-            moved = rig.call(f"/{CONTROLLER}/start").success and said is not names
-            start_ns, began = time.time_ns(), time.monotonic()
-            for k in range(2 * GOOD):
-                off = {GOOD: -0.24, GOOD + 1: 0.24}.get(k, 0.0)
-                rig.sample(start_ns + round((k + off) * PERIOD_NS), command=None)
-                rig.spin(began + (k + 1) * PERIOD_NS * 1e-9 - time.monotonic())
-            for who, expected in said.items():
-                rig.until(lambda w=who, e=expected: rig.has_said(w, e) >= 0, VERDICT)
-                at, name = rig.has_said(who, expected), f"{wanted[who]}"
-                silent = who == MONITOR and not at >= 0
-                seen, hung = rig.said[who].text, rig.is_silent(who)
-                yield Seen(name, expected, seen, at - since, at >= 0, silent, moved, hung)
+    given: dict[str, object] = {**wired, "period": period, "stale_after": PATIENT}
+    with (
+        python(*node(MONITOR, **given)),
+        python(*node(CONTROLLER, lowest=-9.0, highest=9.0, **given)),
+    ):
+        rig.design.publish(String(data=text))
+        ready = "^(idle$|design refused)"
+        rig.need("the controller", lambda: rig.has_said(CONTROLLER, ready) >= 0)
+        rig.need("the monitor", lambda: rig.has_said(MONITOR, "no x0 yet|design refused") >= 0)
+        since, refused = time.monotonic(), "refused" in said[MONITOR]
+        moved = rig.call(f"/{CONTROLLER}/start").success and refused
+        start_ns, began = time.time_ns(), time.monotonic()
+        for k in range(2 * GOOD):
+            off = {GOOD: -0.24, GOOD + 1: 0.24}.get(k, 0.0)
+            rig.sample(start_ns + round((k + off) * PERIOD_NS), command=None)
+            rig.spin(began + (k + 1) * PERIOD_NS * 1e-9 - time.monotonic())
+        for who, expected in said.items():
+            rig.until(lambda: rig.has_said(who, expected) >= 0, VERDICT)  # noqa: B023
+            at, hung = rig.has_said(who, expected), rig.is_silent(who)
+            silent = who == MONITOR and not at >= 0
+            seen = rig.said[who].text
+            yield Seen(f"{name}, {who}", expected, seen, at - since, at >= 0, silent, moved, hung)
 
 
 def clock_faults(rig: Rig, only: str) -> Iterator[Seen]:
@@ -603,7 +610,8 @@ def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
 def design_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[Seen]:
     """Faults in what is published as a design, to both nodes, which then are asked to move."""
     seconds = (("second publisher", good), ("second publisher, other", other))
-    if not any(only in name for name, *_ in (*bundles(good, other), *seconds)):
+    names = [name for name, _, _ in bundles(good, other)] + [name for name, _ in seconds]
+    if not any(only in name for name in names):
         return
     rig.said.clear()
     stale = {"stale_after": PATIENT}
