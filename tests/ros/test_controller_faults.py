@@ -257,6 +257,8 @@ def test_without_the_monitor_it_requires_it_neither_starts_nor_goes_on(
     assert robot.commands == {}
     watching = {"nominal": "profile", "controller": NAME, "command_wait": 0.5, "stale_after": LATE}
     plant = {"model": funnel.with_name("model.json")}
+    for publisher in (robot.odom, robot.command):  # the plant is the only robot
+        robot.node.destroy_publisher(publisher)
     stack.enter_context(process("nlsid_ros.plant", **plant))
     monitor = stack.enter_context(process("nlsid_ros.funnel_monitor", **watching))
     robot.spin_until(lambda: robot.has_said("waiting for the controller"))
