@@ -30,18 +30,42 @@ MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a ma
 VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
-Terms = list[tuple[tuple[int, ...], Fraction]]  # of a polynomial: exponents and coefficients
+# Of a polynomial: exponents and coefficients. Exponents are bytes, whose hash no file can choose.
+Terms = list[tuple[bytes, Fraction]]
+
+# Why a proof is refused: the code of each "no".
+REASONS = {
+    "malformed": "a file is not as its page says",
+    "too_large": "a stated limit on sizes is exceeded, or memory",
+    "too_long": "it takes more processor time than is allowed",
+    "mismatch": "a file is not the one that the proof is about",
+    "unknown": "the kind of claim is not known",
+    "left": "the kind of claim, or the version of the file, is not decided any more",
+    "not_definite": "a matrix is not positive definite, or semidefinite",
+    "not_positive": "a polynomial is not shown to be positive",
+    "not_below": "a number exceeds its bound",
+    "not_covered": "a piece, a vertex or a mode is missing",
+    "not_valid": "the claim leaves where its model or equations hold",
+    "not_decided": "the kernel met what it did not expect",
+}
 
 
 class Rejected(Exception):  # noqa: N818 - a verdict
-    """The proof does not prove its claim; the message says why."""
+    """The proof does not prove its claim; the message says why, `reason` is one of REASONS."""
+
+    def __init__(self, message: str, reason: str = "malformed") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class Mismatch(Rejected):
     """A file is not the one that the proof is about."""
 
+    def __init__(self, message: str, reason: str = "mismatch") -> None:
+        super().__init__(message, reason)
 
-def by_degree(exponents: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+
+def by_degree(exponents: bytes) -> tuple[int, bytes]:
     """The order of monomials: by total degree, then by their exponents."""
     return sum(exponents), exponents
 
@@ -151,19 +175,19 @@ class Node:
         return list(value) if kind is int else [Fraction(entry) for entry in value]
 
     def monomials(
-        self, count: int, degree: int = MAX_DEGREE, order: Callable[[Any], Any] | None = None
-    ) -> list[tuple[int, ...]]:
+        self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], object] | None = None
+    ) -> list[bytes]:
         """Distinct rows of `count` exponents, of `degree` together at most; sorted by `order`."""
-        rows = [tuple(row) for row in self.wholes(None, count)]
-        if len(rows) > MAX_STATED:
-            raise Rejected(f"{self.where}: {len(rows)} terms; at most {MAX_STATED} are taken")
-        if any(e < 0 for row in rows for e in row):
-            raise Rejected(f"{self.where}: an exponent is negative")
+        stated = self.wholes(None, count)
+        if len(stated) > MAX_STATED:
+            too_many = f"{self.where}: {len(stated)} terms; at most {MAX_STATED} are taken"
+            raise Rejected(too_many, "too_large")
+        if any(min(row, default=0) < 0 or sum(row) > degree for row in stated):
+            raise Rejected(f"{self.where}: exponents should be 0 or more, {degree} together at most")
+        rows = list(map(bytes, stated))
         if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
             wanted = "in increasing order" if order else "each once"
             raise Rejected(f"{self.where}: monomials should be distinct, {wanted}")
-        if any(sum(row) > degree for row in rows):
-            raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
         return rows
 
     def polynomial(self, count: int, degree: int = MAX_DEGREE, order: Any = by_degree) -> Terms:
@@ -206,17 +230,18 @@ class Node:
 def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
     """The least one; Rejected if it would make every number long."""
     common = 1
-    for denominator in {value.denominator for value in values}:
-        common = lcm(common, denominator)
+    for value in values:
+        common = lcm(common, value.denominator)
         if common.bit_length() > MAX_COMMON:
-            raise Rejected(f"{where}: denominators of more than {MAX_COMMON} bits together")
+            too_long = f"{where}: denominators of more than {MAX_COMMON} bits together"
+            raise Rejected(too_long, "too_large")
     return common
 
 
 def parse(content: bytes, where: str) -> Node:
     """One JSON object."""
     if len(content) > MAX_BYTES:
-        raise Rejected(f"{where}: {len(content)} bytes; at most {MAX_BYTES} are read")
+        raise Rejected(f"{where}: {len(content)} bytes; at most {MAX_BYTES}", "too_large")
     try:
         value = json.loads(
             content.decode("utf-8"),
@@ -269,7 +294,7 @@ def read_regular(path: Path) -> bytes:
             raise OSError(0, "not a regular file", str(path))
         content = stream.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
-        raise Rejected(f"{plain(path.name)}: more than {MAX_BYTES} bytes")
+        raise Rejected(f"{plain(path.name)}: more than {MAX_BYTES} bytes", "too_large")
     return content
 
 

@@ -8,8 +8,7 @@ each b_k has to be diagonally dominant in V v: a square of a monomial of v count
 any other monomial is charged, by halves of its size, to a pair of v whose product it is, the first
 of those with the largest powers of two.
 So c >= Σ_i left[i] v_i², left[i] >= 0 being the least that any b_k leaves on the diagonal: c > 0
-if something is left for the monomial 1, and c > 0 except at the origin if 1 is not in v and
-something is left for a pure power of every variable.
+if something is left for the monomial 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from fractions import Fraction
 from math import comb, lcm
 
 from .files import MAX_DEGREE, Node, Rejected
-from .polynomials import Polynomial, Ring, long, packed, unpacked
+from .polynomials import Polynomial, Ring, packed, unpacked
 
 MAX_BASIS = 200
 MAX_FACTORS = 24
@@ -51,7 +50,8 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     rows = parts["basis"].monomials(ring.count, MAX_DEGREE // 2)
     size = len(rows)
     if not 0 < size <= MAX_BASIS:
-        raise Rejected(f"{parts['basis'].where} should hold 1 to {MAX_BASIS} distinct monomials")
+        wanted = f"{parts['basis'].where} should hold 1 to {MAX_BASIS} monomials"
+        raise Rejected(wanted, "too_large")
     columns = powers_of_two(parts["columns"], size)
     stated = parts["squares"].members("unit factors", "scale weights")
     scale = stated["scale"].integer() if "scale" in stated else 1
@@ -100,30 +100,10 @@ def positive(
     """A number that c is nowhere below; Rejected unless c > 0 (strict) or c >= 0 everywhere."""
     left = remainder(c, squares, ring, what)
     if strict and 0 not in left:
-        raise Rejected(f"{what}: the basis needs the monomial 1")
+        raise Rejected(f"{what}: the basis needs the monomial 1", "not_positive")
     if strict and not left[0]:
-        raise Rejected(f"{what}: not positive, only nonnegative")
+        raise Rejected(f"{what}: not positive, only nonnegative", "not_positive")
     return left.get(0, Fraction(0))
-
-
-def positive_except_origin(c: Polynomial, squares: Squares, ring: Ring, what: str) -> Fraction:
-    """Raise Rejected unless c = 0 at the origin, and c > 0 elsewhere and unbounded with |x|.
-
-    Returns the largest number with c >= number * Σ_i (a pure power of x_i)², as far as is known.
-    """
-    left = remainder(c, squares, ring, what)
-    if 0 in left:
-        raise Rejected(f"{what}: the basis should not hold the monomial 1")
-    best = [Fraction(0)] * ring.count
-    for key, room in left.items():
-        used = [i for i, e in enumerate(ring.exponents(key)) if e]
-        if len(used) == 1:
-            best[used[0]] = max(best[used[0]], room)
-    if not all(best):
-        raise Rejected(
-            f"{what}: nothing is left for a pure power of variable {best.index(Fraction(0))}"
-        )
-    return min(best)
 
 
 def positive_on(
@@ -159,7 +139,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     grams, digits = _grams(squares, ring, lowest), ring.digits(c)
     keys = list(set(digits).union(*grams))
     if any(key not in square and key not in pair for key in keys):
-        raise Rejected(f"{what}: a monomial that no product of the basis could balance")
+        unbalanced = f"{what}: a monomial that no product of the basis could balance"
+        raise Rejected(unbalanced, "not_positive")
     J, order = len(grams) - 1, c.order
     D = max(order, J)
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
@@ -169,7 +150,6 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     largest = max((abs(entry) for gram in grams for entry in gram.values()), default=0)
     bits = max(ring.width + below.bit_length(), (largest * above).bit_length())
     width = (bits + D + 2) // 8 + 1
-    ring.work.spend(len(keys) * (D + 1) * (1 + (width * (J + order + 2) >> 5)))
     size = ring.width // 8
     pad, zero = bytes(width - size), bytes(size - 1) + b"\x80"
     halves = int.from_bytes((zero + pad) * len(keys), "little")
@@ -197,7 +177,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             left[j] -= charge
         if min(left) < 0:
             i = next(i for i, room in enumerate(left) if room < 0)
-            raise Rejected(f"{what}: not positive (Bernstein coefficient {k} of {D}, monomial {i})")
+            place = f"Bernstein coefficient {k} of {D}, monomial {i}"
+            raise Rejected(f"{what}: not positive ({place})", "not_positive")
         left = [room * (common // comb(D, k)) for room in left]
         least = list(map(min, least, left)) if k else left
     return {
@@ -218,7 +199,6 @@ def _grams(squares: Squares, ring: Ring, lowest: int) -> list[dict[int, int]]:
         most = max((abs(entry) for _, row in factor for entry in row), default=0)
         heaviest = max((weight for weight, _ in factor), default=1)
         width = (most * most * max(1, heaviest) * (len(factor) + 1)).bit_length() // 8 + 1
-        ring.work.spend(size * (len(factor) + size) * long(size * 8 * width, most.bit_length()))
         lines = [
             (weight * packed(row, width) << 8 * width * (size - len(row)), row)
             for weight, row in factor

@@ -13,21 +13,40 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, factorial, prod
 
+from . import text
 from .decision import Decision
-from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed
+from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed, unit
 from .files import Node, Read, Rejected, Terms, bound_files
-from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
+from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .signals import Signal, apart, read_signals
-from .text import above, below
-from .trials import LONGEST, Recorded, read_trials, shared
+from .signals import Signal, apart, ranges, read_signals
+from .text import above
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
-STEP = 5_000  # of the work that a claim may take: what a step costs at the least
-ENTRY = 10  # what one of a matrix of curvature costs
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
+PROVENANCE = "measured safety_factor measured_on"  # of the bound; no part of the claim
+
+SENTENCE = (
+    "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
+    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k]{bound}, at all {samples} samples over "
+    "{span:down} s and ends within {ends} of the nominal; one that starts with "
+    "|S[0] (xhat - x[0])| <= {inlet:down} ends within {goal} of it; at the samples both stay in the "
+    "box of the model's data, {box}"
+)
+DISTURBANCE = "disturbance {form} {kept} at every sample, d = xhat+ - f(xhat, u)"
+KEPT = {
+    "response": "|S r| <= {bound:down}, r+ = A r + d from r = 0,",
+    "peak": "|S d| <= {bound:down}",
+    "energy": "sqrt(E) <= {bound:down}, E+ = E + {gain:up} |S d|^2 from E = 0,",
+    "fading": "sqrt(E) <= {bound:down}, E+ = {rate:up} E + {gain:up} |S d|^2 from E = 0,",
+}
+APPLIED = "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
+ROOTS = (
+    "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1], {low:down} to "
+    "{high:down}; that there is one is not stated"
+)
 
 
 @dataclass(frozen=True)
@@ -40,15 +59,11 @@ class Model:
     signals: list[Signal]
     box: Matrix
     states: int
-    bags: list[Recorded]
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption.
-
-    widens: what the disturbance adds to a radius.
-    """
+    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption."""
 
     S: list[Matrix]
     A: list[Matrix]
@@ -59,8 +74,11 @@ class Funnel:
     bound: Fraction
     rate: Fraction
     gain: Fraction
-    measured: str
-    widens: Fraction
+
+    @property
+    def widens(self) -> Fraction:
+        """What the disturbance adds to a radius."""
+        return Fraction(0) if self.form == "peak" else self.bound
 
 
 @dataclass(frozen=True)
@@ -99,18 +117,17 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     names = "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
     bases = proof.members(names)
 
-    def prove(ring: Ring) -> Fraction:
-        rooms: list[Fraction] = []
-        for k, node in enumerate(bases["steps"].items(len(u), len(u))):
-            at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
-            ring.work.spend(STEP)
-            step = Ring(ring.count, ring.width, ring.work)  # what a step holds is not kept
-            stated, link = _link(node, model, at, funnel.form, step)
-            rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
-        return min(rooms)
+    steps, rooms = bases["steps"].items(len(u), len(u)), []
 
-    margin = at_width(_variables(model), Work(width=FREE_OF_S), prove)
-    return Decision(_sentence(model, funnel, len(u)), margin, _assumptions(model, funnel), digests)
+    def prove(ring: Ring, k: int) -> None:
+        at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
+        stated, link = _link(steps[k], model, at, funnel.form, ring)
+        for chain in CHAINS:
+            rooms.append(_prove_step(link, stated[chain], bases, funnel, chain, k))
+
+    at_width(_variables(model), range(len(u)), prove, FREE_OF_S)
+    said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
+    return Decision(said, min(rooms), assumptions, digests)
 
 
 def _link(
@@ -169,11 +186,8 @@ def _prove_step(
         parts += _equations(stated["equations"], bases["equation_basis"], link)
     else:
         added = _explicit_addition(link, funnel, radius, what)
-    at_most(
-        reach + added,
-        following,
-        f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius",
-    )
+    exceeds = f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius"
+    at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
     return (following - reach - added) / following
@@ -203,8 +217,8 @@ def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) 
     mu = kappa * stretch(link.curvature, kappa * radius, kappa * funnel.bound, least=1)
     if funnel.form == "response":
         return mu * funnel.bound
-    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, too "
-            f"much for rate {above(rate)} and gain {above(gain)}")  # fmt: skip
+    much = f"too much for rate {above(rate)} and gain {above(gain)}"
+    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, {much}")
     return Fraction(0)
 
 
@@ -225,7 +239,8 @@ def _implicit_addition(
     mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
     mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
     if b["rates"] >= 1 or mapped_to > spread:
-        raise Rejected(f"{what}: two roots may differ by more than the stated spread")
+        beyond = f"{what}: two roots may differ by more than the stated spread"
+        raise Rejected(beyond, "not_below")
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
     own = b["kappa_next"] * reach
     at_most(z**2 + own**2, near**2, f"{what}: the second extent is too small")
@@ -263,8 +278,7 @@ def implicit_step(
 
 def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
     """The coefficients of degree 1: a row for each polynomial."""
-    keys = [1 << (BITS * i) for i in range(ring.count)]
-    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in keys] for q in p]
+    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in ring.keys] for q in p]
 
 
 def prove_curvature(
@@ -273,7 +287,6 @@ def prove_curvature(
     """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
     sizes: dict[int, Matrix] = {}
     keys = set().union(*(q.terms for q in p))
-    ring.work.spend(ENTRY * len(keys) * len(p) ** 2)
     for key in keys:
         e = ring.exponents(key)
         c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
@@ -281,7 +294,7 @@ def prove_curvature(
         share = Fraction(prod(map(factorial, e)), factorial(m))
         sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
     if max(sizes, default=0) >= least + len(gammas):
-        raise Rejected("curvature: a bound for every degree is needed")
+        raise Rejected("curvature: a bound for every degree is needed", "not_covered")
     for m, gamma in enumerate(gammas, start=least):
         if m in sizes:
             _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
@@ -327,7 +340,7 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
     """
     n = model.states
     tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
-    rows = [[Fraction(i == j) for j in range(n)] for i in range(n)] + K
+    rows = [unit(i, n) for i in range(n)] + K
     forms = inverse_forms(product(transposed(funnel.S[k]), funnel.S[k]), rows, "S'S")
     names, stays = [signal.name for signal in model.signals], "the box of the model's data"
     rooms = [(tube, width, "its stated half-width") for width in funnel.half_widths[k]]
@@ -336,7 +349,7 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
     named = zip(rooms, [*forms[:n], *forms], [*names[:n], *names], strict=False)
     for (radius, room, kept), form, name in named:
         if room < 0 or radius**2 * form > room**2:
-            raise Rejected(f"sample {k}: {name} can leave {kept}")
+            raise Rejected(f"sample {k}: {name} can leave {kept}", "not_valid")
 
 
 def _read_model(node: Node) -> Model:
@@ -356,11 +369,11 @@ def _read_model(node: Node) -> Model:
     outputs = len(x) // 2 if trapezoidal else len(x)
     columns = transposed(parts["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
-    bags = read_trials(parts["bags"])
-    model = Model(trapezoidal, polynomials, period, signals, box, len(x), bags)
+    model = Model(trapezoidal, polynomials, period, signals, box, len(x))
     degree, variables = max(map(sum, exponents)), _variables(model)
     if comb(variables + degree, degree) > MAX_MONOMIALS:
-        raise Rejected(f"degree {degree} in {variables} variables is too large to decide")
+        too_many = f"degree {degree} in {variables} variables is too large to decide"
+        raise Rejected(too_many, "too_large")
     return model
 
 
@@ -376,7 +389,8 @@ def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matri
     n, p = model.states, len(model.signals) - model.states
     u = parts["u"].array(None, p)
     if not 0 < len(u) * n**3 <= MAX_SAMPLES:
-        raise Rejected(f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps")
+        wanted = f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps"
+        raise Rejected(wanted, "too_large")
     parts["L"].array(n, n)
     return parts["x"].array(len(u) + 1, n), u, parts["K"].array(len(u), p, n)
 
@@ -388,75 +402,53 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
     radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
     roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
     if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
-        raise Rejected("radii and roots should be positive, and the tube start in the inlet")
-    stated = parts["assumption"].members("form bound rate gain measured safety_factor measured_on")
-    form, runs = stated["form"].text(), read_trials(stated["measured_on"])
-    bound, rate, gain, measured, factor = (
-        _nonnegative(stated[key]) for key in ("bound", "rate", "gain", "measured", "safety_factor")
-    )
-    if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
-        raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
-    if any(run.end < LONGEST for run in runs):
-        raise Rejected("commissioning runs are whole recordings, and windows of one are none")
-    if not runs or shared(runs, model.bags):
-        raise Rejected("the assumption needs commissioning runs that the model was not fitted on")
-    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
-    if rate > 1 or gain < 1 or plain:
-        raise Rejected(f"rate {above(rate)} or gain {above(gain)} is none of form {form}")
-    at_most(1, factor, "the safety factor is below 1")
-    at_most(factor * measured, bound, "the bound is below safety_factor x measured")
-    runs_and_factor = (
-        f"largest of {len(set(runs))} distinct commissioning runs {above(measured)}, safety factor "
-        f"{below(factor)}"
-    )
+        wanted = "radii and roots should be positive, and the tube start in the inlet"
+        raise Rejected(wanted, "not_below")
     S = [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
     A, widths = parts["A"].array(steps, n, n), parts["half_widths"].array(steps + 1, n)
-    widens = Fraction(0) if form == "peak" else bound
-    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain, runs_and_factor, widens)
+
+    stated = parts["assumption"].members(f"form bound rate gain {PROVENANCE}")
+    form = stated["form"].text()
+    bound, rate, gain = (_nonnegative(stated[key]) for key in ("bound", "rate", "gain"))
+    if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
+        raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
+    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
+    if rate > 1 or gain < 1 or plain:
+        none = f"rate {above(rate)} or gain {above(gain)} is none of form {form}"
+        raise Rejected(none, "not_below")
+    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain)
 
 
 def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
     """What is proved, its numbers rounded outward."""
     tube, inlet = (funnel.radii[chain] for chain in CHAINS)
+    wider = (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens)
     ends, goal = (
         ", ".join(
-            signal.quantity(f"{signal.name} {above(width * wider)}")
+            signal.quantity(f"{signal.name} {above(width * factor)}")
             for signal, width in zip(model.signals, funnel.half_widths[-1], strict=False)
         )
-        for wider in (Fraction(1), (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens))
+        for factor in (1, wider)
     )
-    box = ", ".join(
-        signal.quantity(f"{signal.name} in [{below(low)}, {above(high)}]")
-        for signal, (low, high) in zip(model.signals, model.box, strict=True)
-    )
-    start, size = "starts with |S[0] (xhat - x[0])| <=", "|S[k] (xhat - x[k])| <= tube[k]"
-    return (
-        f"funnel: a state estimate that {start} {below(tube[0])} stays in the tube, {size}"
-        f"{' + bound' * bool(funnel.widens)}, at all {steps + 1} samples over "
-        f"{below(steps * model.period)} s and ends within {ends} of the nominal; one that {start} "
-        f"{below(inlet[0])} ends within {goal} of it; at the samples both stay in the box of the "
-        f"model's data, {box}"
+    return text.say(
+        SENTENCE,
+        tube=tube[0],
+        bound=" + bound" if funnel.widens else "",
+        samples=steps + 1,
+        span=steps * model.period,
+        ends=ends,
+        inlet=inlet[0],
+        goal=goal,
+        box=ranges(model.signals, list(map(text.PRINTED["outer_range"], model.box))),
     )
 
 
 def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
-    bound, rate, gain = below(funnel.bound), above(funnel.rate), above(funnel.gain)
-    kept = {
-        "response": f"|S r| <= {bound}, r+ = A r + d from r = 0,",
-        "peak": f"|S d| <= {bound}",
-        "energy": f"sqrt(E) <= {bound}, E+ = E + {gain} |S d|^2 from E = 0,",
-        "fading": f"sqrt(E) <= {bound}, E+ = {rate} E + {gain} |S d|^2 from E = 0,",
-    }[funnel.form]
-    assumptions = (
-        f"disturbance {funnel.form} {kept} at every sample, d = xhat+ - f(xhat, u) "
-        f"({funnel.measured})",
-        "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])",
-    )
+    kept = text.say(KEPT[funnel.form], bound=funnel.bound, rate=funnel.rate, gain=funnel.gain)
+    said = (text.say(DISTURBANCE, form=funnel.form, kept=kept), APPLIED)
     if not model.trapezoidal:
-        return assumptions
-    low, high = min(funnel.roots[1:]), max(funnel.roots[1:])
-    near = "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1]"
-    return (*assumptions, f"{near}, {below(low)} to {above(high)}")
+        return said
+    return (*said, text.say(ROOTS, low=min(funnel.roots[1:]), high=max(funnel.roots[1:])))
 
 
 def _nonnegative(node: Node) -> Fraction:

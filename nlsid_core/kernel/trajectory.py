@@ -8,7 +8,7 @@ from fractions import Fraction
 from itertools import pairwise
 
 from .exact import Matrix, definite
-from .files import Node, Rejected, Terms
+from .files import Mismatch, Node, Rejected, Terms
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -68,7 +68,7 @@ def read_field(node: Node) -> Field:
             before = found.get(int(j), (low, high))
             found[int(j)] = max(low, before[0]), min(high, before[1])
     equations = [
-        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, tuple) for row in piece.items(n, n)]
+        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, bytes) for row in piece.items(n, n)]
         for piece in parts["pieces"].items(count, count)
     ]
     if any(max(e[1 + n + m :], default=0) > 1 for span in equations for p in span for e, _ in p):
@@ -90,19 +90,17 @@ def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
     for k in range(K):
         definite(P[k], f"P at knot {k}")
         if rho[k] <= 0:
-            raise Rejected(f"rho is not positive at knot {k}")
+            raise Rejected(f"rho is not positive at knot {k}", "not_below")
     return Funnel(t, x, P, rho)
 
 
 def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str]) -> Policy:
     """The policy: around the funnel's own nominal, each input clipped at most once."""
     made_for = {"vector_field": digests["vector_field"]}
-    parts, count = (
-        node.document("policy", "t x u K limits", "continuous", made_for=made_for),
-        len(funnel.x),
-    )
+    parts = node.document("policy", "t x u K limits", "continuous", made_for=made_for)
+    count = len(funnel.x)
     if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:
-        raise Rejected("the funnel is around another nominal than the policy's")
+        raise Mismatch("the funnel is around another nominal than the policy's")
     u, K = _curve(parts["u"], count, field.m), _curve(parts["K"], count, field.m, field.n)
     rows = parts["limits"].array(None, 3)
     limits = {int(row[0]): (row[1], row[2]) for row in rows if row[0] in range(field.m)}
