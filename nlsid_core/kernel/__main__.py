@@ -76,7 +76,7 @@ def main(given: list[str]) -> int:
         line = "".join(sign if sign.isprintable() else "?" for sign in path)
         name = line.encode("ascii", "replace").decode()
         refused = f"REJECTED {found.get('rejected')} [{found.get('reason')}]"
-        said = found["said"] if "said" in found else refused
+        said = found.get("said", refused)
         print(f"{name}: " + (f"cannot be read: {found['unread']}" if "unread" in found else said))
     return status
 

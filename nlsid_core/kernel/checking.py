@@ -8,7 +8,7 @@ from pathlib import Path
 
 from . import text
 from .decision import Decision
-from .files import MAX_TOTAL, Node, Read, Rejected, digest, parse, plain, read_regular
+from .files import MAX_TOTAL, Node, Read, Rejected, digest, parse, plain, read_regular, refuse_if
 
 # Each claim is a module of this package with a function `decide(claim, proof, read) -> Decision`.
 KINDS = (
@@ -71,9 +71,9 @@ def decide(content: bytes, read: Read) -> Verdict:
         nonlocal left
         found = read(name)
         left -= len(found)
-        if left < 0:
-            most = f"the files of one claim have at most {MAX_TOTAL} bytes together"
-            raise Rejected(most, "too_large")
+        refuse_if(
+            left < 0, f"the files of one claim have at most {MAX_TOTAL} bytes together", "too_large"
+        )
         files[name] = digest(found)
         return found
 
@@ -96,12 +96,13 @@ def decide(content: bytes, read: Read) -> Verdict:
 
 
 def _decided(kind: str, claim: Node, proof: Node, read: Read) -> Decision:
-    if kind in LEFT:
-        raise Rejected(f"kind {kind} {LEFT_WITH}", "left")
-    if kind not in KINDS:
-        raise Rejected(f"claim {kind!r} is unknown; known: {', '.join(KINDS)}", "unknown")
-    if type(claim.value) is dict and kind == "continuous_funnel" and "decay" in claim.value:
-        raise Rejected(f"decay, a member of a {kind}'s claim, {LEFT_WITH}", "left")
+    refuse_if(kind in LEFT, f"kind {kind} {LEFT_WITH}", "left")
+    refuse_if(kind not in KINDS, f"claim {kind!r} is unknown; known: {', '.join(KINDS)}", "unknown")
+    refuse_if(
+        type(claim.value) is dict and kind == "continuous_funnel" and "decay" in claim.value,
+        f"decay, a member of a {kind}'s claim, {LEFT_WITH}",
+        "left",
+    )
     decision: Decision = import_module(f".{kind}", __package__).decide(claim, proof, read)
     return decision
 

@@ -98,7 +98,7 @@ class ClosedLoop:
         return own - turned + ring.dot(gains, moved)
 
     def taken(self, taus: Node, held: list[Polynomial], sides: Node) -> list[Polynomial]:
-        """-τ q for everything that is nonnegative here, τ sums of squares in the monomials sides."""
+        """-τ q for everything that is nonnegative here, τ sums of squares in `sides`."""
         ring, found = self.ring, []
         for node, q in zip(taus.items(len(held), len(held)), held, strict=True):
             tau = node.members("columns squares") | {"basis": sides}

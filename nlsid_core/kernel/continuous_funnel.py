@@ -21,7 +21,7 @@ from . import text
 from .closed_loop import Loops, Push, at, read_multiplier
 from .decision import Decision
 from .exact import at_most, dot, inverse_forms, semidefinite, unit
-from .files import Node, Read, Rejected, bound_files
+from .files import Node, Read, Rejected, bound_files, refuse_if
 from .held import Hold, decide_rates, read_hold
 from .pieces import Piece, in_order, modes_of, pushed, pushing, refuse_many
 from .polynomials import Ring, at_width
@@ -37,8 +37,8 @@ GOAL = ", ends in the goal, an ellipsoid within {box}"
 OBEYED = "the state obeys the stored equations and the stored policy is applied {how}"
 AT_ONCE = "continuously, with no hold and no delay"
 LATE = (
-    "every {0:exact} s or more often: at every time, the input is the policy's of some time at most "
-    "{0:exact} s before, and not before the solution's start, for the state then"
+    "every {0:exact} s or more often: at every time, the input is the policy's of some time at "
+    "most {0:exact} s before, and not before the solution's start, for the state then"
 )
 EXPANDED = (
     "the equations expand others, and that the ranges of w cover what they leave out is an "
@@ -79,11 +79,12 @@ def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[Decision, Funne
     required += " rates rate_pieces" * ("hold" in parts)
     stated = proof.members(required, "kappa" if field.box else "")
     margin = stated["margin"].number()
-    if margin <= 0:
-        raise Rejected("the margin should be positive", "not_below")
+    refuse_if(margin <= 0, "the margin should be positive", "not_below")
     for t in field.breaks:
-        if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
-            raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
+        refuse_if(
+            funnel.t[0] < t < funnel.t[-1] and t not in funnel.t,
+            f"the dynamics change at {text.exact(t)} s, which is no knot",
+        )
     spans = [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
     hold = read_hold(parts, stated, field, policy, funnel)
     stage = Stage(field, policy, funnel, spans, hold)
@@ -95,7 +96,7 @@ def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[Decision, Funne
         count += decide_rates(field, policy, funnel, spans, stated, hold)
     said = text.say(
         SENTENCE,
-        # A held input remembers: only of a solution that starts inside is it always one from inside.
+        # A held input remembers: only of a solution that starts inside is it one from inside.
         whose="starts" if hold.period else "is",
         start=funnel.t[0],
         end=funnel.t[-1],
@@ -156,9 +157,11 @@ def _decide_valid(stage: Stage) -> None:
             room = [min(middle) - low - off, high - max(middle) - off]
             if i in policy.limits:
                 least, most = policy.limits[i]
-                if (least < low and most < low + off) or (most > high and least > high - off):
-                    where = f"the limits of u{i} lie where its dynamics are not valid"
-                    raise Rejected(where, "not_valid")
+                refuse_if(
+                    (least < low and most < low + off) or (most > high and least > high - off),
+                    f"the limits of u{i} lie where its dynamics are not valid",
+                    "not_valid",
+                )
                 room = room[least >= low : 2 - (most <= high)]
             kept += [(j, row, min(room)) for row in rows if room]
         for knot in (k, k + 1):
@@ -179,11 +182,14 @@ def _decide_pieces(stage: Stage, stated: dict[str, Node], margin: Fraction) -> i
     kappa = None
     if "kappa" in stated:
         kappa = stated["kappa"].array(count, len(field.box))
-        if any(k <= 0 for row in kappa for k in row):
-            raise Rejected("kappa should be positive", "not_below")
-        if len(pushing(field, first, len(field.box))) < len(field.box):
-            more = "w does more than add constants: kappa does not bound what it does"
-            raise Rejected(more, "not_valid")
+        refuse_if(
+            any(k <= 0 for row in kappa for k in row), "kappa should be positive", "not_below"
+        )
+        refuse_if(
+            len(pushing(field, first, len(field.box))) < len(field.box),
+            "w does more than add constants: kappa does not bound what it does",
+            "not_valid",
+        )
     refuse_many(count, 2 ** (0 if kappa else len(field.box)), len(hold.corners), 3**limited)
     middle = [tuple((low + high) / 2 for low, high in field.box)]
     vertices = list(product(hold.corners, middle if kappa else product(*field.box)))

@@ -1,9 +1,9 @@
 """The first family of models: polynomial equations 0 = h(v, x, w), x⁺ = [v; ã(x, w)].
 
-Of two solutions under one input, E = [∂h/∂v, ∂h/∂x] is averaged on the segment between them, and so
-it is in the hull of the Bernstein coefficients of these derivatives on a box that both are in.
-Where they depend on the input alone, the box is the model's own range of it; where they are constant
-there is none. docs/certificate_stability.md and docs/certificate_tube.md.
+Of two solutions under one input, E = [∂h/∂v, ∂h/∂x] is averaged on the segment between them, and
+so it is in the hull of the Bernstein coefficients of these derivatives on a box that both are in.
+Where they depend on the input alone, the box is the model's own range of it; where they are
+constant there is none. docs/certificate_stability.md and docs/certificate_tube.md.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from itertools import product
 from math import comb, prod
 
 from .exact import MAX_ORDER, Matrix, combined, definite, unit
-from .files import Node, Rejected, Terms
+from .files import Node, Rejected, Terms, refuse_if
 from .increments import Box, Hull, Linear, Model, read_recorded, sized
 from .signals import Signal, ranges, read_signal, read_signals
 from .text import PRINTED
@@ -36,10 +36,11 @@ def read_linear(node: Node) -> Model:
     direct, *b = parts["b"].array(n + 1)
     parts["c"].number()
     low, high = parts["u_range"].array(2)
-    if low > high:
-        raise Rejected(f"{node.where} u_range is empty")
+    refuse_if(low > high, f"{node.where} u_range is empty")
     F = [[a_i, *unit(i + 1, n + 1)[1:n]] for i, a_i in enumerate(a)]
-    linear = Linear([b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)], direct, (low, high))
+    linear = Linear(
+        [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)], direct, (low, high)
+    )
     y, u = (read_signal(parts["y"]),), (read_signal(parts["u"]),)
     none = Hull(lambda _, __: [])
     return Model(period, y, u, F, [unit(0, n)], none, "for every input", linear)
@@ -57,10 +58,14 @@ def read_affine(node: Node) -> Model:
     parts["y_offset"].array(p)
     y_scale, u_scale = parts["y_scale"].array(p), parts["u_scale"].array(n_u)
     limits, offsets = parts["u_range"].array(n_u, 2), parts["u_offset"].array(n_u)
-    if min(y_scale + u_scale) <= 0 or any(low >= high for low, high in limits):
-        raise Rejected(f"{node.where}: scales should be positive and input ranges not empty")
-    if any(not (0 <= i < n_u and 0 <= d < len(G)) for i, d in window):
-        raise Rejected(f"{node.where} window names inputs or delays that are not there")
+    refuse_if(
+        min(y_scale + u_scale) <= 0 or any(low >= high for low, high in limits),
+        f"{node.where}: scales should be positive and input ranges not empty",
+    )
+    refuse_if(
+        any(not (0 <= i < n_u and 0 <= d < len(G)) for i, d in window),
+        f"{node.where} window names inputs or delays that are not there",
+    )
 
     own = [tuple((end - offsets[i]) / u_scale[i] for end in limits[i]) for i, _ in window]
     box = [(low, high) for low, high in own]
@@ -86,8 +91,11 @@ def read_monotone(node: Node) -> Model:
     parts["c"].number()
     parts["y_offset"].number()
     _refuse_window(window, len(u), node)
-    if e[2] < 0 or (e[2] == 0 and e[1] != 0):
-        raise Rejected(f"{node.where} e is not increasing everywhere", "not_valid")
+    refuse_if(
+        e[2] < 0 or (e[2] == 0 and e[1] != 0),
+        f"{node.where} e is not increasing everywhere",
+        "not_valid",
+    )
     only = [[[_least_slope(e), *(-entry for entry in a)]]]
     F, H = [unit(i, n + 1) for i in range(n)], [unit(0, n + 1)]
     hull = Hull(lambda _, __: only, ray=e[2] > 0)
@@ -108,13 +116,14 @@ def read_implicit(node: Node, bounds: Node | None) -> Model:
     y, u = read_signals(parts["y"], "outputs"), read_signals(parts["u"], "inputs")
     window = parts["window"].wholes(given.inputs, 2)
     p, n = given.unknowns, given.states
-    if len(y) != p or n % p:
-        raise Rejected(f"{node.where}: outputs and states do not fit")
+    refuse_if(len(y) != p or n % p, f"{node.where}: outputs and states do not fit")
     _refuse_window(window, len(u), node)
     F = [unit(i, p + n) for i in range(p)]
     for terms in given.shift:
-        if any(sum(e) > 1 and any(e[:n]) for e, _ in terms):
-            raise Rejected(f"{node.where}: the shift should be linear in the states")
+        refuse_if(
+            any(sum(e) > 1 and any(e[:n]) for e, _ in terms),
+            f"{node.where}: the shift should be linear in the states",
+        )
         linear = {e.index(1): c for e, c in terms if any(e[:n])}
         F.append([Fraction(linear.get(j - p, 0)) for j in range(p + n)])
 
@@ -124,13 +133,15 @@ def read_implicit(node: Node, bounds: Node | None) -> Model:
     if known != (bounds is None):
         wanted = "needs no box: they are known everywhere" if known else "are known on a box only"
         raise Rejected(f"{node.where}: the increments of this model, which {wanted}", "not_valid")
-    where, box = "for every input", [] if bounds is None else _read_box(given, bounds, window, len(u))
+    where, box = (
+        "for every input",
+        [] if bounds is None else _read_box(given, bounds, window, len(u)),
+    )
     if box:
         where = "while signals stay in the box"
 
     def vertices(part: Box, ends: Node | None) -> list[Matrix]:
-        if ends is not None:
-            raise Rejected(f"{ends.where}: ends are for state-affine models")
+        refuse_if(ends is not None, f"{node.where}: ends are for state-affine models")
         return bernstein(E, part) if least is None else [least]
 
     hull = Hull(vertices, box, ray=least is not None, whole=p + n if p > 1 and box else 0)
@@ -153,8 +164,10 @@ class ImplicitModel:
     def separated(self) -> tuple[list[Terms], list[Terms]]:
         """(e in x, f in (x, w)) of a model e(x⁺) = f(x, w); Rejected if it is not of that form."""
         n = self.states
-        if self.unknowns < n or any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p):
-            raise Rejected("the model is not e(x+) = f(x, w); this set is for such models")
+        refuse_if(
+            self.unknowns < n or any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p),
+            "the model is not e(x+) = f(x, w); this set is for such models",
+        )
         left = [[(e[:n], c) for e, c in p if any(e[:n])] for p in self.h]
         right = [[(e[n:], -c) for e, c in p if not any(e[:n])] for p in self.h]
         return left, right
@@ -163,17 +176,19 @@ class ImplicitModel:
 def read_implicit_model(node: Node) -> ImplicitModel:
     """The equations of an `implicit` model's file."""
     parts = node.document("model", IMPLICIT, "implicit", optional=f"shift centre {RECORDED}")
-    if parts["equation"].text() != EQUATION:
-        raise Rejected(f"{parts['equation'].where} should be {EQUATION!r}")
+    refuse_if(
+        parts["equation"].text() != EQUATION, f"{parts['equation'].where} should be {EQUATION!r}"
+    )
     n = len([entry.text() for entry in parts["states"].items(1, MAX_IMPLICIT)])
     m = len([entry.text() for entry in parts["inputs"].items(0, MAX_WINDOW)])
     monotonicity, period = parts["monotonicity"].number(), parts["period"].number()
-    if monotonicity <= 0 or period <= 0:
-        raise Rejected("monotonicity and period should be positive")
+    refuse_if(monotonicity <= 0 or period <= 0, "monotonicity and period should be positive")
     rows = parts["h"].members("exponents coefficients")["coefficients"].array(None, None)
     k = len(rows[0]) if rows else 0
-    if not 0 < k <= n or ("shift" in parts) != (k < n):
-        raise Rejected(f"{k} equations for {n} states; a shift gives the others")
+    refuse_if(
+        not 0 < k <= n or ("shift" in parts) != (k < n),
+        f"{k} equations for {n} states; a shift gives the others",
+    )
     h = _read_stack(parts["h"], k + n + m, k)
     shift = _read_stack(parts["shift"], n + m, n - k) if "shift" in parts else []
     centre = _read_stack(parts["centre"], k, k) if "centre" in parts else []
@@ -192,9 +207,11 @@ def bernstein(E: MatrixTerms, box: Box) -> list[Matrix]:
     of degree d. Where they differ in one entry only, the two extreme ones have the same hull.
     """
     degrees = [max(powers[i] for powers, _ in E) for i in range(len(box))]
-    if prod(d + 1 for d in degrees) > MAX_VERTICES:
-        too_many = f"a box with more than {MAX_VERTICES} vertices"
-        raise Rejected(too_many, "too_large")
+    refuse_if(
+        prod(d + 1 for d in degrees) > MAX_VERTICES,
+        f"a box with more than {MAX_VERTICES} vertices",
+        "too_large",
+    )
     tables = [
         [[_weight(e, k, d, low, high) for k in range(d + 1)] for e in range(d + 1)]
         for d, (low, high) in zip(degrees, box, strict=True)
@@ -234,18 +251,24 @@ def _between(E: MatrixTerms, box: Box, node: Node) -> list[Matrix]:
         high - q - Σ b_i (w_i - lo_i)(hi_i - w_i) ≻ 0.
     """
     q = [(e, c[0][0]) for e, c in E if c[0][0]]
-    if len(E[0][1]) != 1 or any(any(e) and any(c[0][1:]) for e, c in E):
-        raise Rejected(f"{node.where}: ends are for one output whose lags have constant factors")
-    if any(sum(e) > 2 for e, _ in q):
-        raise Rejected(f"{node.where}: ends are for a leading coefficient of degree 2 at most")
-    if len(box) >= MAX_ORDER:
-        raise Rejected(f"{node.where}: at most {MAX_ORDER - 1} entries of the box", "too_large")
+    refuse_if(
+        len(E[0][1]) != 1 or any(any(e) and any(c[0][1:]) for e, c in E),
+        f"{node.where}: ends are for one output whose lags have constant factors",
+    )
+    refuse_if(
+        any(sum(e) > 2 for e, _ in q),
+        f"{node.where}: ends are for a leading coefficient of degree 2 at most",
+    )
+    refuse_if(
+        len(box) >= MAX_ORDER,
+        f"{node.where}: at most {MAX_ORDER - 1} entries of the box",
+        "too_large",
+    )
     parts = node.members("low high low_weights high_weights")
     ends = parts["low"].number(), parts["high"].number()
     for name, sign, end in (("low", 1, ends[0]), ("high", -1, ends[1])):
         weights = parts[f"{name}_weights"].array(len(box))
-        if min(weights) < 0:
-            raise Rejected(f"{node.where}: weights should be 0 or more", "not_below")
+        refuse_if(min(weights) < 0, f"{node.where}: weights should be 0 or more", "not_below")
         M = [[Fraction(0)] * (len(box) + 1) for _ in range(len(box) + 1)]
         M[0][0] = -sign * end
         for e, c in q:
@@ -287,17 +310,20 @@ def _least_cubic(model: ImplicitModel) -> Matrix | None:
     return [[_least_slope(e), *E[1:]]] if e[2] > 0 else None
 
 
-def _read_box(
-    model: ImplicitModel, bounds: Node, window: list[list[int]], inputs: int
-) -> Box:
+def _read_box(model: ImplicitModel, bounds: Node, window: list[list[int]], inputs: int) -> Box:
     """The box of (v, x, w), from ranges of outputs and inputs; x stacks past outputs."""
     p, n, ends = model.unknowns, model.states, bounds.members("y u")
     y_box, u_box = ends["y"].array(p, 2), ends["u"].array(inputs, 2)
-    if any(low >= high for low, high in [*y_box, *u_box]):
-        raise Rejected(f"{bounds.where}: a range is empty", "not_valid")
+    refuse_if(
+        any(low >= high for low, high in [*y_box, *u_box]),
+        f"{bounds.where}: a range is empty",
+        "not_valid",
+    )
     for i, terms in enumerate(model.shift):  # else a state is no output: it has another range
-        if terms != [(bytes(int(j == i) for j in range(n + model.inputs)), 1)]:
-            raise Rejected(f"{bounds.where}: on a box, the states should be the past outputs")
+        refuse_if(
+            terms != [(bytes(int(j == i) for j in range(n + model.inputs)), Fraction(1))],
+            f"{bounds.where}: on a box, the states should be the past outputs",
+        )
     rows = [*y_box, *y_box * (n // p), *(u_box[i] for i, _ in window)]
     return [(low, high) for low, high in rows]
 
@@ -308,12 +334,14 @@ def _jacobian(rows: Sequence[Terms], variables: int) -> MatrixTerms:
     for i, row in enumerate(rows):
         for j in range(variables):
             for powers, c in derivative(row, j):
-                if max(powers, default=0) > MAX_POWER:
-                    raise Rejected(f"powers should be from 0 to {MAX_POWER}", "too_large")
+                refuse_if(
+                    max(powers, default=0) > MAX_POWER,
+                    f"powers should be from 0 to {MAX_POWER}",
+                    "too_large",
+                )
                 entry = found.setdefault(powers, [[Fraction(0)] * variables for _ in rows])
                 entry[i][j] += c
-    if not found:
-        raise Rejected("the model's equation does not depend on its output")
+    refuse_if(not found, "the model's equation does not depend on its output")
     return sorted(found.items())
 
 
@@ -332,8 +360,10 @@ def _matrix_terms(node: Node, variables: int, *shape: int) -> MatrixTerms:
     parts = node.members("exponents coefficients")
     exponents = parts["exponents"].monomials(variables)
     coefficients = parts["coefficients"].array(len(exponents), *shape)
-    if not exponents or any(power > MAX_POWER for row in exponents for power in row):
-        raise Rejected(f"{node.where} should have monomials, with powers from 0 to {MAX_POWER}")
+    refuse_if(
+        not exponents or any(power > MAX_POWER for row in exponents for power in row),
+        f"{node.where} should have monomials, with powers from 0 to {MAX_POWER}",
+    )
     return list(zip(exponents, coefficients, strict=True))
 
 
@@ -348,14 +378,17 @@ def _read_stack(node: Node, count: int, size: int) -> list[Terms]:
 
 
 def _refuse_window(window: list[list[int]], inputs: int, node: Node) -> None:
-    if any(not (0 <= i < inputs and d >= 0) for i, d in window):
-        raise Rejected(f"{node.where} window names inputs or delays that are not there")
+    refuse_if(
+        any(not (0 <= i < inputs and d >= 0) for i, d in window),
+        f"{node.where} window names inputs or delays that are not there",
+    )
 
 
 def _within(beyond: str, u: Sequence[Signal], limits: Sequence[Sequence[Fraction]]) -> str:
     """For which inputs, in words: the model's range of them."""
-    if beyond not in ("clip", "refuse"):
-        raise Rejected(f"on_out_of_range is {beyond!r}; known: clip, refuse")
+    refuse_if(
+        beyond not in ("clip", "refuse"), f"on_out_of_range is {beyond!r}; known: clip, refuse"
+    )
     shown = ranges(u, list(map(PRINTED["inner_range"], limits)))
     if beyond == "clip":
         return f"for every input (the model clips its inputs: {shown})"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from math import lcm
 
-from .files import Rejected, common_denominator
+from .files import common_denominator, refuse_if
 
 Matrix = list[list[Fraction]]
 Rows = Sequence[Sequence[Fraction | int]]
@@ -33,11 +33,16 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
     its row is zero, else M is indefinite.
     """
     size = len(M)
-    if not 0 < size <= MAX_ORDER or any(len(row) != size for row in M):
-        wanted = f"{what} should be a square matrix of order 1 to {MAX_ORDER}"
-        raise Rejected(wanted, "too_large")
-    if any(M[i][j] != M[j][i] for i in range(size) for j in range(i)):
-        raise Rejected(f"{what} is not symmetric", "not_definite")
+    refuse_if(
+        not 0 < size <= MAX_ORDER or any(len(row) != size for row in M),
+        f"{what} should be a square matrix of order 1 to {MAX_ORDER}",
+        "too_large",
+    )
+    refuse_if(
+        any(M[i][j] != M[j][i] for i in range(size) for j in range(i)),
+        f"{what} is not symmetric",
+        "not_definite",
+    )
 
     scales = [lcm(*(entry.denominator for entry in g)) for g in vectors]
     whole = [[int(e * scale) for e in g] for g, scale in zip(vectors, scales, strict=True)]
@@ -48,11 +53,16 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
 
     for k, row in enumerate(rows):
         pivot = row[k]
-        if strict and pivot <= 0:
-            minor = f"{what} is not positive definite (leading minor {k + 1} of {size})"
-            raise Rejected(minor, "not_definite")
-        if pivot < 0 or (pivot == 0 and any(row[k:])):
-            raise Rejected(f"{what} is not positive semidefinite", "not_definite")
+        refuse_if(
+            strict and pivot <= 0,
+            f"{what} is not positive definite (leading minor {k + 1} of {size})",
+            "not_definite",
+        )
+        refuse_if(
+            pivot < 0 or (pivot == 0 and any(row[k:])),
+            f"{what} is not positive semidefinite",
+            "not_definite",
+        )
         if pivot == 0:
             continue
         corners = [
@@ -72,13 +82,12 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
 
 def at_most(small: Fraction | int, large: Fraction | int, what: str) -> None:
     """Raise Rejected unless small <= large."""
-    if not small <= large:
-        raise Rejected(what, "not_below")
+    refuse_if(not small <= large, what, "not_below")
 
 
 def dot(a: Sequence[Fraction | int], b: Sequence[Fraction | int]) -> Fraction:
     """a'b."""
-    return sum((p * q for p, q in zip(a, b, strict=True) if p and q), Fraction(0))
+    return Fraction(sum(p * q for p, q in zip(a, b, strict=True) if p and q))
 
 
 def product(A: Rows, B: Rows) -> Matrix:

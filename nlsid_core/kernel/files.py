@@ -65,6 +65,12 @@ class Mismatch(Rejected):
         super().__init__(message, reason)
 
 
+def refuse_if(wrong: object, message: str, reason: str = "malformed") -> None:
+    """Raise Rejected if something is wrong."""
+    if wrong:
+        raise Rejected(message, reason)
+
+
 def by_degree(exponents: bytes) -> tuple[int, bytes]:
     """The order of monomials: by total degree, then by their exponents."""
     return sum(exponents), exponents
@@ -104,11 +110,11 @@ class Node:
 
     def text(self) -> str:
         """A printable text of at most MAX_NAME characters."""
-        if type(self.value) is not str or len(self.value) > MAX_NAME:
-            raise Rejected(f"{self.where} should be a text of at most {MAX_NAME} characters")
-        if not self.value.isprintable():
-            raise Rejected(f"{self.where} should have no control characters")
-        return self.value
+        value = self.value
+        if type(value) is not str or len(value) > MAX_NAME or not value.isprintable():
+            wanted = f"at most {MAX_NAME} characters, none of them a control character"
+            raise Rejected(f"{self.where} should be a text of {wanted}")
+        return value
 
     def number(self) -> Fraction:
         """A float64, exactly."""
@@ -130,16 +136,19 @@ class Node:
         digits = above.removeprefix("-")
         parts = [digits] + ([below] if slash else [])
         for part in parts:
-            if not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS):
-                raise Rejected(f"{self.where} should be a number or a text p/q of whole numbers")
-        if slash and not int(below):
-            raise Rejected(f"{self.where} divides by zero")
+            refuse_if(
+                not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS),
+                f"{self.where} should be a number or a text p/q of whole numbers",
+            )
+        refuse_if(slash and not int(below), f"{self.where} divides by zero")
         return Fraction(int(above), int(below) if slash else 1)
 
     def integer(self) -> int:
         """A whole number; one beyond 2^53 is a text of digits."""
-        if type(self.value) is not int and (type(self.value) is not str or "/" in self.value):
-            raise Rejected(f"{self.where} should be a whole number")
+        refuse_if(
+            type(self.value) is not int and (type(self.value) is not str or "/" in self.value),
+            f"{self.where} should be a whole number",
+        )
         return self.rational().numerator
 
     def integers(self, least: int, most: int) -> tuple[int, ...]:
@@ -149,8 +158,10 @@ class Node:
             numbers: list[int] = entries
         else:
             numbers = [entry.integer() for entry in self.items(least, most)]
-        if not least <= len(numbers) <= most:
-            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
+        refuse_if(
+            not least <= len(numbers) <= most,
+            f"{self.where} should be a list of {least} to {most} entries",
+        )
         return tuple(numbers)
 
     def array(self, *shape: int | None) -> list:  # type: ignore[type-arg]
@@ -169,21 +180,24 @@ class Node:
             return [self._nested(entry, shape[1:], kind) for entry in value]
         for entry in value:
             if type(entry) is not int and (kind is int or type(entry) is not Fraction):
-                raise Rejected(
-                    f"{self.where} should hold {'whole ' if kind is int else ''}numbers only"
-                )
+                wanted = "whole numbers" if kind is int else "numbers"
+                raise Rejected(f"{self.where} should hold {wanted} only")
         return list(value) if kind is int else [Fraction(entry) for entry in value]
 
     def monomials(
-        self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], object] | None = None
+        self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] | None = None
     ) -> list[bytes]:
         """Distinct rows of `count` exponents, of `degree` together at most; sorted by `order`."""
         stated = self.wholes(None, count)
-        if len(stated) > MAX_STATED:
-            too_many = f"{self.where}: {len(stated)} terms; at most {MAX_STATED} are taken"
-            raise Rejected(too_many, "too_large")
-        if any(min(row, default=0) < 0 or sum(row) > degree for row in stated):
-            raise Rejected(f"{self.where}: exponents should be 0 or more, {degree} together at most")
+        refuse_if(
+            len(stated) > MAX_STATED,
+            f"{self.where}: {len(stated)} terms; at most {MAX_STATED} are taken",
+            "too_large",
+        )
+        refuse_if(
+            any(min(row, default=0) < 0 or sum(row) > degree for row in stated),
+            f"{self.where}: exponents should be 0 or more, {degree} together at most",
+        )
         rows = list(map(bytes, stated))
         if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
             wanted = "in increasing order" if order else "each once"
@@ -232,16 +246,19 @@ def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
     common = 1
     for value in values:
         common = lcm(common, value.denominator)
-        if common.bit_length() > MAX_COMMON:
-            too_long = f"{where}: denominators of more than {MAX_COMMON} bits together"
-            raise Rejected(too_long, "too_large")
+        refuse_if(
+            common.bit_length() > MAX_COMMON,
+            f"{where}: denominators of more than {MAX_COMMON} bits together",
+            "too_large",
+        )
     return common
 
 
 def parse(content: bytes, where: str) -> Node:
     """One JSON object."""
-    if len(content) > MAX_BYTES:
-        raise Rejected(f"{where}: {len(content)} bytes; at most {MAX_BYTES}", "too_large")
+    refuse_if(
+        len(content) > MAX_BYTES, f"{where}: {len(content)} bytes; at most {MAX_BYTES}", "too_large"
+    )
     try:
         value = json.loads(
             content.decode("utf-8"),
@@ -252,8 +269,7 @@ def parse(content: bytes, where: str) -> Node:
         )
     except (ValueError, RecursionError, ArithmeticError) as error:
         raise Rejected(f"{where}: not a valid document: {plain(str(error))}") from error
-    if type(value) is not dict:
-        raise Rejected(f"{where}: expected a JSON object")
+    refuse_if(type(value) is not dict, f"{where}: expected a JSON object")
     return Node(value, where)
 
 
@@ -269,8 +285,10 @@ def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], d
     for role, binding in about.members(roles).items():
         entry = binding.members("file digest")
         name, stated = entry["file"].text(), entry["digest"].text()
-        if not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"):
-            raise Rejected(f"{role} file {name!r} is not a plain file name")
+        refuse_if(
+            not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"),
+            f"{role} file {name!r} is not a plain file name",
+        )
         try:
             content = read(name)
         except OSError as error:
@@ -293,8 +311,9 @@ def read_regular(path: Path) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise OSError(0, "not a regular file", str(path))
         content = stream.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise Rejected(f"{plain(path.name)}: more than {MAX_BYTES} bytes", "too_large")
+    refuse_if(
+        len(content) > MAX_BYTES, f"{plain(path.name)}: more than {MAX_BYTES} bytes", "too_large"
+    )
     return content
 
 

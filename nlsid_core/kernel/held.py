@@ -1,4 +1,4 @@
-"""What holding and mismeasuring an input changes: |δ_i| <= W_i, the applied input being clip(ũ) + δ.
+"""What holding and mismeasuring an input changes: it is clip(ũ) + δ, and |δ_i| <= W_i.
 
 A held input is the policy's of some time at most a period ago. Pieces of rates show that
 |dũ_i/dt| < R_i in the funnel, so it is off by the period times R at most, and an error e of the
@@ -8,10 +8,11 @@ state by |Ke| more. Why that is enough: "The hold between samples" in docs/theor
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
+from typing import Any
 
 from .closed_loop import Corner, Loops, at
-from .exact import dot
-from .files import Node, Rejected
+from .exact import Matrix, dot
+from .files import Node, refuse_if
 from .pieces import Piece, in_order, modes_of, pushed, pushing, refuse_many
 from .polynomials import Ring, at_width
 from .positivity import positive, read_squares
@@ -51,25 +52,34 @@ def read_hold(
     before it starts: W is period times the largest rate there, and what e does to the largest Ke.
     """
     period, error = Fraction(0), [Fraction(0)] * field.n
-    rates = [[Fraction(0)] * field.m for _ in funnel.x]
+    rates: Matrix = [[Fraction(0)] * field.m for _ in funnel.x]
     if "hold" in parts:
         period = parts["hold"].number()
         rates = stated["rates"].array(len(funnel.x), field.m)
-        if period <= 0 or any(rate <= 0 for row in rates for rate in row):
-            raise Rejected("hold and rates should be positive", "not_below")
-        if any(p[-1] != q[0] for curve in (policy.u, policy.K) for p, q in pairwise(curve)):
-            jumps = "the policy jumps at a knot: no rate bounds what holding it changes"
-            raise Rejected(jumps, "not_valid")
+        curves: tuple[list[Any], ...] = policy.u, policy.K
+        refuse_if(
+            period <= 0 or any(rate <= 0 for row in rates for rate in row),
+            "hold and rates should be positive",
+            "not_below",
+        )
+        refuse_if(
+            any(p[-1] != q[0] for curve in curves for p, q in pairwise(curve)),
+            "the policy jumps at a knot: no rate bounds what holding it changes",
+            "not_valid",
+        )
     if "error" in parts:
         error = parts["error"].array(field.n)
-        if any(e < 0 for e in error):
-            raise Rejected("error should be 0 or more for every state", "not_below")
+        refuse_if(
+            any(e < 0 for e in error), "error should be 0 or more for every state", "not_below"
+        )
     exponents = [e for span in field.equations for equation in span for e, _ in equation]
     first = 1 + field.n
     curved = any(power > 1 for e in exponents for power in e[first : first + field.m])
-    if curved and parts.keys() & {"hold", "error"}:
-        wanted = "the dynamics are not affine in each input: corners do not bound its hold"
-        raise Rejected(wanted, "not_valid")
+    refuse_if(
+        curved and parts.keys() & {"hold", "error"},
+        "the dynamics are not affine in each input: corners do not bound its hold",
+        "not_valid",
+    )
 
     shaken = [
         [max(dot(list(map(abs, gain[i])), error) for gain in points) for i in range(field.m)]

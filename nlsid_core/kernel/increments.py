@@ -1,11 +1,11 @@
 """How two solutions of an identified model under one input differ, and the one inequality of it.
 
-With ζ = (ν, x̄), x̄ the difference of the states and ν those of quantities that the model defines by
-an equation,
+With ζ = (ν, x̄), x̄ the difference of the states and ν those of quantities that the model defines
+by an equation,
     E(θ) ζ = 0,    x̄⁺ = F ζ,    o = H ζ,    E(θ) in the convex hull of finitely many matrices,
-plus multiples of [1, 0] where the form has a ray. θ is what is not known: the input where the model
-is affine in its outputs, the slope of a nonlinearity elsewhere. With an innovation e beside ζ, every
-claim asks at each of these matrices, with multipliers N of its own,
+plus multiples of [1, 0] where the form has a ray. θ is what is not known: the input where the
+model is affine in its outputs, the slope of a nonlinearity elsewhere. With an innovation e beside
+ζ, every claim asks at each of these matrices, with multipliers N of its own,
     diag(0, ρP, R) - G'QG + sym(N [E 0]) ≻ 0.
 It is affine in E, so it holds at E(θ), where (ζ, e)'N E ζ = 0; a ray adds 2 T s ν² >= 0.
 docs/certificate_stability.md has the forms and why.
@@ -17,7 +17,7 @@ from fractions import Fraction
 
 from .exact import Matrix, Rows, block_diagonal, combined, congruence, definite, scaled, transposed
 from .exact import product as times
-from .files import Node, Rejected
+from .files import Node, Rejected, refuse_if
 from .signals import Signal
 
 MAX_STATES = 120
@@ -82,9 +82,7 @@ def gap(model: Model, rho: Fraction, P: Rows, R: Rows, G: Rows, Q: Rows) -> Matr
     return combined(block_diagonal(zero, scaled(P, rho), R), congruence(G, Q), -1)
 
 
-def positive(
-    model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, Matrix]]
-) -> None:
+def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, Matrix]]) -> None:
     """Raise Rejected unless M + sym(N [E 0]) ≻ 0 for each gap (what, M), at every vertex E.
 
     `multipliers` is a leaf {N}, N of M's order × m, a list of one for each gap if there are
@@ -103,9 +101,11 @@ def positive(
     for box, leaf in _leaves(multipliers, model.E, model.E.box, 0):
         given = leaf["N"]
         Ns = given.array(len(gaps), size, m) if len(gaps) > 1 else [given.array(size, m)]
-        if model.E.ray and any(N[0][0] < 0 or any(row[0] for row in N[1:]) for N in Ns):
-            wanted = "the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0"
-            raise Rejected(wanted, "not_below")
+        refuse_if(
+            model.E.ray and any(N[0][0] < 0 or any(row[0] for row in N[1:]) for N in Ns),
+            "the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0",
+            "not_below",
+        )
         for E in model.E.vertices(box, leaf.get("ends")):
             wide = [row + [Fraction(0)] * (size - len(row)) for row in E]
             for (what, M), N in zip(gaps, Ns, strict=True):
@@ -121,9 +121,11 @@ def _leaves(node: Node, E: Hull, box: Box, depth: int) -> Iterator[tuple[Box, di
     if set(parts) != {"split", "parts"} or not box:
         wanted = "a multiplier N, or the split of a box and its parts"
         raise Rejected(f"{node.where} should be {wanted}")
-    if depth == MAX_SPLITS:
-        too_many = f"{node.where}: more than {MAX_SPLITS} splits, one inside the other"
-        raise Rejected(too_many, "too_large")
+    refuse_if(
+        depth == MAX_SPLITS,
+        f"{node.where}: more than {MAX_SPLITS} splits, one inside the other",
+        "too_large",
+    )
     i = parts["split"].whole(E.whole, len(box) - 1)
     low, high = box[i]
     halves = ((low, (low + high) / 2), ((low + high) / 2, high))
@@ -135,14 +137,15 @@ def read_recorded(node: Node, kind: str, names: str) -> tuple[dict[str, Node], F
     """The members of a model of recorded signals, and its period; what made it is not read."""
     parts = node.document("model", f"period training bags {names}", kind, optional="equation")
     period = parts["period"].number()
-    if period <= 0:
-        raise Rejected("the model's period should be positive")
+    refuse_if(period <= 0, "the model's period should be positive")
     return parts, period
 
 
 def sized(n: int, node: Node) -> int:
     """So many states."""
-    if not 0 < n <= MAX_STATES:
-        too_many = f"{node.where}: {n} states; 1 to {MAX_STATES} are decided"
-        raise Rejected(too_many, "too_large")
+    refuse_if(
+        not 0 < n <= MAX_STATES,
+        f"{node.where}: {n} states; 1 to {MAX_STATES} are decided",
+        "too_large",
+    )
     return n

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from . import text
-from .files import Node, Rejected
+from .files import Node, Rejected, refuse_if
 from .signals import Signal
 
 MAX_TERMS = 200
@@ -43,8 +43,11 @@ def read_level(node: Node, inputs: int) -> CommandLevel:
     parts = node.members("terms weights")
     terms = [_term(entry, inputs) for entry in parts["terms"].items(1, MAX_TERMS)]
     (weights,) = parts["weights"].array(1, len(terms))
-    if min(weights) < 0 or not sum(weights):
-        raise Rejected(f"{node.where}: weights should be 0 or more, some positive", "not_below")
+    refuse_if(
+        min(weights) < 0 or not sum(weights),
+        f"{node.where}: weights should be 0 or more, some positive",
+        "not_below",
+    )
     return CommandLevel(terms, weights)
 
 
@@ -54,8 +57,9 @@ def _term(node: Node, inputs: int) -> Term:
     if len(factors) > MAX_FACTORS or any(not 0 <= i < inputs for i in factors):
         wanted = f"at most {MAX_FACTORS}, among the model's {inputs}"
         raise Rejected(f"{node.where}: inputs should be {wanted}")
-    if of not in ("value", "change"):
-        raise Rejected(f"{node.where}: of should be value or change, not {of!r}")
+    refuse_if(
+        of not in ("value", "change"), f"{node.where}: of should be value or change, not {of!r}"
+    )
     centre, scale, fading = (parts[name].number() for name in ("centre", "scale", "fading"))
     if not scale > 0 or not 0 <= fading < 1:
         wanted = "scale should be positive, fading in [0, 1)"

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from .equations import read_affine, read_implicit, read_linear, read_monotone
-from .files import Node, Rejected
+from .files import Node, Rejected, refuse_if
 from .increments import Model
 from .networks import read_cascade, read_cells
 
@@ -27,6 +27,8 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
     if kind not in READERS:
         known = ", ".join([*READERS, "implicit"])
         raise Rejected(f"{node.where}: kind is {kind!r}; known: {known}")
-    if bounds is not None:
-        raise Rejected(f"a model of kind {kind} needs no box: its increments are known everywhere")
+    refuse_if(
+        bounds is not None,
+        f"a model of kind {kind} needs no box: its increments are known everywhere",
+    )
     return READERS[kind](node)

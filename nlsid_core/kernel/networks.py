@@ -11,7 +11,7 @@ from itertools import pairwise, product
 
 from . import text
 from .exact import Matrix, unit
-from .files import Node, Rejected
+from .files import Node, refuse_if
 from .increments import Hull, Model, read_recorded, sized
 from .signals import read_signal, read_signals
 
@@ -30,8 +30,10 @@ def read_cells(node: Node) -> Model:
     width = m + n + len(u) + 1
     into = parts["into"].array(m, width)
     F, H = parts["next"].array(n, width), parts["output"].array(len(y), width)
-    if any(any(row[j:m]) for j, row in enumerate(into)):
-        raise Rejected(f"{node.where} into: a map should depend on earlier maps only")
+    refuse_if(
+        any(any(row[j:m]) for j, row in enumerate(into)),
+        f"{node.where} into: a map should depend on earlier maps only",
+    )
     F, H, into = ([row[: m + n] for row in rows] for rows in (F, H, into))
     return Model(period, y, u, F, H, _corners(slopes, into), "for every input")
 
@@ -46,10 +48,14 @@ def read_cascade(node: Node) -> Model:
     a1, a2 = parts["a1"].array(None), parts["a2"].array(None)
     b1, b2 = parts["b1"].array(None, None), parts["b2"].array(None, None)
     M = len(b1)
-    if not 0 < M <= MAX_MAPS or len(b2) != M:
-        raise Rejected(f"{node.where}: b1 and b2 should have as many rows, 1 to {MAX_MAPS}")
-    if any(len(row) != len(rows[0]) or not row for rows in (b1, b2) for row in rows):
-        raise Rejected(f"{node.where}: the rows of b1, and of b2, should have equal lengths")
+    refuse_if(
+        not 0 < M <= MAX_MAPS or len(b2) != M,
+        f"{node.where}: b1 and b2 should have as many rows, 1 to {MAX_MAPS}",
+    )
+    refuse_if(
+        any(len(row) != len(rows[0]) or not row for rows in (b1, b2) for row in rows),
+        f"{node.where}: the rows of b1, and of b2, should have equal lengths",
+    )
     n1, n2 = max(len(a1), len(b1[0]) - 1), max(len(a2), len(b2[0]) - 1)
     n = sized(n1 + n2, node)
     a1, a2 = _padded(a1, n1), _padded(a2, n2)
@@ -94,8 +100,10 @@ def _slopes(node: Node) -> list[Fraction]:
     parts = node.members("knots values")
     knots = parts["knots"].array(None)
     values = parts["values"].array(len(knots))
-    if len(knots) < 2 or any(high <= low for low, high in pairwise(knots)):
-        raise Rejected(f"{node.where}: 2 knots or more, ascending")
+    refuse_if(
+        len(knots) < 2 or any(high <= low for low, high in pairwise(knots)),
+        f"{node.where}: 2 knots or more, ascending",
+    )
     steps = zip(pairwise(knots), pairwise(values), strict=True)
     return _ends([(after - before) / (high - low) for (low, high), (before, after) in steps])
 
@@ -105,8 +113,9 @@ def _spline_slopes(node: Node) -> list[Fraction]:
     parts = node.members("low spacing coefficients")
     parts["low"].number()
     spacing, c = parts["spacing"].number(), parts["coefficients"].array(None)
-    if spacing <= 0 or len(c) < 4:
-        raise Rejected(f"{node.where}: a positive spacing and 4 coefficients or more")
+    refuse_if(
+        spacing <= 0 or len(c) < 4, f"{node.where}: a positive spacing and 4 coefficients or more"
+    )
     return _ends([(after - before) / spacing for before, after in pairwise(c)])
 
 

@@ -7,7 +7,7 @@ from itertools import product
 from math import prod
 
 from .closed_loop import Mode, Part
-from .files import Node, Rejected, Terms
+from .files import Node, Terms, refuse_if
 from .trajectory import Field, Policy
 
 MAX_LEVEL, MAX_PIECES = 16, 100_000
@@ -41,26 +41,32 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
         if "input" in piece:
             mode = piece["input"].whole(0), piece["sign"].whole(-1, 1), *mode
         k, v = piece["interval"].whole(0), piece["vertex"].whole(0)
-        if (k, v, mode) not in covered:
-            none = f"piece {place} is about interval {k}, vertex {v}, mode {mode}: none"
-            raise Rejected(none, "not_covered")
+        refuse_if(
+            (k, v, mode) not in covered,
+            f"piece {place} is about interval {k}, vertex {v}, mode {mode}: none",
+            "not_covered",
+        )
         pieces.append(Piece((k, v, mode), (k, level, index), piece, place))
     starts = [(p.key, Fraction(p.part[2], 2 ** p.part[1]), p.part[1]) for p in pieces]
     for key, start, level in sorted(starts):
         if start <= covered[key]:
             covered[key] = max(covered[key], start + Fraction(1, 2**level))
     for (k, v, mode), until in covered.items():
-        if until < 1:
-            missing = f"a piece of interval {k} is missing (vertex {v}, mode {mode})"
-            raise Rejected(missing, "not_covered")
+        refuse_if(
+            until < 1,
+            f"a piece of interval {k} is missing (vertex {v}, mode {mode})",
+            "not_covered",
+        )
     return pieces
 
 
 def refuse_many(*counts: int) -> None:
     """Raise Rejected if there are more intervals, vertices and modes than pieces."""
-    if prod(counts) > MAX_PIECES:
-        many = f"{prod(counts)} intervals, vertices and modes; at most {MAX_PIECES}"
-        raise Rejected(many, "too_large")
+    refuse_if(
+        prod(counts) > MAX_PIECES,
+        f"{prod(counts)} intervals, vertices and modes; at most {MAX_PIECES}",
+        "too_large",
+    )
 
 
 def modes_of(policy: Policy) -> list[Mode]:

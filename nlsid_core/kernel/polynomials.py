@@ -17,7 +17,7 @@ from math import comb, lcm
 from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Rejected, Terms
+from .files import MAX_DEGREE, Rejected, Terms, refuse_if
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
 SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
@@ -81,10 +81,15 @@ class Ring:
 
     def key(self, exponents: Sequence[int]) -> int:
         """The integer that stands for a monomial of x."""
-        if len(exponents) != self.count or min(exponents, default=0) < 0:
-            raise Rejected(f"a monomial should have {self.count} exponents of 0 or more")
-        if sum(exponents) > MAX_DEGREE:
-            raise Rejected(f"degree {sum(exponents)} is above {MAX_DEGREE}", "too_large")
+        refuse_if(
+            len(exponents) != self.count or min(exponents, default=0) < 0,
+            f"a monomial should have {self.count} exponents of 0 or more",
+        )
+        refuse_if(
+            sum(exponents) > MAX_DEGREE,
+            f"degree {sum(exponents)} is above {MAX_DEGREE}",
+            "too_large",
+        )
         return sum(e * key for e, key in zip(exponents, self.keys, strict=True) if e)
 
     def exponents(self, key: int) -> tuple[int, ...]:
@@ -150,9 +155,7 @@ class Ring:
         """y'M y."""
         return self.dot(y, self.product(M, y))
 
-    def substitution(
-        self, values: Sequence[Polynomial]
-    ) -> Callable[[Terms], Polynomial]:
+    def substitution(self, values: Sequence[Polynomial]) -> Callable[[Terms], Polynomial]:
         """What puts a polynomial in the place of each variable; powers are made once."""
         powers: dict[bytes, Polynomial] = {bytes(len(values)): self.made(1)}
 
@@ -172,10 +175,9 @@ class Ring:
     def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
         """p q."""
         degree, norm = p.degree + q.degree, p.norm * q.norm
-        if degree > MAX_DEGREE:
-            raise Rejected(f"degree {degree} is above {MAX_DEGREE}", "too_large")
-        if norm.bit_length() > WIDTHS[-1]:
-            raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits", "too_large")
+        if degree > MAX_DEGREE or norm.bit_length() > WIDTHS[-1]:
+            most = f"degree {MAX_DEGREE} and coefficients of {WIDTHS[-1]} bits"
+            raise Rejected(f"a product beyond {most}", "too_large")
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
             for right, b in q.terms.items():

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, lcm
 
-from .files import MAX_DEGREE, Node, Rejected
+from .files import MAX_DEGREE, Node, Rejected, refuse_if
 from .polynomials import Polynomial, Ring, packed, unpacked
 
 MAX_BASIS = 200
@@ -49,21 +49,24 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     where = parts["squares"].where
     rows = parts["basis"].monomials(ring.count, MAX_DEGREE // 2)
     size = len(rows)
-    if not 0 < size <= MAX_BASIS:
-        wanted = f"{parts['basis'].where} should hold 1 to {MAX_BASIS} monomials"
-        raise Rejected(wanted, "too_large")
+    refuse_if(
+        not 0 < size <= MAX_BASIS,
+        f"{parts['basis'].where} should hold 1 to {MAX_BASIS} monomials",
+        "too_large",
+    )
     columns = powers_of_two(parts["columns"], size)
     stated = parts["squares"].members("unit factors", "scale weights")
     scale = stated["scale"].integer() if "scale" in stated else 1
-    if scale < 1:
-        raise Rejected(f"{where}: scale should be a positive whole number")
+    refuse_if(scale < 1, f"{where}: scale should be a positive whole number")
     weights = stated["weights"].integers(0, 4 * MAX_BASIS) if "weights" in stated else None
     factors = []
     for factor in stated["factors"].items(1, MAX_FACTORS):
         entries = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
         heights = (1,) * len(entries) if weights is None else weights
-        if len(heights) != len(entries) or min(heights, default=0) < 0:
-            raise Rejected(f"{where}: one weight of 0 or more for each row of each factor")
+        refuse_if(
+            len(heights) != len(entries) or min(heights, default=0) < 0,
+            f"{where}: one weight of 0 or more for each row of each factor",
+        )
         factors.append(list(zip(heights, entries, strict=True)))
     degree, unit = max(map(sum, rows)), stated["unit"].whole(0, MAX_SHIFT)
     return Squares(tuple(map(ring.key, rows)), columns, degree, Fraction(scale), unit, factors)
@@ -77,8 +80,10 @@ def read_witness(node: Node, ring: Ring) -> Squares:
 def powers_of_two(node: Node, size: int) -> list[int]:
     """So many exponents of two."""
     shifts: list[int] = node.wholes(size)
-    if any(abs(shift) > MAX_SHIFT for shift in shifts):
-        raise Rejected(f"{node.where}: powers of two beyond 2^{MAX_SHIFT}")
+    refuse_if(
+        any(abs(shift) > MAX_SHIFT for shift in shifts),
+        f"{node.where}: powers of two beyond 2^{MAX_SHIFT}",
+    )
     return shifts
 
 
@@ -87,7 +92,7 @@ def expanded(squares: Squares, ring: Ring) -> Polynomial:
     lowest, J = min(squares.columns), len(squares.factors) - 1
     weight = Fraction(2) ** (2 * lowest - 2 * squares.unit) / squares.scale
     parts = []
-    for j, gram in enumerate(_grams(squares, ring, lowest)):
+    for j, gram in enumerate(_grams(squares, lowest)):
         norm = sum(map(abs, gram.values()))
         constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, norm)
         parts.append((weight, ring.bernstein([Fraction(i == j) for i in range(J + 1)]) * constants))
@@ -99,10 +104,8 @@ def positive(
 ) -> Fraction:
     """A number that c is nowhere below; Rejected unless c > 0 (strict) or c >= 0 everywhere."""
     left = remainder(c, squares, ring, what)
-    if strict and 0 not in left:
-        raise Rejected(f"{what}: the basis needs the monomial 1", "not_positive")
-    if strict and not left[0]:
-        raise Rejected(f"{what}: not positive, only nonnegative", "not_positive")
+    refuse_if(strict and 0 not in left, f"{what}: the basis needs the monomial 1", "not_positive")
+    refuse_if(strict and not left[0], f"{what}: not positive, only nonnegative", "not_positive")
     return left.get(0, Fraction(0))
 
 
@@ -136,11 +139,13 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             a, b = pair.setdefault(left_key + basis[j], (i, j))
             if columns[i] + columns[j] > columns[a] + columns[b]:
                 pair[left_key + basis[j]] = (i, j)
-    grams, digits = _grams(squares, ring, lowest), ring.digits(c)
+    grams, digits = _grams(squares, lowest), ring.digits(c)
     keys = list(set(digits).union(*grams))
-    if any(key not in square and key not in pair for key in keys):
-        unbalanced = f"{what}: a monomial that no product of the basis could balance"
-        raise Rejected(unbalanced, "not_positive")
+    refuse_if(
+        any(key not in square and key not in pair for key in keys),
+        f"{what}: a monomial that no product of the basis could balance",
+        "not_positive",
+    )
     J, order = len(grams) - 1, c.order
     D = max(order, J)
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
@@ -177,8 +182,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             left[j] -= charge
         if min(left) < 0:
             i = next(i for i, room in enumerate(left) if room < 0)
-            place = f"Bernstein coefficient {k} of {D}, monomial {i}"
-            raise Rejected(f"{what}: not positive ({place})", "not_positive")
+            at = f"Bernstein coefficient {k} of {D}, monomial {i}"
+            raise Rejected(f"{what}: not positive ({at})", "not_positive")
         left = [room * (common // comb(D, k)) for room in left]
         least = list(map(min, least, left)) if k else left
     return {
@@ -187,7 +192,7 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     }
 
 
-def _grams(squares: Squares, ring: Ring, lowest: int) -> list[dict[int, int]]:
+def _grams(squares: Squares, lowest: int) -> list[dict[int, int]]:
     """Σ_i weight_i (R_j[i] V v)² / 4^lowest by monomial, whole numbers, for each factor R_j.
 
     Rows are packed into one integer each, so that a row of R'R is a few products.

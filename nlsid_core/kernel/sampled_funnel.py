@@ -8,18 +8,18 @@ h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄�
 Why that is enough: docs/certificate_sampled_funnel.md.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import comb, factorial, prod
+from math import comb
 
 from . import text
 from .decision import Decision
-from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed, unit
-from .files import Node, Read, Rejected, Terms, bound_files
+from .exact import Matrix, at_most, inverse_forms, product, transposed, unit
+from .files import Node, Read, bound_files, refuse_if
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .signals import Signal, apart, ranges, read_signals
+from .sampled_step import Link, Model, Sample, nonnegative, read_link, stretch, triangular
+from .signals import apart, ranges, read_signals
 from .text import above
 
 CHAINS = ("tube", "inlet")
@@ -30,10 +30,10 @@ PROVENANCE = "measured safety_factor measured_on"  # of the bound; no part of th
 
 SENTENCE = (
     "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
-    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k]{bound}, at all {samples} samples over "
-    "{span:down} s and ends within {ends} of the nominal; one that starts with "
-    "|S[0] (xhat - x[0])| <= {inlet:down} ends within {goal} of it; at the samples both stay in the "
-    "box of the model's data, {box}"
+    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k]{bound}, at all {samples} samples "
+    "over {span:down} s and ends within {ends} of the nominal; one that starts with "
+    "|S[0] (xhat - x[0])| <= {inlet:down} ends within {goal} of it; at the samples both stay in "
+    "the box of the model's data, {box}"
 )
 DISTURBANCE = "disturbance {form} {kept} at every sample, d = xhat+ - f(xhat, u)"
 KEPT = {
@@ -47,18 +47,6 @@ ROOTS = (
     "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1], {low:down} to "
     "{high:down}; that there is one is not stated"
 )
-
-
-@dataclass(frozen=True)
-class Model:
-    """A map (trapezoidal: of accelerations); signals and their box, states first."""
-
-    trapezoidal: bool
-    map: list[Terms]
-    period: Fraction
-    signals: list[Signal]
-    box: Matrix
-    states: int
 
 
 @dataclass(frozen=True)
@@ -81,30 +69,6 @@ class Funnel:
         return Fraction(0) if self.form == "peak" else self.bound
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A sample of a policy and the next state, with the shapes of both and A of the response."""
-
-    x: list[Fraction]
-    u: list[Fraction]
-    K: Matrix
-    x_next: list[Fraction]
-    S: Matrix
-    S_next: Matrix
-    A: Matrix
-
-
-@dataclass(frozen=True)
-class Link:
-    """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
-
-    rows: list[Polynomial]
-    h: list[Polynomial]
-    size: Polynomial
-    bounds: dict[str, Fraction]
-    curvature: list[Fraction]
-
-
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
     """Decide {kind, about: {model, policy, funnel}} by {basis, ball_basis, ..., steps}."""
     about = claim.members("kind about")["about"]
@@ -121,51 +85,12 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
 
     def prove(ring: Ring, k: int) -> None:
         at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
-        stated, link = _link(steps[k], model, at, funnel.form, ring)
-        for chain in CHAINS:
-            rooms.append(_prove_step(link, stated[chain], bases, funnel, chain, k))
+        stated, link = read_link(steps[k], model, at, funnel.form, ring)
+        rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
 
     at_width(_variables(model), range(len(u)), prove, FREE_OF_S)
     said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
     return Decision(said, min(rooms), assumptions, digests)
-
-
-def _link(
-    node: Node, model: Model, at: Sample, form: str, ring: Ring
-) -> tuple[dict[str, Node], Link]:
-    """A step's members; its polynomials, and its stated bounds verified."""
-    norms = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
-    more = " T_next inverse" * model.trapezoidal
-    stated = node.members(f"T curvature tube inlet {norms}{more}")
-    bounds = {name: _nonnegative(stated[name]) for name in norms.split()}
-    curvature = [_nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
-    n, d, where = model.states, model.states // 2, stated["T"].where
-    T = _triangular(stated["T"].array(n, n), where)
-    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
-    z = ring.variables[:n]
-    scaled = ring.product(ST, z)
-    prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
-    h: list[Polynomial] = []
-    if not model.trapezoidal:
-        rows = moved = explicit_step(model.map, at, T, ring)
-        if form == "response":
-            moved = [p - q for p, q in zip(rows, ring.product(unit, z), strict=True)]
-    else:
-        T_next = stated["T_next"].array(d, d)
-        S_rates = [row[d:] for row in at.S_next[d:]]
-        prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
-        rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
-        moved = ring.product(stated["inverse"].array(d, d), h)
-        (B, C), (L_z, L_w) = (
-            ([row[:n] for row in M], [row[n:] for row in M])
-            for M in (linear_part(moved, ring), linear_part(rows, ring))
-        )
-        C = [[entry - (i == j) for j, entry in enumerate(row)] for i, row in enumerate(C)]
-        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
-        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w)):
-            prove_norm(M, bounds[name], f"{where}: the bound {name}")
-    prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
-    return stated, Link(rows, h, ring.dot(scaled, scaled), bounds, curvature)
 
 
 def _prove_step(
@@ -176,7 +101,7 @@ def _prove_step(
     names = "reach columns squares ball" + " roots equations" * bool(d)
     names += " spread extents" * (bool(d) and funnel.form == "response")
     stated = node.members(names)
-    reach, (radius, following) = _nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
+    reach, (radius, following) = nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
     parts = [reach**2 - ring.dot(link.rows, link.rows)]
     parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size))
     if d:
@@ -231,16 +156,18 @@ def _implicit_addition(
     far = b["kappa_next"] * funnel.roots[k + 1]
     if funnel.form == "peak":
         return far, funnel.bound
-    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, _nonnegative(stated["spread"])
-    wide, near = (_nonnegative(entry) for entry in stated["extents"].items(2, 2))
+    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, nonnegative(stated["spread"])
+    wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
     # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
     far += spread * r
     at_most(z**2 + far**2, wide**2, f"{what}: the first extent is too small")
     mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
     mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
-    if b["rates"] >= 1 or mapped_to > spread:
-        beyond = f"{what}: two roots may differ by more than the stated spread"
-        raise Rejected(beyond, "not_below")
+    refuse_if(
+        b["rates"] >= 1 or mapped_to > spread,
+        f"{what}: two roots may differ by more than the stated spread",
+        "not_below",
+    )
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
     own = b["kappa_next"] * reach
     at_most(z**2 + own**2, near**2, f"{what}: the second extent is too small")
@@ -249,88 +176,6 @@ def _implicit_addition(
     if shrink > 0:
         spread = min(spread, (b["state"] + mu) / shrink)
     return far, (b["direct"] + b["through"] * (b["rates"] * spread + mu * (1 + spread))) * r
-
-
-def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
-    """S⁺(f(x + Tz, u - K T z) - x⁺)."""
-    moved = ring.substituted(f, _state_and_input(at, T, ring))
-    return ring.product(at.S_next, [p - c for p, c in zip(moved, at.x_next, strict=True)])
-
-
-def implicit_step(
-    a: Sequence[Terms], at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
-) -> tuple[list[Polynomial], list[Polynomial]]:
-    """S⁺x̄⁺ and h = v⁺ - v - period/2 (a(q, v, u) + a(q⁺, v⁺, u)), in z, then w.
-
-    v⁺ = v_{k+1} + T⁺w and q⁺ = q + period/2 (v + v⁺).
-    """
-    d, half = len(T_next), period / 2
-    here = _state_and_input(at, T, ring)
-    q, v, u = here[:d], here[d : 2 * d], here[2 * d :]
-    moved = ring.product(T_next, ring.variables[2 * d :])
-    rate = [p + c for p, c in zip(moved, at.x_next[d:], strict=True)]
-    place = [p + half * (s + r) for p, s, r in zip(q, v, rate, strict=True)]
-    pulls = ring.substituted(a, here), ring.substituted(a, [*place, *rate, *u])
-    h = [r - s - half * (b + c) for r, s, b, c in zip(rate, v, *pulls, strict=True)]
-    after = [p - c for p, c in zip([*place, *rate], at.x_next, strict=True)]
-    return ring.product(at.S_next, after), h
-
-
-def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
-    """The coefficients of degree 1: a row for each polynomial."""
-    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in ring.keys] for q in p]
-
-
-def prove_curvature(
-    p: Sequence[Polynomial], gammas: Sequence[Fraction], ring: Ring, least: int
-) -> None:
-    """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
-    sizes: dict[int, Matrix] = {}
-    keys = set().union(*(q.terms for q in p))
-    for key in keys:
-        e = ring.exponents(key)
-        c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
-        outer = [[a * b for b in c] for a in c]
-        share = Fraction(prod(map(factorial, e)), factorial(m))
-        sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
-    if max(sizes, default=0) >= least + len(gammas):
-        raise Rejected("curvature: a bound for every degree is needed", "not_covered")
-    for m, gamma in enumerate(gammas, start=least):
-        if m in sizes:
-            _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
-
-
-def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: int) -> Fraction:
-    """μ with |p(z + w) - p(z)| <= μ|w| for |z| <= size, |w| <= step; degrees from `least` on."""
-    far, total = size + step, Fraction(0)
-    for m, gamma in enumerate(gammas, start=least):
-        total += gamma * sum((far**i * size ** (m - 1 - i) for i in range(m)), Fraction(0))
-    return total
-
-
-def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
-    """Raise Rejected unless |M v| <= bound |v| for every v."""
-    _at_most_square(product(M, transposed(M)), bound, what)
-
-
-def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
-    """Raise Rejected unless |z| <= bound |M z| for every z."""
-    MM = product(transposed(M), M)
-    scaled = [[bound**2 * e - (i == j) for j, e in enumerate(row)] for i, row in enumerate(MM)]
-    semidefinite(scaled, what)
-
-
-def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
-    semidefinite(
-        [[bound**2 * (i == j) - e for j, e in enumerate(row)] for i, row in enumerate(MM)], what
-    )
-
-
-def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
-    """x + T z and u - K T z."""
-    feedback = [[-entry for entry in row] for row in product(at.K, T)]
-    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
-    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
 
 
 def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K: Matrix) -> None:
@@ -348,8 +193,11 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
         rooms.append((max(tube, inlet), min(high - centre, centre - low), stays))
     named = zip(rooms, [*forms[:n], *forms], [*names[:n], *names], strict=False)
     for (radius, room, kept), form, name in named:
-        if room < 0 or radius**2 * form > room**2:
-            raise Rejected(f"sample {k}: {name} can leave {kept}", "not_valid")
+        refuse_if(
+            room < 0 or radius**2 * form > room**2,
+            f"sample {k}: {name} can leave {kept}",
+            "not_valid",
+        )
 
 
 def _read_model(node: Node) -> Model:
@@ -364,16 +212,20 @@ def _read_model(node: Node) -> Model:
     box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
     signals = [*x, *apart(u, x)]
     exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
-    if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
-        raise Rejected("a model needs a positive period, monomials, and a rate for each position")
+    refuse_if(
+        (trapezoidal and len(x) % 2) or period <= 0 or not exponents,
+        "a model needs a positive period, monomials, and a rate for each position",
+    )
     outputs = len(x) // 2 if trapezoidal else len(x)
     columns = transposed(parts["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
     model = Model(trapezoidal, polynomials, period, signals, box, len(x))
     degree, variables = max(map(sum, exponents)), _variables(model)
-    if comb(variables + degree, degree) > MAX_MONOMIALS:
-        too_many = f"degree {degree} in {variables} variables is too large to decide"
-        raise Rejected(too_many, "too_large")
+    refuse_if(
+        comb(variables + degree, degree) > MAX_MONOMIALS,
+        f"degree {degree} in {variables} variables is too large to decide",
+        "too_large",
+    )
     return model
 
 
@@ -384,13 +236,17 @@ def _variables(model: Model) -> int:
 
 def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matrix, list[Matrix]]:
     parts = node.document("policy", "law period L u x K", "sampled", made_for={"model": made_for})
-    if parts["period"].number() != model.period:
-        raise Rejected("the policy has another sample time than the model")
+    refuse_if(
+        parts["period"].number() != model.period,
+        "the policy has another sample time than the model",
+    )
     n, p = model.states, len(model.signals) - model.states
     u = parts["u"].array(None, p)
-    if not 0 < len(u) * n**3 <= MAX_SAMPLES:
-        wanted = f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps"
-        raise Rejected(wanted, "too_large")
+    refuse_if(
+        not 0 < len(u) * n**3 <= MAX_SAMPLES,
+        f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps",
+        "too_large",
+    )
     parts["L"].array(n, n)
     return parts["x"].array(len(u) + 1, n), u, parts["K"].array(len(u), p, n)
 
@@ -401,21 +257,27 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
     parts, n = node.document("funnel", names, "sampled", made_for=made_for), model.states
     radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
     roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
-    if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
-        wanted = "radii and roots should be positive, and the tube start in the inlet"
-        raise Rejected(wanted, "not_below")
-    S = [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
+    refuse_if(
+        min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0],
+        "radii and roots should be positive, and the tube start in the inlet",
+        "not_below",
+    )
+    S = [triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
     A, widths = parts["A"].array(steps, n, n), parts["half_widths"].array(steps + 1, n)
 
     stated = parts["assumption"].members(f"form bound rate gain {PROVENANCE}")
     form = stated["form"].text()
-    bound, rate, gain = (_nonnegative(stated[key]) for key in ("bound", "rate", "gain"))
-    if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
-        raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
+    bound, rate, gain = (nonnegative(stated[key]) for key in ("bound", "rate", "gain"))
+    refuse_if(
+        form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal),
+        f"form {form!r} is not for this kind of model; use response or peak",
+    )
     plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
-    if rate > 1 or gain < 1 or plain:
-        none = f"rate {above(rate)} or gain {above(gain)} is none of form {form}"
-        raise Rejected(none, "not_below")
+    refuse_if(
+        rate > 1 or gain < 1 or plain,
+        f"rate {above(rate)} or gain {above(gain)} is none of form {form}",
+        "not_below",
+    )
     return Funnel(S, A, radii, widths, roots, form, bound, rate, gain)
 
 
@@ -449,16 +311,3 @@ def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
     if not model.trapezoidal:
         return said
     return (*said, text.say(ROOTS, low=min(funnel.roots[1:]), high=max(funnel.roots[1:])))
-
-
-def _nonnegative(node: Node) -> Fraction:
-    value = node.number()
-    at_most(0, value, f"{node.where} should not be negative")
-    return value
-
-
-def _triangular(M: Matrix, what: str) -> Matrix:
-    size = range(len(M))
-    if not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)):
-        raise Rejected(f"{what} should be upper triangular with a nonzero diagonal")
-    return M

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .files import Node, Rejected
+from .files import Node, refuse_if
 
 MAX_SIGNALS = 50
 
@@ -54,8 +54,10 @@ def read_signals(
 ) -> tuple[Signal, ...]:
     """A list of `least` to `most` of `what`, each with a name of its own."""
     signals = tuple(read_signal(entry) for entry in node.items(least, most))
-    if len({signal.name for signal in signals}) < len(signals):
-        raise Rejected(f"{node.where}: two {what} have the same name")
+    refuse_if(
+        len({signal.name for signal in signals}) < len(signals),
+        f"{node.where}: two {what} have the same name",
+    )
     return signals
 
 

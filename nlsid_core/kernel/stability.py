@@ -10,7 +10,7 @@ from fractions import Fraction
 from . import text
 from .decision import Decision
 from .exact import definite
-from .files import Node, Read, Rejected, bound_files
+from .files import Node, Read, bound_files, refuse_if
 from .increments import gap, positive
 from .models import read_model
 
@@ -26,13 +26,14 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     documents, digests = bound_files(parts["about"], read, "model")
     model = read_model(documents["model"])
     rate = parts["rate"].number()
-    if not 0 < rate < 1:
-        raise Rejected("the rate should satisfy 0 < rate < 1", "not_below")
+    refuse_if(not 0 < rate < 1, "the rate should satisfy 0 < rate < 1", "not_below")
     given = proof.members("P", "multipliers")
     P = given["P"].array(model.states, model.states)
     definite(P, "P")
     form = gap(model, rate**2, P, [], model.F, P)
-    positive(model, given.get("multipliers"), [("the decrease of V = x'Px at the stated rate", form)])
+    positive(
+        model, given.get("multipliers"), [("the decrease of V = x'Px at the stated rate", form)]
+    )
     said = text.say(SENTENCE, rate=_shown(rate), period=model.period, where=model.where)
     return Decision(said, 1 - rate, (), digests)
 

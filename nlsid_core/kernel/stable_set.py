@@ -22,7 +22,7 @@ from . import text
 from .decision import Decision
 from .equations import ImplicitModel, derivative, read_implicit_model
 from .exact import definite
-from .files import Node, Read, Rejected, Terms, bound_files
+from .files import Node, Read, Terms, bound_files, refuse_if
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import WITNESS, positive_on
 
@@ -46,21 +46,23 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     model = read_implicit_model(documents["model"])
     n, m = model.states, model.inputs
     kind = parts["set"].text() if "set" in parts else ""
-    if kind not in STORAGE:
-        raise Rejected(f"the set {kind!r} is unknown; known: {', '.join(filter(None, STORAGE))}")
-    if ("delta" in parts) != bool(kind):
-        raise Rejected("a set needs a delta, and a delta needs a set")
+    refuse_if(
+        kind not in STORAGE,
+        f"the set {kind!r} is unknown; known: {', '.join(filter(None, STORAGE))}",
+    )
+    refuse_if(("delta" in parts) != bool(kind), "a set needs a delta, and a delta needs a set")
     delta = parts["delta"].number() if kind else Fraction(0)
-    if kind and delta <= 0:
-        raise Rejected("delta should be positive", "not_below")
+    refuse_if(kind and delta <= 0, "delta should be positive", "not_below")
     box = parts["box"].array(n + m, 2) if "box" in parts else []
-    if any(not low < high for low, high in box):
-        raise Rejected("an interval of the box is empty", "not_valid")
+    refuse_if(
+        any(not low < high for low, high in box), "an interval of the box is empty", "not_valid"
+    )
     given = proof.members("inequalities" + STORAGE[kind])
     storage = _read_storage(kind, given, n, local=bool(box))
     count = 2 * model.unknowns + 2 * n + m + 2 * n + 1  # v, x, w, v~, x~, and y
-    if count > MAX_VARIABLES:
-        raise Rejected(f"{count} variables; at most {MAX_VARIABLES} are taken", "too_large")
+    refuse_if(
+        count > MAX_VARIABLES, f"{count} variables; at most {MAX_VARIABLES} are taken", "too_large"
+    )
 
     def prove(ring: Ring, _: None) -> None:
         wanted = _inequalities(model, kind, storage, delta, box, ring)
@@ -85,9 +87,7 @@ def _where(box: list[Any], n: int) -> str:
     return f"every state in {' x '.join(shown[:n])}{inputs}"
 
 
-def _along(
-    ps: Sequence[Terms], at: Vector, direction: Vector, ring: Ring
-) -> Vector:
+def _along(ps: Sequence[Terms], at: Vector, direction: Vector, ring: Ring) -> Vector:
     """Σ_j ∂p/∂(variable j) direction[j] of each p, with `at` in the variables' place."""
     put, size = ring.substitution(at), len(direction)
     return [ring.dot([put(derivative(p, j)) for j in range(size)], direction) for p in ps]
@@ -162,12 +162,15 @@ def _well_posed(model: ImplicitModel, here: Vector, y: Vector, ring: Ring) -> di
 
 def _check_linear(e: list[Terms], f: list[Terms], box: list[Any]) -> None:
     n = len(e)
-    if box:
-        raise Rejected("a linear model is stable everywhere: the claim has no box")
-    if any(sum(a[:n]) > 1 or (any(a[:n]) and any(a[n:])) for p in (*e, *f) for a, _ in p):
-        raise Rejected("the model is not linear in its states")
-    if any(derivative(e[i], j) != derivative(e[j], i) for i in range(n) for j in range(i)):
-        raise Rejected("E is not symmetric; multiply the model's equation by E' first")
+    refuse_if(box, "a linear model is stable everywhere: the claim has no box")
+    refuse_if(
+        any(sum(a[:n]) > 1 or (any(a[:n]) and any(a[n:])) for p in (*e, *f) for a, _ in p),
+        "the model is not linear in its states",
+    )
+    refuse_if(
+        any(derivative(e[i], j) != derivative(e[j], i) for i in range(n) for j in range(i)),
+        "E is not symmetric; multiply the model's equation by E' first",
+    )
 
 
 def _minus(a: Vector, b: Vector) -> Vector:
@@ -184,16 +187,16 @@ def _read_storage(kind: str, given: dict[str, Node], n: int, *, local: bool) -> 
     """V as terms in (x, x~), M as rows of terms in x, P as numbers; None for other claims."""
     if kind == "2.10":
         V = given["V"].polynomial(2 * n)
-        if any(c and not any(e[n:]) for e, c in V):
-            raise Rejected("V(x, x) is not zero")
+        refuse_if(any(c and not any(e[n:]) for e, c in V), "V(x, x) is not zero")
         return V
     if kind == "2.11":
         rows = given["M"].items(n, n)
         M = [[entry.polynomial(n) for entry in row.items(n, n)] for row in rows]
-        if any(M[i][j] != M[j][i] for i in range(n) for j in range(i)):
-            raise Rejected("M is not symmetric")
-        if local and any(any(e) for row in M for entry in row for e, _ in entry):
-            raise Rejected("on a box M should be constant: curved paths can leave the box")
+        refuse_if(any(M[i][j] != M[j][i] for i in range(n) for j in range(i)), "M is not symmetric")
+        refuse_if(
+            local and any(any(e) for row in M for entry in row for e, _ in entry),
+            "on a box M should be constant: curved paths can leave the box",
+        )
         return M
     if "P" in given:
         P = given["P"].array(n, n)

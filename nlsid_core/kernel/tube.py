@@ -16,7 +16,7 @@ from fractions import Fraction
 from . import text
 from .decision import Decision
 from .exact import Matrix, Rows, at_most, definite, unit
-from .files import Node, Read, Rejected, bound_files
+from .files import Node, Read, Rejected, bound_files, refuse_if
 from .increments import Model, gap, positive
 from .levels import CommandLevel, formula, read_level
 from .models import read_model
@@ -123,10 +123,13 @@ def _decide_tube(
     tube: Tube, tree: Node | None, modes: Sequence[tuple[str, Model]], policy: Policy | None
 ) -> Fraction:
     """The part of the half-widths' squares that one tube leaves."""
-    if policy and tube.L != policy.L:
-        raise Rejected("the observer of a tube is not the policy's: L is another")
-    if policy and tube.assumed.follows:
-        raise Rejected("a level that follows the commands is for a tube without a policy")
+    refuse_if(
+        policy and tube.L != policy.L, "the observer of a tube is not the policy's: L is another"
+    )
+    refuse_if(
+        policy and tube.assumed.follows,
+        "a level that follows the commands is for a tube without a policy",
+    )
     definite(tube.P, "P")
     definite(tube.R, "R")
     for mode, model in modes:
@@ -182,12 +185,18 @@ def _read(node: Node, model: Model) -> Tube:
         parts["inlet"].number(),
         _read_assumption(parts, rho, len(model.u)),
     )
-    if min(tube.tau) <= 0 or min(tube.half_widths) <= 0:
-        raise Rejected("tau and half-widths should be positive", "not_below")
-    if min(tube.inlet, tube.assumed.level) < 0:
-        raise Rejected("level and inlet should be 0 or more", "not_below")
-    if tube.assumed.follows is not None and (rho == 1 or tube.inlet):
-        raise Rejected("a level that follows the commands is for fading, without an inlet")
+    refuse_if(
+        min(tube.tau) <= 0 or min(tube.half_widths) <= 0,
+        "tau and half-widths should be positive",
+        "not_below",
+    )
+    refuse_if(
+        min(tube.inlet, tube.assumed.level) < 0, "level and inlet should be 0 or more", "not_below"
+    )
+    refuse_if(
+        tube.assumed.follows is not None and (rho == 1 or tube.inlet),
+        "a level that follows the commands is for fading, without an inlet",
+    )
     return tube
 
 
@@ -195,13 +204,18 @@ def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assu
     """The level of a tube's members, and what it bounds."""
     given = parts["assumption"].members(f"kind {PROVENANCE}", "samples")
     kind = given["kind"].text()
-    if kind not in ("fading", "energy"):
-        raise Rejected(f"assumption {kind!r} is unknown; known: fading, energy")
-    if (kind == "energy") != ("samples" in given):
-        raise Rejected("the assumption energy is for a number of samples, fading for ever")
-    if not 0 < rho <= 1 or (kind == "energy") != (rho == 1):
-        wanted = "rho should be 1 for the assumption energy, between 0 and 1 for fading"
-        raise Rejected(wanted, "not_below")
+    refuse_if(
+        kind not in ("fading", "energy"), f"assumption {kind!r} is unknown; known: fading, energy"
+    )
+    refuse_if(
+        (kind == "energy") != ("samples" in given),
+        "the assumption energy is for a number of samples, fading for ever",
+    )
+    refuse_if(
+        not 0 < rho <= 1 or (kind == "energy") != (rho == 1),
+        "rho should be 1 for the assumption energy, between 0 and 1 for fading",
+        "not_below",
+    )
     samples = given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None
     follows = read_level(parts["follows"], inputs) if "follows" in parts else None
     return Assumption(parts["level"].number(), samples, follows)
@@ -210,17 +224,20 @@ def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assu
 def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
     n, p = model.states, len(model.H)
     plan = node.document("policy", "period start u K L", "tube", made_for={"model": made_for})
-    if plan["period"].number() != model.period:
-        raise Rejected("the policy's period is not the model's")
+    refuse_if(plan["period"].number() != model.period, "the policy's period is not the model's")
     plan["start"].array(n)
     u = plan["u"].array(None, len(model.u))
-    if not 0 < len(u) <= MAX_PLAN:
-        raise Rejected(f"a plan should have 1 to {MAX_PLAN} samples", "too_large")
+    refuse_if(
+        not 0 < len(u) <= MAX_PLAN, f"a plan should have 1 to {MAX_PLAN} samples", "too_large"
+    )
     if model.linear is None:
         raise Rejected("a plan is decided for a model of kind difference_equation")
     low, high = model.linear.input_range
-    if any(not low <= entry <= high for row in u for entry in row):
-        raise Rejected("a planned input is outside the model's input range", "not_valid")
+    refuse_if(
+        any(not low <= entry <= high for row in u for entry in row),
+        "a planned input is outside the model's input range",
+        "not_valid",
+    )
     return Policy(plan["K"].array(len(model.u), n), plan["L"].array(n, p), len(u))
 
 
@@ -277,7 +294,7 @@ def _inside(model: Model, box: Node) -> str:
 
 
 def _energy(model: Model, tube: Tube) -> str:
-    """The bound on the innovations' energy. Of one output with R = 1, E carries its unit squared."""
+    """The bound on the innovations' energy; of one output with R = 1 in its unit, squared."""
     unit_, energy, assumed = "", "e'Re", tube.assumed
     if len(model.y) == 1 and tube.R == [[1]]:
         unit_, energy = f"({model.y[0].unit})^2" if model.y[0].unit else "", "e^2"

@@ -22,7 +22,6 @@ from nlsid_core.funnels.factor import UNIT
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.kernel.signals import name_label
-from nlsid_core.kernel.tube import BESIDE
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
@@ -36,7 +35,7 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
-WATCHED = BESIDE.replace("this", "the tube's")  # in the words of `check`
+WATCHED = "watched as well, not needed for the tube's sentence"
 
 
 class TubeRun:
