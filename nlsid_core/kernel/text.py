@@ -90,7 +90,7 @@ def _decimal(value: Fraction, digits: int, rounding: str) -> str:
         context = Context(prec=digits, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN)
         shown = context.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize()
     exponent = shown.adjusted()
-    if not shown or -4 <= exponent < SHORT + 1:
+    if not shown or -4 <= exponent < digits + 3:
         return f"{shown:f}"
     return f"{shown.scaleb(-exponent):f}e{exponent:+03d}"
 

@@ -23,7 +23,8 @@ def decide(c: Coefficients, squares: Any, *, strict: bool = True) -> None:
 
     def build(ring: Ring, _: None) -> None:
         parts = [ring.bernstein(control) * ring.monomial(e) for e, control in c.items()]
-        positive(ring.sum(parts), read_squares(Node(squares, "c").members("basis columns squares"), ring), ring, "c", strict=strict)
+        members = Node(squares, "c").members("basis columns squares")
+        positive(ring.sum(parts), read_squares(members, ring), ring, "c", strict=strict)
 
     at_width(count, [None], build)
 
