@@ -22,16 +22,16 @@ from scipy.signal import lfilter
 from benchmarks.machine import describe
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.moment_rie import minimise_moment_rie
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.moment_rie import minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     Offsets,
     plain_moments,
     repeated_moments,
 )
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 
 POLE, SAMPLES = 0.9, 5000
 LEVELS = (0, 5, 10, 15, 20, 30)  # dB

@@ -23,10 +23,10 @@ from scipy.signal import lfilter
 from benchmarks.machine import describe, peers
 from benchmarks.recorded import single
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.newton import minimise
-from nlsid_core.identification.rse import Bound
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.newton import minimise
+from nlsid_core.identification.methods.rse import Bound
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 
 SIZES = (500, 2000, 10_000, 90_000, 300_000, 1_000_000)
 LMI_SIZES = (250, 500, 1000)
