@@ -20,7 +20,7 @@ def decide(c: Claim, witness: Any, how: Any = positive, **options: Any) -> Any:
     """The kernel's verdict on c with this witness."""
     found: list[Any] = []
 
-    def build(ring: Ring, _: None) -> None:
+    def build(ring: Ring, nothing: None) -> None:  # noqa: ARG001 - one case
         parts: list[Polynomial] = []
         power = ring.made(1)
         for p in c:
