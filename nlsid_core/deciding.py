@@ -68,7 +68,14 @@ class Deciding:
             )
 
     @classmethod
-    def of(cls, proof: bytes, files: Mapping[str, bytes], **limits: Any) -> "Deciding":
+    def of(
+        cls,
+        proof: bytes,
+        files: Mapping[str, bytes],
+        *,
+        seconds: int = SECONDS,
+        memory: int = MEMORY,
+    ) -> "Deciding":
         """The same for a proof in memory; `files` by the names that it calls them."""
         folder = tempfile.TemporaryDirectory(prefix="nlsid-proof-")
         path = Path(folder.name) / f"{digest(proof)[7:]}.json"
@@ -77,7 +84,7 @@ class Deciding:
             if name not in ("", ".", "..") and not set(name) & set("/\\:\0"):
                 with contextlib.suppress(OSError):  # too long a name: the kernel misses the file
                     path.with_name(name).write_bytes(content)
-        made = cls(path, **limits)
+        made = cls(path, seconds=seconds, memory=memory)
         made._folder = folder
         return made
 
@@ -137,7 +144,9 @@ def _verdict(answer: dict[str, Any]) -> Verdict:
         raise OSError(0, answer["unread"])
     if "rejected" in answer:
         mismatch = answer["reason"] == "mismatch"
-        raise (CertificateMismatch if mismatch else CertificateRejected)(answer["rejected"])
+        refusal = (CertificateMismatch if mismatch else CertificateRejected)(answer["rejected"])
+        refusal.reason = answer["reason"]
+        raise refusal
     return Verdict(
         answer["kind"],
         answer["statement"],

@@ -175,12 +175,14 @@ def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
 
 
 def nonnegative(node: Node) -> Fraction:
+    """A number of 0 or more."""
     value = node.number()
     at_most(0, value, f"{node.where} should not be negative")
     return value
 
 
 def triangular(M: Matrix, what: str) -> Matrix:
+    """M, if it is upper triangular with a nonzero diagonal."""
     size = range(len(M))
     refuse_if(
         not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)),

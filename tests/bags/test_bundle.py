@@ -1,7 +1,6 @@
 """Bundles of a design: what is true is decided as from its files, everything else is refused."""
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.proofs import check
+from tests.bags.deciding import decide
 
 
 @pytest.fixture
@@ -24,15 +24,6 @@ def funnel(f1tenth_chain: Path) -> Path:
 @pytest.fixture
 def bundle(funnel: Path) -> Bundle:
     return Bundle.load(funnel)
-
-
-def decide(text: str) -> Json:
-    """What a receiver is told."""
-    check = Check(text)
-    while (answer := check.poll()) is None:
-        time.sleep(0.01)
-    check.close()
-    return answer
 
 
 def test_a_bundle_is_the_files_byte_for_byte_and_decided_like_them(

@@ -23,7 +23,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Limits
 from nlsid_core.running.reading import Reading, Status
-from tests.bags.test_bundle import decide
+from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
 
 RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"
