@@ -46,11 +46,9 @@ def where(name: str, model: Json) -> str:
 
 
 def rounded(value: Fraction, mode: str) -> str:
-    if (
-        len(shown := repr(float(value)).strip("-0.").replace(".", "")) <= 6
-        and float(value) == value
-    ):
-        return f"{Decimal(repr(float(value))).normalize():f}" if shown else "0"
+    own = Decimal(repr(float(value))).normalize()
+    if float(value) == value and len(own.as_tuple().digits) <= 6:
+        return f"{own:f}"
     four = Context(prec=4, rounding=mode)
     return f"{four.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize():f}"
 
