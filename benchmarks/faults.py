@@ -258,14 +258,14 @@ def stretched(factor: float) -> Act:
 INSIDE = "^inside$"
 MESSAGES: list[tuple[str, Act, str]] = [
     ("no fault", every(), INSIDE),
-    ("state NaN", every(speed=math.nan), r"unknown: no speed at .* \(it is nan\)"),
+    ("state NaN", every(speed=math.nan), r"unknown: no speed at .* \(missing, or not a number\)"),
     ("state infinite", every(speed=math.inf), r"unknown: no speed at .* \(it is inf\)"),
     ("state minus infinite", every(speed=-math.inf), r"unknown: no speed at .* \(it is -inf\)"),
     ("state 1e300", every(speed=1e300), "^outside"),
     ("state 1 m/s", every(speed=1.0), "^outside"),
     ("command NaN", every(command=math.nan), "^unknown"),
     ("silence", silence, "unknown: no speed for"),
-    ("one sample dropped", drop, "unknown: .* 1 sample is missing before"),
+    ("one sample dropped", drop, "unknown: the sample is lost"),
     ("pairs reordered", swap, "^unknown"),
     ("duplicates", duplicate, INSIDE),
     ("conflicting duplicates", contradict, "unknown: speed has two values"),
