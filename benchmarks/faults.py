@@ -282,7 +282,7 @@ MESSAGES: list[tuple[str, Act, str]] = [
     ("33 Hz", stretched(40.0 / 33.0), "^unknown"),
     ("50 Hz", stretched(40.0 / 50.0), "^unknown"),
     ("a clock 2.4 % slow", stretched(1.024), "unknown: samples come every 0.0"),
-    ("a clock 1.5 % fast", stretched(0.985), "unknown: samples come every 0.0"),
+    ("a clock 2.4 % fast", stretched(0.976), "unknown: samples come every 0.0"),
     ("commands stamped 0", commanded(math.nan), "^unknown"),
     ("commands stamped an hour ahead", commanded(3600.0), "^unknown"),
     ("commands stamped an hour ago", commanded(-3600.0), "^unknown"),
