@@ -605,25 +605,25 @@ Proof.
   eapply Rle_lt_trans; [apply clip_lipschitz|exact N].
 Qed.
 Lemma d_plan g i t w0 : In g (segments d) -> (i < m)%nat -> begins g < t < ends g ->
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (u t) w0) ->
-  derivable_pt_lim (wish i) t (turn g (place g t) (at_time x t) (u t) w0 i * / duration g).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) (u t) w0) ->
+  right_derivative (wish i) t (turn g (place g t) (at_time x t) (u t) w0 i * / duration g).
 Proof.
   intros Hg Hi Hr Hd. pose proof (segment_known g Hg) as Hok. destruct (curves_known g i Hg Hi) as [Lf Lr].
-  apply (derivable_pt_lim_locally_ext (fun v => plan g i v (at_time x v)) _ t (begins g) (ends g)); auto.
+  apply (right_near (fun v => plan g i v (at_time x v)) _ t _ (ends g - t)); [lra| |].
   { intros v Hv. unfold wish. now rewrite (now_is g v Hg) by lra. }
-  apply (limit_same (fun v => along (place g v) (nth i (feed g) [])
+  apply (right_same (fun v => along (place g v) (nth i (feed g) [])
     - dot (map (along (place g v)) (row_of g i)) (dev g x v))).
   { intros v. now rewrite plan_value by auto. }
-  eapply limit_equal.
-  { apply (d_minus (fun v => along (place g v) (nth i (feed g) []))).
-    - apply (d_along d g n Hok); auto.
+  eapply right_equal.
+  { apply (r_minus (fun v => along (place g v) (nth i (feed g) []))).
+    - apply from_right, (d_along d g n Hok); auto.
     - apply d_dot; [|apply (d_dev d g n Hok x x_length t Hr (u t) w0 Hd)].
       exists (map (fun c v => along (place g v) c) (row_of g i)). split.
       + intros v. unfold at_time. rewrite map_map. reflexivity.
       + instantiate (1 := map (fun v => v * / duration g)
           (map (fun c => curve' (map val c) (place g t)) (row_of g i))).
         clear - Lr Hok. induction Lr as [|c row Hc Hrow IH]; cbn; constructor; auto.
-        now apply (d_along d g n Hok). }
+        now apply from_right, (d_along d g n Hok). }
   unfold turn. rewrite dot_scaled, dot_scaled_r. fold (dev g x t). unfold dev. ring.
 Qed.
 

@@ -90,7 +90,7 @@ Hypothesis Hx : length x = n.
 Hypothesis Cx : forall t, begins g <= t <= ends g -> lo <= t <= hi ->
   Forall (fun f => continuity_pt f t) x.
 Definition moves (t : R) : Prop := exists w, in_box w (box d) /\
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (act t) w).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) (act t) w).
 Hypothesis Dx : forall t, begins g < t < ends g -> lo < t < hi ->
   within_off off (input d g (place g t) (at_time x t)) (act t) /\ moves t.
 
@@ -151,7 +151,7 @@ Proof.
 Qed.
 
 Lemma d_dev t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) ut w0) ->
   slopes dev t (map (fun v => v * / duration g) (relative g (place g t) (at_time x t) ut w0)).
 Proof.
   intros Ht ut w0 Hd. unfold relative. rewrite line_place.
@@ -165,8 +165,8 @@ Proof.
         (curve' (map val c) (place g t) * / duration g)) by (intros; apply d_along; lia).
     clear - Hd Hcv D DA. revert Hcv. generalize (nominal g).
     induction Hd as [|f v fs vs Hf Hfs IH]; intros [|c cs] Hc; cbn; constructor; inversion Hc; subst.
-    + eapply limit_equal.
-      { apply (d_minus f (fun u => along (place g u) c)); [exact Hf|]. now apply DA. }
+    + eapply right_equal.
+      { apply (r_minus f (fun u => along (place g u) c)); [exact Hf|]. now apply from_right, DA. }
       field. lra.
     + now apply IH.
 Qed.
@@ -177,9 +177,9 @@ Proof.
     clear. induction l as [|row l IH]; intros [|row' l']; cbn; auto. f_equal; auto.
     revert row'. induction row as [|a row IHr]; intros [|b row']; cbn; auto. f_equal. apply IHr.
   - unfold P'. generalize (shape (start g)) (shape (stop g)).
-    assert (D : forall a b, derivable_pt_lim (fun u => line (place g u) a b) t
+    assert (D : forall a b, right_derivative (fun u => line (place g u) a b) t
       ((val b - val a) * / duration g)).
-    { intros a b. unfold line. eapply limit_equal.
+    { intros a b. apply from_right. unfold line. eapply limit_equal.
       { apply (d_plus (fun u => (1 - place g u) * val a) (fun u => place g u * val b)).
         - apply (d_mult (fun u => 1 - place g u) (fun _ => val a)); [|apply d_const].
           apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
@@ -196,15 +196,15 @@ Proof.
   rewrite IH, !dot_scaled. ring.
 Qed.
 Lemma d_gap t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
-  derivable_pt_lim gap t (growth g (place g t) (at_time x t) ut w0 * / duration g).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) ut w0) ->
+  right_derivative gap t (growth g (place g t) (at_time x t) ut w0 * / duration g).
 Proof.
   intros Ht ut w0 Hd. pose proof (d_dev t Ht ut w0 Hd) as Hdev.
   pose proof (d_form _ _ _ _ _ _ _ (d_P t) Hdev Hdev) as D.
-  eapply limit_equal.
-  { unfold gap. apply (d_minus (fun u => form (P g (place g u)) (dev u) (dev u))
+  eapply right_equal.
+  { unfold gap. apply (r_minus (fun u => form (P g (place g u)) (dev u) (dev u))
       (fun u => rho g (place g u))); [exact D|].
-    unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
+    apply from_right. unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
       (fun u => place g u * val (level (stop g)))).
     - apply (d_mult (fun u => 1 - place g u) (fun _ => val (level (start g)))); [|apply d_const].
       apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
@@ -260,13 +260,13 @@ Qed.
 
 (* the excess over a share of rho that falls *)
 Lemma d_excess c t1 t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
-  derivable_pt_lim (fun u => gap u + (1 - share d c t1 u) * rho g (place g u)) t
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) ut w0) ->
+  right_derivative (fun u => gap u + (1 - share d c t1 u) * rho g (place g u)) t
     ((growth g (place g t) (at_time x t) ut w0 + (1 - share d c t1 t) * rho' g
       + duration g * pace d * (share d c t1 t - bottom d) * rho g (place g t)) * / duration g).
 Proof.
-  intros Ht ut w0 Hd. pose proof duration_pos as D. eapply limit_equal.
-  { apply (d_plus gap); [exact (d_gap t Ht ut w0 Hd)|].
+  intros Ht ut w0 Hd. pose proof duration_pos as D. eapply right_equal.
+  { apply (r_plus gap); [exact (d_gap t Ht ut w0 Hd)|]. apply from_right.
     apply (d_mult (fun u => 1 - share d c t1 u) (fun u => rho g (place g u))).
     - apply (d_minus (fun _ => 1)); [apply d_const|apply d_share].
     - unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
