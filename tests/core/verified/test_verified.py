@@ -46,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[3]
 VERIFIED = ROOT / "verified"
 CORPUS = ROOT / "tests" / "core" / "kernel" / "corpus"
 FUNNELS = CORPUS / "continuous_funnel"
-GAPS = re.compile(r"\b(Admitted|admit|Axiom|Parameter|Conjecture|Unset Guard Checking)\b")
+GAPS = re.compile(r"\b(Admitted|admit|Axioms?|Parameters?|Conjectures?|Unset \w+ Checking)\b")
 
 needs_coq = pytest.mark.skipif(
     shutil.which("coqc") is None or shutil.which("make") is None,
@@ -64,7 +64,7 @@ def test_nothing_is_left_to_believe_in_the_theory() -> None:
 def test_the_page_quotes_theorems_as_they_are() -> None:
     """Every theorem and definition on docs/verified.md is, sign by sign, one of the sources."""
     sources = [path.read_text() for path in VERIFIED.glob("*.v")]
-    made = vars(generator()).values()
+    made = vars(generator().theorems).values()
     stated = "\n".join([*sources, *(text for text in made if type(text) is str)])
     page = (ROOT / "docs" / "verified.md").read_text()
     blocks = map(textwrap.dedent, re.findall(r"(?:^ {4,}\S.*\n)+", page, re.MULTILINE))
@@ -87,6 +87,67 @@ def test_the_page_counts_the_lines_that_are_to_be_read() -> None:
         assert len((VERIFIED / name).read_text().splitlines()) == int(lines)
 
 
+def test_every_premise_is_met_by_a_real_run() -> None:
+    """Whatever is called a solution in the theory is concluded of real runs in Runs.v."""
+    sources = "".join(path.read_text() for path in VERIFIED.glob("*.v"))
+    premises = set(re.findall(r"Definition (\w*solution) ", sources))
+    assert premises == {"solution", "held_solution"}
+    runs = re.findall(r"Theorem (.*?)\.\nProof", (VERIFIED / "Runs.v").read_text(), re.DOTALL)
+    for premise in (*premises, "motion", "run"):
+        assert any(re.search(rf"\b{premise}\b", theorem) for theorem in runs), premise
+
+
+def theorem(name: str = "tube/engaged") -> str:
+    """What the generator writes for Coq."""
+    generate = generator()
+    return str(generate.coq(generate.read(CORPUS / name / "claim.proof.json")))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Axiom _hidden : False.",
+        "Axiom hidden : False.",
+        "Parameter found : forall d x, solution d x.",
+        "Definition stays_near := (None).",
+        "Definition data := (Linear []). Axiom _hidden : False.",
+        "Definition rate := (proj1_sig _hidden).",
+        "Definition rate := (fun x => x).",
+        'Notation "x <= y" := True.',
+        "Unset Guard Checking.",
+        "From Coq Require Import Berardi.",
+        "",
+    ],
+)
+def test_a_line_that_is_not_of_the_template_is_refused(line: str) -> None:
+    theorems, text = generator().theorems, theorem()
+    assert theorems.proved(text) == ["accepted", "near", "planned", "near_plan"]
+    lines = text.splitlines(keepends=True)
+    for i in range(len(lines) + 1):
+        with pytest.raises(theorems.NotTemplate):
+            theorems.proved("".join([*lines[:i], f"{line}\n", *lines[i:]]))
+
+
+@pytest.mark.parametrize(
+    "assumed",
+    [
+        "_hidden : False",
+        "hidden : False",
+        "Classical_Prop.classic : forall P : Prop, P",
+        "PrimInt63.int : Prop",
+        "proof_irrelevance is assumed to be guarded.",
+        "Section Variables:",
+    ],
+)
+def test_an_assumption_that_is_not_listed_with_its_type_is_refused(assumed: str) -> None:
+    theorems = generator().theorems
+    answer = "Axioms:\n" + theorems.ALLOWED.read_text()
+    theorems.hold_assumptions(answer, 1)
+    for wrong, asked in ((f"{answer}{assumed}\n", 1), (answer, 2), ("", 1)):
+        with pytest.raises(theorems.NotTemplate):
+            theorems.hold_assumptions(wrong, asked)
+
+
 @pytest.fixture(scope="module")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the theory is built, once."""
@@ -100,6 +161,20 @@ def accepted(proof: Path, build: Path) -> subprocess.CompletedProcess[str]:
     """The build of the theorem of one file."""
     command = ["make", "-C", str(VERIFIED), f"BUILD={build}", f"FILE={proof}"]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@needs_coq
+@pytest.mark.coq
+def test_a_hidden_axiom_is_seen(tmp_path: Path) -> None:
+    """The name of 0.2's, which no name in a list begins with."""
+    theorems = generator().theorems
+    (tmp_path / "hiding.v").write_text("Axiom _hidden : False.\nDefinition said := _hidden.\n")
+    (tmp_path / "asked.v").write_text(theorems.question(["said"], "hiding"))
+    for file in ("hiding.v", "asked.v"):
+        command = ["coqc", "-q", file]
+        done = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
+    with pytest.raises(theorems.NotTemplate, match="_hidden : False"):
+        theorems.hold_assumptions(done.stdout, 1)
 
 
 @needs_coq
