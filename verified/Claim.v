@@ -36,11 +36,10 @@ Record segment := Segment {
   equations : list equation; bounds : list (nat * (num * num)) }.
 
 (* [limits]: for each input, what it is clipped to, if it is. [box]: the range of each w.
-   [goal]: centre and P (upper triangle) of an ellipsoid. [decay]: how fast V falls, in 1/s, and down
-   to what. *)
+   [goal]: centre and P (upper triangle) of an ellipsoid. *)
 Record problem := Problem {
   segments : list segment; limits : list (option (num * num)); box : list (num * num);
-  goal : option (list num * list (list num)); decay : option (num * num) }.
+  goal : option (list num * list (list num)) }.
 
 Definition begins (g : segment) : R := val (time (start g)).
 Definition ends (g : segment) : R := val (time (stop g)).
@@ -116,20 +115,6 @@ Definition in_goal (d : problem) (x : list (R -> R)) : Prop :=
   | Some (centre, B) =>
       let z := zip Rminus (at_time x (finish d)) (map val centre) in
       form (map (map val) B) z z <= 1
-  end.
-
-(* V = W / rho. With a decay, of any two times the excess of V over the floor at the later one is at
-   most exp(- pace (t2 - t1)) of that at the earlier one; at a knot for V on either side of it. *)
-Definition V (g : segment) (x : list (R -> R)) (t : R) : R :=
-  let s := place g t in
-  let z := deviation g s (at_time x t) in
-  form (P g s) z z / rho g s.
-Definition decays (d : problem) (x : list (R -> R)) (since : R) : Prop :=
-  match decay d with
-  | None => True
-  | Some (pace, floor) => forall g h t1 t2, In g (segments d) -> In h (segments d) ->
-      begins g <= t1 <= ends g -> begins h <= t2 <= ends h -> since <= t1 <= t2 ->
-      V h x t2 <= val floor + exp (- val pace * (t2 - t1)) * Rmax 0 (V g x t1 - val floor)
   end.
 
 (* A policy that is held, late, or measures with an error: the input at t is the policy's of some

@@ -773,12 +773,6 @@ Proof.
 Qed.
 Lemma held_stays t : since <= t <= finish d -> inside d x t.
 Proof. intros Hr. apply (inside_until (finish d)); auto; [lra|]. intros s Hs. now apply good_always. Qed.
-Lemma held_decays : decays d x since.
-Proof.
-  apply (decays_until d offs w H_checked x (fun _ => u)); auto; [lra|].
-  apply followed; [lra|exact good_always].
-Qed.
-
 Lemma bounds_here t : since <= t <= finish d -> held_in_bounds d x u t.
 Proof.
   intros Hr g b Hg Hb. pose proof (segment_known g Hg) as Hok.
@@ -829,11 +823,10 @@ Proof.
 Qed.
 End Solution.
 
-(* What starts inside stays inside, within its bounds, ends in its goal, and decays. *)
+(* What starts inside stays inside, within its bounds, and ends in its goal. *)
 Theorem held_proved since x u : held_solution d period errors since x u ->
   begin d <= since <= finish d -> inside d x since ->
-  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x /\
-  decays d x since.
+  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x.
 Proof.
   intros Hs Hr Hi. destruct held_parts as [_ [Hg [Hne _]]].
   assert (E : exists g0 gs0, segments d = g0 :: gs0).
@@ -843,8 +836,7 @@ Proof.
   { intros t Ht'. now apply (held_stays since x u g0 gs0 E Hs Hr Hi). }
   split.
   - intros t Ht'. split; auto. now apply (bounds_here since x u g0 gs0 E Hs Hr Hi).
-  - split; [|exact (held_decays since x u g0 gs0 E Hs Hr Hi)].
-    apply (goal_reached d w (goal_multiplier w) C Hg); auto.
+  - apply (goal_reached d w (goal_multiplier w) C Hg); auto.
     + exact (x_length since x u g0 gs0 E Hs).
     + apply S. lra.
 Qed.
@@ -854,20 +846,20 @@ End Problem.
 Definition pushing_of (f : field_file) : list bool :=
   map (fun j => forallb (forallb (alone (1 + states f + j))) (spans f))
     (seq 0 (inputs f + length (uncertain f))).
-Definition held_files_ok f p u g e (period : num) (errors : list num) (w : witness)
+Definition held_files_ok f p u g (period : num) (errors : list num) (w : witness)
   (rs : list (list num)) (ts : list (list rate_piece)) : bool :=
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
-    (andb (held_ok (stated f p u g e) period errors w (Rates rs (pushing_of f) ts))
+    (andb (held_ok (stated f p u g) period errors w (Rates rs (pushing_of f) ts))
       (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
        else true)).
 
-Theorem held_theorem f p u g e period errors w rs ts :
-  held_files_ok f p u g e period errors w rs ts = true ->
-  forall since x act, held_solution (stated f p u g e) period errors since x act ->
-  begin (stated f p u g e) <= since <= finish (stated f p u g e) -> inside (stated f p u g e) x since ->
-  (forall t, since <= t <= finish (stated f p u g e) ->
-    inside (stated f p u g e) x t /\ held_in_bounds (stated f p u g e) x act t) /\
-  in_goal (stated f p u g e) x /\ decays (stated f p u g e) x since.
+Theorem held_theorem f p u g period errors w rs ts :
+  held_files_ok f p u g period errors w rs ts = true ->
+  forall since x act, held_solution (stated f p u g) period errors since x act ->
+  begin (stated f p u g) <= since <= finish (stated f p u g) -> inside (stated f p u g) x since ->
+  (forall t, since <= t <= finish (stated f p u g) ->
+    inside (stated f p u g) x t /\ held_in_bounds (stated f p u g) x act t) /\
+  in_goal (stated f p u g) x.
 Proof.
   unfold held_files_ok. intros H since x act Hx Hr Hi. apply andb_prop in H as [_ H].
   apply andb_prop in H as [H _]. now apply (held_proved _ period errors w (Rates rs (pushing_of f) ts)).

@@ -210,7 +210,7 @@ Definition n (a : Z) : num := (a, 1%positive).
 Definition only : segment :=
   Segment (Knot (n 0) [[n 1]] (n 1)) (Knot (n 1) [[n 1]] (n 1)) [[n 0]] [[n 0]] [[[n 1]]]
     [[([0; 0; 1]%nat, n 1)]] [].
-Definition robot : problem := Problem [only] [None] [] None None.
+Definition robot : problem := Problem [only] [None] [] None.
 Definition x (x0 t : R) : R :=
   if Rle_dec t 0 then x0
   else if Rle_dec t (1 / 2) then x0 * (1 - t)

@@ -5,9 +5,10 @@
     python generate.py FILE.proof.json --ask CHECKER   what the extracted checker says of these
                                                        numbers: status 0, 1; 3 is not covered
 
-Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them. printed.py prints
-those back into the files before anything is said, and theorems.py holds every line to its template. What the second kernel does not cover is
-told by name (NotCovered, status 3); what the pages do not allow is refused (strict.py, status 1).
+Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them. printed.py
+prints those back into the files before anything is said, and theorems.py holds every line to its
+template. What the second kernel does not cover is told by name (NotCovered, status 3); what the
+pages do not allow is refused (strict.py, status 1).
 Standard library only.
 """
 
@@ -23,6 +24,7 @@ import theorems
 from problems import Composition, Funnel, Increments, NotCovered, Problem, Sampled, read
 from strict import Refused
 from terms import Coq, Writer
+
 
 def coq(problem: Problem) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
@@ -73,8 +75,8 @@ def trees(writer: Writer, problem: Increments) -> list[str]:
 
 
 ASKED = {
-    "held": "field policy funnel goal decay period errors proof rates turns",
-    "funnel": "field policy funnel goal decay proof",
+    "held": "field policy funnel goal period errors proof rates turns",
+    "funnel": "field policy funnel goal proof",
     "plan": "data tubes proofs a b b0 feedback",
     "tube": "data tubes proofs",
     "stability": "data storage rate proof",

@@ -319,7 +319,7 @@ class Writer:
 
     def composition(self, problem: Composition) -> None:
         """What the theorem is about, stage by stage, and what is used to decide it."""
-        to, parts = self.to, ("field", "policy", "funnel", "goal", "decay")
+        to, parts = self.to, ("field", "policy", "funnel", "goal")
         stages, proofs = [], []
         for i, stage in enumerate(problem.stages, start=1):
             to.mark = f"stage{i}_"
@@ -375,7 +375,7 @@ class Writer:
         return to.listed(to.named(f"{name}_{k}", row) for k, row in enumerate(rows))
 
     def problem(self, problem: Funnel) -> None:
-        """What the theorem is about: field, policy, funnel, goal, decay."""
+        """What the theorem is about: field, policy, funnel, goal."""
         to, policy, funnel = self.to, problem.policy, problem.funnel
         to.named("field", self.field(problem.field))
         limits = (
@@ -396,9 +396,6 @@ class Writer:
             stated = problem.claim["goal"]
             goal = to.pair(self.nums(stated["centre"]), self.matrix(stated["P"]))
         to.named("goal : option (list num * list (list num))", to.maybe(goal))
-        stated = problem.claim.get("decay")
-        decay = self.ends([stated["rate"], stated["floor"]]) if stated else None
-        to.named("decay : option (num * num)", to.maybe(decay))
 
     def by_interval(self, name: str, problem: Funnel, entries: list[Any], made: Any) -> str:
         """Pieces of each interval, in the order in which they begin."""

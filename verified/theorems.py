@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """What a generated file of Coq may hold, line by line, and what its theorems may assume.
 
-    python theorems.py THEOREM.v                  holds it to its template; prints a file for Coq that
-                                                  asks what its theorems assume
+    python theorems.py THEOREM.v                  holds it to its template; prints a file for Coq
+                                                  that asks what its theorems assume
     python theorems.py THEOREM.v --assumed TEXT   holds Coq's answer to axioms.txt, word for word
 
-Trusted: read this file and axioms.txt. The answer is asked for in a file of its own, in which nothing
-of the generated one is imported and every name and type is printed in full, without notations; so
-no line of the generated file can change how it reads. Standard library only.
+Trusted: read this file and axioms.txt. The answer is asked for in a file of its own. Nothing of the
+generated file is imported there, and every name and type is printed in full, without notations. So
+no line of the generated file can change how the answer reads. Standard library only.
 """
 
 import argparse
@@ -23,26 +23,26 @@ Import ListNotations.
 Open Scope Z_scope.
 """
 THEOREM = """\
-Definition data := stated field policy funnel goal decay.
-Theorem accepted : files_ok field policy funnel goal decay proof = true.
+Definition data := stated field policy funnel goal.
+Theorem accepted : files_ok field policy funnel goal proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
 Theorem funnel_stays : forall x, solution data x ->
   forall ta, (begin data <= ta <= finish data)%R -> inside data x ta ->
   (forall t, (ta <= t <= finish data)%R -> inside data x t /\\ in_bounds data x t) /\\
-  in_goal data x /\\ decays data x ta.
-Proof. exact (funnel_theorem field policy funnel goal decay proof accepted). Qed.
+  in_goal data x.
+Proof. exact (funnel_theorem field policy funnel goal proof accepted). Qed.
 """
 HELD = """\
-Definition data := stated field policy funnel goal decay.
+Definition data := stated field policy funnel goal.
 Theorem accepted :
-  held_files_ok field policy funnel goal decay period errors proof rates turns = true.
+  held_files_ok field policy funnel goal period errors proof rates turns = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
 Theorem held_stays : forall since x u, held_solution data period errors since x u ->
   (begin data <= since <= finish data)%R -> inside data x since ->
   (forall t, (since <= t <= finish data)%R -> inside data x t /\\ held_in_bounds data x u t) /\\
-  in_goal data x /\\ decays data x since.
+  in_goal data x.
 Proof.
-  exact (held_theorem field policy funnel goal decay period errors proof rates turns accepted).
+  exact (held_theorem field policy funnel goal period errors proof rates turns accepted).
 Qed.
 """
 NEAR = """\
@@ -91,20 +91,20 @@ KINDS = {
 # Definitions of numbers, one a line: a name, perhaps its type, and a term of numbers, lists, pairs
 # and the constructors below.
 NAMED = (
-    "field|policy|funnel|goal|decay|proof|period|errors|rates|turns|data|tubes|proofs|a|b|b0|c|"
+    "field|policy|funnel|goal|proof|period|errors|rates|turns|data|tubes|proofs|a|b|b0|c|"
     "feedback|stages|multipliers|model|storage|rate|"
     r"(?:span|feed|gain|nominal|shape|piece|turn|link)_\d+"
 )
 TYPED = (
-    r"num|list num|list \(list num\)|matrix|option \(num \* num\)|"
+    r"num|list num|list \(list num\)|matrix|"
     r"option \(list num \* list \(list num\)\)|list \(list rate_piece\)"
 )
 DEFINED = re.compile(rf"Definition ((?:stage\d+_)?(?:{NAMED}))(?: : (?:{TYPED}))? := (.+)\.")
 TOKEN = re.compile(r"-?\d+|[A-Za-z_][A-Za-z_0-9]*|%(?:nat|positive|uint63)|[\[\]();,]| ")
-MADE = set(
-    "None Some true false Linear Affine Monotone Cells Broken Spline Leaf Split Ends Tube Map Track "
-    "Sampled Response Peak Energy Fading Links Link Chain Field Policy Funnel Stage Witness Piece "
-    "RatePiece big_mu word_squares".split()
+CONSTRUCTORS = (
+    "None Some true false Linear Affine Monotone Cells Broken Spline Leaf Split Ends Tube Map "
+    "Track Sampled Response Peak Energy Fading Links Link Chain Field Policy Funnel Stage Witness "
+    "Piece RatePiece big_mu word_squares"
 )
 ALLOWED = Path(__file__).with_name("axioms.txt")
 
@@ -142,7 +142,7 @@ def _hold_definitions(lines: list[str]) -> None:
         name, term = match.groups()
         tokens = TOKEN.findall(term)
         words = {token for token in tokens if token[0].isalpha() or token[0] == "_"}
-        if "".join(tokens) != term or words - MADE - known:
+        if "".join(tokens) != term or words - set(CONSTRUCTORS.split()) - known:
             raise NotTemplate(f"{name} is not made of numbers")
         known.add(name)
 

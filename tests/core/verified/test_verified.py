@@ -1,6 +1,5 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
-import copy
 import hashlib
 import json
 import random
@@ -74,7 +73,7 @@ def test_the_page_quotes_theorems_as_they_are() -> None:
         for quote in re.split(r"^(?=Theorem|Definition)", block, flags=re.MULTILINE)
         if quote.startswith(("Theorem", "Definition"))
     ]
-    assert len(quotes) == 11
+    assert len(quotes) == 12
     for quote in quotes:
         assert quote in stated
 
@@ -179,14 +178,13 @@ def test_a_hidden_axiom_is_seen(tmp_path: Path) -> None:
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize("name", ["clipped", "pushed", "held", "decaying"])
+@pytest.mark.parametrize("name", ["clipped", "pushed", "held"])
 def test_coq_proves_the_theorem_of_a_funnel(name: str, build: Path) -> None:
     done = accepted(FUNNELS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
     assert "accepted: " in done.stdout
     text = (build / "theorem.v").read_text()
     assert ("held_in_bounds data x u t" if name == "held" else "in_bounds data x t") in text
-    assert ("decay : option (num * num) := None." in text) == (name != "decaying")
 
 
 def rho_raised(files: Files) -> None:
@@ -254,22 +252,6 @@ def pushed_by_the_state(files: Files) -> None:
     exponents.sort()
 
 
-def falls_faster(files: Files) -> None:
-    """Half as fast again."""
-    files[PROOF]["claim"]["decay"]["rate"] *= 1.5
-
-
-def falls_further(files: Files) -> None:
-    """Down to the nominal itself."""
-    files[PROOF]["claim"]["decay"]["floor"] = 0.0
-
-
-def shell_turned(files: Files) -> None:
-    """The multipliers of rho - W and of W - floor rho, exchanged."""
-    for piece in files[PROOF]["proof"]["pieces"]:
-        piece["tau"][:2] = piece["tau"][1::-1]
-
-
 def held_longer(files: Files) -> None:
     """Three times."""
     files[PROOF]["claim"]["hold"] *= 3
@@ -297,10 +279,7 @@ def turns_more_slowly(files: Files) -> None:
         pushed_by_the_state)]
     + [("held", forge) for forge in
        (rho_raised, gain_lower, input_bounds_too_narrow, held_longer, measured_worse,
-        turns_more_slowly)]
-    + [("decaying", forge) for forge in
-       (rho_raised, gain_lower, piece_missing, limit_wider, goal_smaller, pushed_more,
-        falls_faster, falls_further, shell_turned)],
+        turns_more_slowly)],
 )  # fmt: skip
 def test_both_kernels_refuse_a_forgery(
     name: str, forge: Callable[[Files], None], build: Path, tmp_path: Path
@@ -339,7 +318,6 @@ COMPOSED = "funnel_composition/two"
         "continuous_funnel/clipped",
         "continuous_funnel/pushed",
         "continuous_funnel/held",
-        "continuous_funnel/decaying",
     ],
 )
 def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
@@ -661,25 +639,6 @@ def test_every_forged_held_funnel_is_refused(program: Path, tmp_path: Path) -> N
     for what in HELD_FORGERIES:
         proof = write(forged_held(files, what), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
-
-
-@needs_coq
-@pytest.mark.coq
-@pytest.mark.parametrize(
-    "options", [{}, {"hold": 0.01, "error": [0.002, 0.01]}], ids=["pushed", "held"]
-)
-def test_a_decay_and_its_smallest_forgeries(options: Json, program: Path, tmp_path: Path) -> None:
-    """A little faster and a little lower than was proved: both kernels refuse."""
-    files = saved_design(design(tracking(decay=0.5, **options)), tmp_path)
-    assert second.opinion(write(files, tmp_path), program).verdict == "accepted"
-    for member, factor in (("rate", 1.2), ("floor", 0.5)):
-        more = copy.deepcopy(files)
-        more[PROOF]["claim"]["decay"][member] *= factor
-        bind(more)
-        proof = write(more, tmp_path)
-        with pytest.raises(CertificateRejected, match="not positive"):
-            proofs.check(proof)
-        assert second.opinion(proof, program).verdict == "refused", member
 
 
 @needs_coq
