@@ -38,7 +38,6 @@ for verb in (
     models_cli.compare,
     designs_cli.funnel,
     designs_cli.push,
-    designs_cli.gain,
     designs_cli.compose,
     designs_cli.check,
     designs_cli.report,

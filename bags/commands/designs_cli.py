@@ -7,7 +7,7 @@ A command imports what it runs when it is called.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -114,39 +114,6 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) ->
         out.print(f"measured, not proved: {given.push}", soft_wrap=True, markup=False)
 
 
-def gain(
-    model: Annotated[Path, typer.Argument(help="The model.json that `nlsid identify` wrote.")],
-    passivity: Annotated[
-        bool, typer.Option("--passivity", help="The index of passivity in the gain's place.")
-    ] = False,
-    discount: Annotated[
-        float, typer.Option(help="What a sample's squares count of those of the one before.")
-    ] = 1.0,
-    scale: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=VALUE, the unit that a signal counts in; repeat. Default 1."),
-    ] = None,
-) -> None:
-    """Prove how much two runs of a model with two inputs can differ: model.gain.proof.json.
-
-    The sum of squares of the outputs' differences is at most gain^2 times that of the inputs'. It
-    is about the model, not the robot. Beside it, what two simulated runs reach: no gain is less.
-    Status 1 if nothing was proved.
-    """
-    from bags.chain.gains import gain_of
-    from bags.commands import show
-
-    scales = show.named_numbers(scale or [], "--scale")
-    kind: Literal["gain", "passivity"] = "passivity" if passivity else "gain"
-    found = gain_of(model, kind=kind, discount=discount, scales=scales)
-    if found is None:
-        out.print(f"NOT PROVED: no quadratic storage was found for a bound of {kind}")
-        raise typer.Exit(1)
-    for line in show.gain_lines(found):
-        out.print(line, soft_wrap=True, markup=False, highlight=False)
-    out.print(f"wrote {found.file}", soft_wrap=True)
-
-
 def push(
     bags: BagsArgument,
     problem: Annotated[Path, typer.Option(help="The problem whose equations are compared.")],
@@ -190,35 +157,13 @@ def push(
 def compose(
     proofs: Annotated[
         list[Path],
-        typer.Argument(help="funnel.proof.json files, in the order of time; or two of gains."),
+        typer.Argument(help="funnel.proof.json files, in the order of time."),
     ],
     out_dir: OutOption,
-    jump: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="jump.json from each funnel into the next, in order; one more: into the first."
-        ),
-    ] = None,
 ) -> None:
-    """Bind proofs into one claim, for `check`: composition., hybrid. or small_gain.proof.json.
+    """Bind proofs of funnels that follow each other into one claim, for `check`."""
+    from nlsid_core.design import compose_funnels
 
-    Funnels that follow each other, in time or, with --jump, where a guard is met; or two models, of
-    gains by `nlsid gain`, in a loop where each one's output is the other's input.
-    """
-    from nlsid_core.design import compose_funnels, compose_jumps
-    from nlsid_core.design.loop import compose_loop, is_gain
-
-    if jump:
-        path = compose_jumps(proofs, jump, out_dir)
-        count = 4 * len(proofs) + len(jump)
-        out.print(f"wrote {path} and {count} files of its stages and jumps", soft_wrap=True)
-        return
-
-    if any(map(is_gain, proofs)):
-        path, verdict = compose_loop(proofs, out_dir)
-        out.print(str(verdict), soft_wrap=True, markup=False, highlight=False)
-        out.print(f"wrote {path} and 4 files of its models", soft_wrap=True)
-        return
     path = compose_funnels(proofs, out_dir)
     out.print(f"wrote {path} and {4 * len(proofs)} files of its stages", soft_wrap=True)
 
@@ -228,16 +173,11 @@ def check(
     second: Annotated[
         bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
     ] = False,
-    recording: Annotated[
-        Path | None,
-        typer.Option(help="Of a falsification: the bag, whose digest and samples are compared."),
-    ] = None,
 ) -> None:
-    """Decide proofs without a solver: PROVED or FALSIFIED (status 0), or REJECTED (status 1).
+    """Decide proofs without a solver: PROVED (status 0), or REJECTED (status 1).
 
-    FALSIFIED: of what a tube assumes, by `nlsid monitor --falsify`. Status 2 if a proof cannot be
-    read, so that nothing was decided about it, or if the second kernel was asked and has no opinion
-    of it.
+    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
+    kernel was asked and has no opinion of it.
     """
     status = 0
     for path in proofs:
@@ -246,10 +186,6 @@ def check(
             said = str(kernel.check(path))
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
-            if recording is not None:
-                from bags.monitoring.falsify import recorded
-
-                typer.echo(f"  compared: {recorded(path, recording)}")
             if second:
                 opinion = second_kernel.opinion(path)
                 typer.echo(f"  {opinion}")

@@ -45,12 +45,6 @@ def monitor(
     forecast: Annotated[
         float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
     ] = 0.0,
-    falsify: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for certificates that bags break what a tube assumes, for `nlsid check`."
-        ),
-    ] = None,
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
@@ -67,7 +61,6 @@ def monitor(
     from bags.designs import documents
     from bags.designs.design import Wiring
     from bags.fleet.monitor import judged_of
-    from bags.monitoring.falsify import falsified, refuse_unfalsifiable
     from bags.monitoring.replay import replay_bag, to_judge
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
@@ -80,8 +73,6 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
-    if falsify is not None:
-        refuse_unfalsifiable(proved.design.model)
     folders = expand_bags(bags)
     if settings is not None:
         chosen = to_judge(proved.design, folders, validation=settings.split.validation)
@@ -113,10 +104,6 @@ def monitor(
             out.print(line, soft_wrap=True, markup=False, highlight=False)
     for line in () if as_json else show.paced_lines(replays):
         out.print(line, soft_wrap=True, markup=False, highlight=False)
-    if falsify is not None:
-        bad = [f for f, r in zip(folders, replays, strict=True) if r.first_bad is not None]
-        for said in (line for f in bad for line in falsified(funnel, f, falsify, types)):
-            (err if as_json else out).print(said, soft_wrap=True, markup=False, highlight=False)
     if drawn and not as_json:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):

@@ -1,7 +1,7 @@
 """What the commands of the chain print."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from rich.box import SIMPLE_HEAD
@@ -12,7 +12,6 @@ from rich.text import Text
 
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
-from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
@@ -107,69 +106,6 @@ def notes(result: Identified) -> list[str]:
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
-
-
-def gain_lines(found: Gain) -> list[str]:
-    """What was proved of a model's gain or passivity, and how near two runs of it come."""
-    number, unit = Fraction(found.proof.number), found.unit and f" {found.unit}"
-    fading = "" if found.proof.discount == 1.0 else f", with discount {found.proof.discount!r}"
-    least = found.proof.kind == "gain"
-    bound = f"gain at most {text.above(number)}" if least else (
-        f"passivity index at least {text.below(number)}"
-    )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
-    if (seen := found.reached) is None:
-        lines.append("not compared with simulated runs")
-    else:
-        value, (_, inputs) = Fraction(seen.value), signals(found.model)
-        bound = f"at least {text.below(value)}" if least else f"at most {text.above(value)}"
-        where = ", ".join(
-            f"{signal.name} {size:.3g} around {around:.3g} {signal.unit}".rstrip()
-            for signal, size, around in zip(inputs, seen.amplitude, seen.around, strict=True)
-        )
-        shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
-        lines.append(f"{bound}{unit}: {shown}")
-    return [*lines, *str(found.verdict).splitlines()]
-
-
-def _gain_conditions(found: Gain) -> str:
-    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
-    outputs, inputs = signals(found.model)
-    scales = [*zip(outputs, found.proof.y_scales, strict=True),
-              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
-    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
-    said = f", {' and '.join(counted)}" if counted else ""
-    if found.proof.box is None:
-        return said
-    ranges = [
-        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
-        f"{signal.unit}".rstrip()
-        for key, group in (("y", outputs), ("u", inputs))
-        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
-    ]
-    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
-
-
-def named_number(given: str) -> tuple[str, float]:
-    """NAME=VALUE as an option has it; DataError if it is none."""
-    name, found, value = given.rpartition("=")
-    try:
-        number = float(value)
-    except ValueError:
-        found = ""
-    if not (found and name) or not math.isfinite(number):
-        raise DataError(f"'{given}' should be NAME=VALUE, as speed=0.5")
-    return name, number
-
-
-def named_numbers(given: Iterable[str], option: str) -> dict[str, float]:
-    """`named_number` of each; DataError where a name comes twice."""
-    found: dict[str, float] = {}
-    for name, number in map(named_number, given):
-        if name in found:
-            raise DataError(f"{option} {name} is given twice")
-        found[name] = number
-    return found
 
 
 def selection_table(selection: Selection[Model]) -> Table:

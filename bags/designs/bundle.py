@@ -28,11 +28,6 @@ from nlsid_core.kernel.files import read_regular
 FORMAT: Final = "nlsid/bundle"
 PROOF: Final = "proof"  # the role of the file that names the others
 MAX_BYTES: Final = 16 * 2**20  # of a bundle; real ones have about 1 MB
-JUMPING: Final = "hybrid_funnel"  # the kind of a claim
-NOT_RUN: Final = (
-    "funnels that jump into each other are proved and not run: each of their stages has a clock "
-    "that starts at a jump, and what is run here has one clock"
-)
 MAX_ROLES: Final = 401  # of a composition of 100 stages
 MAX_MEMORY: Final = 4 * 2**30  # bytes of address space to decide in
 MAX_TIME: Final = 600.0  # s to decide in
@@ -49,18 +44,14 @@ class Bundle:
     def load(cls, funnel: Path | str) -> "Bundle":
         """The files of the proof beside `funnel`; of a composition's proof, those of its stages.
 
-        Raises CertificateMismatch if the proof is about another funnel, CertificateRejected if it
-        is one of funnels that jump into each other, DocumentError if it is no proof or the files
-        are too large to be published; OS errors for the proof pass through.
+        Raises CertificateMismatch if the proof is about another funnel, DocumentError if it is no
+        proof or the files are too large to be published; OS errors for the proof pass through.
         """
         funnel = Path(funnel)
         folder = funnel.parent
-        composed = funnel.name in (designs.COMPOSITION, designs.HYBRID)
+        composed = funnel.name == designs.COMPOSITION
         named = funnel.read_bytes()
         proof = named if composed else (folder / designs.PROOF).read_bytes()
-        claim = files.parse_document(proof, source=PROOF).get("claim")
-        if isinstance(claim, dict) and claim.get("kind") == JUMPING:
-            raise CertificateRejected(f"{funnel}: {NOT_RUN}")
         contents = {PROOF: proof, **_beside(folder, proof)}
         for stage in list(contents) if composed else []:
             if stage != PROOF:
@@ -121,8 +112,6 @@ class Bundle:
         if PROOF not in self.contents:
             raise CertificateRejected("there is no proof in the bundle")
         verdict = proofs.decide(self.contents[PROOF], self._files())
-        if verdict.kind == JUMPING:
-            raise CertificateRejected(NOT_RUN)
         found = {role: files.digest(content) for role, content in self.contents.items()}
         if found != verdict.digests or not ("funnel" in found or self._stages):
             raise CertificateMismatch(

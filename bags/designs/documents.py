@@ -62,8 +62,8 @@ def load_model(path: Path | str) -> DifferenceEquation:
 
 def funnel_of(folder: Path) -> Path:
     """What `load_proved` reads in a design folder: a proof of several funnels, or its funnel."""
-    several = (folder / name for name in (designs.COMPOSITION, designs.HYBRID))
-    return next((path for path in several if path.is_file()), folder / FUNNEL)
+    several = folder / designs.COMPOSITION
+    return several if several.is_file() else folder / FUNNEL
 
 
 def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:

@@ -6,11 +6,6 @@ from nlsid_core.identification.block_cascade import (
     identify_block_cascade,
 )
 from nlsid_core.identification.cells import CellClass
-from nlsid_core.identification.dissipation import (
-    DissipationProof,
-    prove_gain,
-    prove_passivity,
-)
 from nlsid_core.identification.feedback import FeedbackClass
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import Selection, Tried, identify, select
@@ -56,7 +51,6 @@ __all__ = [
     "CellClass",
     "CertifiedRse",
     "CertifiedSem",
-    "DissipationProof",
     "FeedbackClass",
     "FirstRse",
     "Fit",
@@ -91,9 +85,7 @@ __all__ = [
     "identify_from_repeats",
     "methods_of",
     "predict",
-    "prove_gain",
     "prove_implicit",
-    "prove_passivity",
     "prove_stability",
     "select",
     "simulate_trial",

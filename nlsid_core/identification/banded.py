@@ -6,7 +6,7 @@ diagonals, {D: (N,) array}: entry (r, r - D) is G[D][r]; entries that fall outsi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,6 @@ from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array, dia_array
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import DataError
 
 Diagonals = Mapping[int, FloatArray]
 
@@ -25,8 +24,7 @@ class Rows:
     """offsets: the diagonal of each left parameter; weights, errors: (N, n_g) columns; Q: (N, n_p)
     with orthonormal columns. Weights are zero where a lag reaches before its trajectory's first
     row: there the measured output stands in the errors only. `identity` are the left parameters
-    of G = I. covariance: W⁻¹, symmetric positive definite by diagonals, of errors measured as
-    |y - ŷ|²_W (None: W = I).
+    of G = I.
     """
 
     offsets: tuple[int, ...]
@@ -34,27 +32,15 @@ class Rows:
     errors: FloatArray
     Q: FloatArray
     identity: FloatArray
-    covariance: Diagonals | None = None
 
     def __len__(self) -> int:
         """The number of rows N."""
         return len(self.errors)
 
-    def weighted(self, weights: FloatArray) -> "Rows":
-        """The same rows with errors measured as Σ weights (y - ŷ)², (N,) in the order of the rows.
-
-        Raises DataError unless every weight is positive and finite.
-        """
-        given = np.asarray(weights, dtype=np.float64)
-        if given.shape != (len(self),) or not (np.isfinite(given) & (given > 0)).all():
-            raise DataError(f"weights should be ({len(self)},), positive and finite")
-        return replace(self, covariance={0: 1.0 / given})
-
     @cached_property
     def bandwidth(self) -> int:
-        """The bandwidth of G W⁻¹ G'."""
-        own = 0 if self.covariance is None else max(map(abs, self.covariance))
-        return max(self.offsets) - min(*self.offsets, 0) + own
+        """The bandwidth of GG'."""
+        return max(self.offsets) - min(*self.offsets, 0)
 
     @cached_property
     def groups(self) -> tuple[tuple[int, slice | list[int], FloatArray], ...]:
@@ -72,10 +58,6 @@ class Rows:
     def G(self, theta: FloatArray) -> Diagonals:
         """G(θ) by diagonals."""
         return {D: weights @ theta[group] for D, group, weights in self.groups}
-
-    def weighed(self, G: Diagonals) -> Diagonals:
-        """G W⁻¹."""
-        return G if self.covariance is None else product(G, self.covariance)
 
     @cached_property
     def eye(self) -> Diagonals:
@@ -107,15 +89,6 @@ def sparse(G: Diagonals) -> csr_array:
     return dia_array((rows, [-D for D in G]), shape=(N, N)).tocsr()
 
 
-def product(G: Diagonals, H: Diagonals) -> Diagonals:
-    """GH by diagonals."""
-    result: dict[int, FloatArray] = {}
-    for D, a in G.items():
-        for E, b in H.items():
-            result[D + E] = result.get(D + E, 0.0) + a * shift(b, D)
-    return result
-
-
 def lower_band(K: Diagonals) -> FloatArray:
     """(bandwidth + 1, N): the diagonals D ≥ 0 of K as LAPACK stores them, [D, s] = (s + D, s)."""
     N = len(next(iter(K.values())))
@@ -124,11 +97,6 @@ def lower_band(K: Diagonals) -> FloatArray:
         if D >= 0:
             band[D, : N - D] = diagonal[D:]
     return band
-
-
-def diagonals_of(L: FloatArray) -> Diagonals:
-    """The lower band L (bandwidth + 1, N), as LAPACK stores it, by diagonals."""
-    return {D: shift(row, D) for D, row in enumerate(L)}
 
 
 def symmetric_product(G: Diagonals, H: Diagonals, bandwidth: int) -> FloatArray:

@@ -15,7 +15,6 @@ from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.newton import Descent
-from nlsid_core.identification.noise import MOST_NOISE_LAGS, Noise
 from nlsid_core.identification.regressors import lagged, signal_scale
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import prove_stability
@@ -33,19 +32,15 @@ RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeat
 class LinearClass:
     """Linear difference equations of one input and one output. Source: thesis (4.1).
 
-    lags: n of both, 1 to 100 samples. noise_lags: samples over which the noise of the output is
-    correlated, 0 to 200; above 0 the error is weighted by what the residual shows of it, unless
-    that raises the simulation error of validation trials. Raises OptionError, which names an
-    option, its value and what is allowed, as every model class does.
+    lags: n of both, 1 to 100 samples. Raises OptionError, which names an option, its value and
+    what is allowed, as every model class does.
     """
 
     lags: int
-    noise_lags: int = 0
     kind: ClassVar[type[DifferenceEquation]] = DifferenceEquation
 
     def __post_init__(self) -> None:
         require_whole(self, "lags", 1, MOST_LAGS)
-        require_whole(self, "noise_lags", 0, MOST_NOISE_LAGS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +49,7 @@ class Regression:
 
     Signals are scaled to zero mean and unit spread over the dataset, undone once in `model`.
     Y: (N, n+1) with y(t-k) in column k; W: (N, n+2), the input window and a constant, as
-    W = Q R with orthonormal Q; row: (N,) index of the row within its trial. noise: of the output,
-    by which its error is weighted (None: white).
+    W = Q R with orthonormal Q; row: (N,) index of the row within its trial.
     """
 
     Y: FloatArray
@@ -65,7 +59,6 @@ class Regression:
     y_scale: tuple[float, float]
     u_scale: tuple[float, float]
     dataset: Dataset
-    noise: Noise | None = None
 
     @cached_property
     def rows(self) -> Rows:
@@ -77,7 +70,6 @@ class Regression:
             errors=np.asfortranarray(self.Y),
             Q=np.asfortranarray(self.Q),
             identity=np.eye(self.lags + 1)[0],
-            covariance=None if self.noise is None else self.noise.covariance(self.row),
         )
 
     @property
@@ -106,7 +98,7 @@ class Regression:
         )
 
 
-def build_regression(dataset: Dataset, lags: int, *, noise: Noise | None = None) -> Regression:
+def build_regression(dataset: Dataset, lags: int) -> Regression:
     """Stack the lagged rows of every trial of a one-input one-output dataset.
 
     Raises ShapeError if there is more than one input or output, DataError if there are too few
@@ -153,7 +145,6 @@ def build_regression(dataset: Dataset, lags: int, *, noise: Noise | None = None)
         y_scale=y_scale,
         u_scale=u_scale,
         dataset=dataset,
-        noise=noise,
     )
 
 

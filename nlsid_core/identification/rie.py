@@ -17,7 +17,6 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import ShapeError
 from nlsid_core.identification.inequalities import MatrixInequality
 from nlsid_core.identification.newton import Point, minimise, project_columns
 from nlsid_core.identification.state_affine import StateAffineRows
@@ -30,7 +29,7 @@ ROOM = 0.5  # of the first storage function: V exceeds |x - x̃|²_Q by it
 def robust_identification_error(problem: StateAffineRows) -> tuple[StateAffineModel, float]:
     """The model that minimises the RIE, and the RIE itself (scaled, as J).
 
-    Raises ShapeError for weighted rows, SolverError if no minimiser is found.
+    Raises SolverError if no minimiser is found.
     """
     bound = IdentificationErrorBound(problem)
     found = minimise(bound, bound.start(), inequalities=(bound.storage(),))
@@ -42,8 +41,6 @@ class IdentificationErrorBound:
     """Σ ε'(M⁻¹)_νν ε in z = [θ; P's upper triangle], with the interface of `Bound`."""
 
     def __init__(self, problem: StateAffineRows) -> None:
-        if problem.rows.covariance is not None:
-            raise ShapeError("the robust identification error takes no weights; give rows without")
         self.rows, self.problem = problem.rows, problem
         self.outputs = len(problem.y_scale[0])
         self.size = (len(problem.left) - 1) * self.outputs  # of a state

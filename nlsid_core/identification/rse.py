@@ -1,16 +1,15 @@
 """Robust simulation error: convex upper bounds on the simulation error, made exact by iterating.
 
 With G(θ) the banded matrix of the left side over all rows of all trials and ε(θ) the equation
-errors, the simulation error is |G⁻¹ε|². With outputs weighted by W (usually I) and the multiplier
-that is exact at θ_m, P = G_m⁻ᵀW,
-    J_m(θ) = min_p ε' K⁻¹ ε,   K(θ) = G W⁻¹ G_m' + G_m W⁻¹ G' - G_m W⁻¹ G_m'    (first: G_m = I)
+errors, the simulation error is |G⁻¹ε|². With the multiplier that is exact at θ_m, P = G_m⁻ᵀ,
+    J_m(θ) = min_p ε' K⁻¹ ε,   K(θ) = G G_m' + G_m G' - G_m G_m'    (first: G_m = I)
 bounds it from above and equals it at θ_m, so minimising and re-linearising never goes up. K and ε
 are affine in θ. p enters linearly and is projected out: with K = LL', x = K⁻¹ε at the best p and
 v_i = ε_i - K_i x,
     gradient_i = 2 ε_i'x - x'K_i x,   Hessian = 2 |(I - Π) L⁻¹V|²,  Π the projection on L⁻¹Q.
-K is banded (bandwidth n·n_y, and that of W⁻¹): O(N·p·n) a step.
-Source: thesis (4.1)-(4.3), Proposition 4.3 and Section 4.4; |Δ|²_W - 2(PΔ)'(GΔ + ε) with
-Δ = W⁻¹G_m'η is η'G_m W⁻¹G_m'η - 2η'(G W⁻¹G_m'η + ε).
+K is banded (bandwidth n·n_y): O(N·p·n) a step.
+Source: thesis (4.1)-(4.3), Proposition 4.3 and Section 4.4; |Δ|² - 2(PΔ)'(GΔ + ε) with Δ = G_m'η
+is η'G_m G_m'η - 2η'(G G_m'η + ε).
 """
 
 from collections.abc import Iterator
@@ -78,15 +77,15 @@ class Bound:
     def __init__(self, rows: Rows, theta_m: FloatArray | None) -> None:
         self.rows = rows
         G_m = rows.eye if theta_m is None else rows.G(theta_m)
-        self.H = rows.weighed(G_m)
-        self._H = sparse(self.H)
+        self._G_m = G_m
+        self._H = sparse(G_m)
         self._Ht = self._H.T
-        self._constant = -0.5 * symmetric_product(G_m, self.H, rows.bandwidth)
+        self._constant = -0.5 * symmetric_product(G_m, G_m, rows.bandwidth)
 
     def at(self, theta: FloatArray) -> Point:
         """Value and best p; LinAlgError if K(θ) is not positive definite."""
         rows = self.rows
-        K = self._constant + symmetric_product(rows.G(theta), self.H, rows.bandwidth)
+        K = self._constant + symmetric_product(rows.G(theta), self._G_m, rows.bandwidth)
         return project(rows, theta, theta, Factor.of(K))
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +93,7 @@ class Bound:
         return point.derivatives(self.rows.errors, self.slopes(point.x))
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """(N, n_g): K_i x, K_i = G_i H' + H G_i', of every left parameter i."""
+        """(N, n_g): K_i x, K_i = G_i G_m' + G_m G_i', of every left parameter i."""
         rows, ahead = self.rows, self._Ht @ x
         columns, behind = np.empty_like(rows.weights), np.empty(rows.weights.shape)
         for D, group, weights in rows.groups:

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,7 +15,6 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.coloured import fit_in_turn
 from nlsid_core.identification.feedback import (
     FeedbackClass,
     identify_feedback,
@@ -68,7 +66,6 @@ from nlsid_core.identification.monotone import (
     minimise_monotone_simulation_error,
 )
 from nlsid_core.identification.monotone_descent import minimise_certified
-from nlsid_core.identification.noise import Noise
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
@@ -109,15 +106,8 @@ CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: c
 
 
 def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
-    """Difference equations of one input and one output, of white noise or of coloured."""
-    search = partial(_linear, model_class)
-    return fit_in_turn(search, train, model_class.noise_lags, task)
-
-
-def _linear(
-    model_class: LinearClass, train: Dataset, task: Task, noise: Noise | None
-) -> Trail[DifferenceEquation]:
-    regression = build_regression(train, model_class.lags, noise=noise)
+    """Difference equations of one input and one output."""
+    regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
     radius = task.searched_rate
@@ -161,15 +151,8 @@ def _linear(
 def state_affine(
     train: Dataset, model_class: StateAffineClass, task: Task
 ) -> Trail[StateAffineModel]:
-    """State-affine models, of several inputs and outputs, of white noise or of coloured."""
-    search = partial(_state_affine, model_class)
-    return fit_in_turn(search, train, model_class.noise_lags, task)
-
-
-def _state_affine(
-    model_class: StateAffineClass, train: Dataset, task: Task, noise: Noise | None
-) -> Trail[StateAffineModel]:
-    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate, noise=noise)
+    """State-affine models, of several inputs and outputs."""
+    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
     if problem.rows.errors.size > MOST_ENTRIES:
         beside = [m for m in task.comparators if isinstance(m, LeastSquares)]
         left_out = ", ".join(m.name for m in task.comparators if m not in beside)

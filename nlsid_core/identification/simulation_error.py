@@ -1,7 +1,7 @@
 """Simulation error minimisation (SEM): the usual comparator, and a last step for proved models.
 
-With Δ = ŷ - ỹ over all rows, G Δ = -ε: the simulation error |Δ|²_W = |L⁻¹ε|² has the form of the
-robust bound with L = G C, W⁻¹ = CC', instead of a convex K. Its exact sensitivities are
+With Δ = ŷ - ỹ over all rows, G Δ = -ε: the simulation error |Δ|² = |L⁻¹ε|² has the form of the
+robust bound with L = G, instead of a convex K. Its exact sensitivities are
     ∂(L⁻¹ε)/∂θ_i = L⁻¹(ε_i - G_i r),   r = G⁻¹ε = -Δ,
 and p, which enters linearly, is projected out: Gauss-Newton in the left parameters only.
 Nothing makes the minimiser global. Source: thesis Definition 2.2 and Section 1.1.1.
@@ -11,39 +11,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve
 from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.banded import (
     Diagonals,
     Rows,
-    diagonals_of,
     lower_band,
-    product,
     shift,
-    sparse,
 )
 from nlsid_core.identification.newton import Point, Root, project
 
 
 class SimulationError:
-    """|ŷ - ỹ|²_W over all rows in the left parameters θ, where `inside` holds (None: anywhere)."""
+    """|ŷ - ỹ|² over all rows in the left parameters θ, where `inside` holds (None: anywhere)."""
 
     def __init__(self, rows: Rows, *, inside: Callable[[FloatArray], bool] | None = None) -> None:
         self.rows, self.inside = rows, inside
-        self._root: Diagonals | None = None
-        if rows.covariance is not None:
-            band = lower_band(rows.covariance)
-            self._root = diagonals_of(cholesky_banded(band, lower=True, check_finite=False))
 
     def at(self, theta: FloatArray) -> Point:
         """Value and best p; LinAlgError if the simulation diverges or G is singular."""
         if self.inside is not None and not self.inside(theta):
             raise LinAlgError("outside the set that is searched")
-        G = self.rows.G(theta)
-        return project(self.rows, theta, theta, Band.of(G if self._root is None else
-                                                        product(G, self._root)))  # fmt: skip
+        return project(self.rows, theta, theta, Band.of(self.rows.G(theta)))
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
         """Gradient, and the Hessian of Gauss and Newton."""
@@ -59,7 +50,7 @@ class SimulationError:
     def _moved(self, point: Point) -> FloatArray:
         """(N, n): ε_i - G_i r."""
         rows = self.rows
-        r = point.residual if self._root is None else sparse(self._root) @ point.residual
+        r = point.residual
         V = rows.errors.copy(order="F")
         for D, group, weights in rows.groups:
             V[:, group] -= weights * shift(r, D)[:, None]

@@ -14,7 +14,6 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.noise import MOST_NOISE_LAGS, Noise
 from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
 from nlsid_core.models import StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
@@ -43,7 +42,6 @@ class StateAffineClass:
     input_range: (low, high) of each input in its unit, where the model is proved (None: the range
     in the data). on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
     weights: of the squared error of each output in units of its spread, above 0 (None: all equal).
-    noise_lags: samples over which the noise of each output is correlated, as of `LinearClass`.
     """
 
     lags: int
@@ -54,7 +52,6 @@ class StateAffineClass:
     input_range: tuple[tuple[float, float], ...] | None = None
     on_out_of_range: OutOfRange = "clip"
     weights: tuple[float, ...] | None = None
-    noise_lags: int = 0
     kind: ClassVar[type[StateAffineModel]] = StateAffineModel
 
     def __post_init__(self) -> None:
@@ -65,7 +62,6 @@ class StateAffineClass:
         require_ranges(self, "input_range")
         require_one_of(self, "on_out_of_range", get_args(OutOfRange))
         require_weights(self, "weights")
-        require_whole(self, "noise_lags", 0, MOST_NOISE_LAGS)
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""
@@ -150,13 +146,11 @@ def build_state_affine_rows(
     model_class: StateAffineClass,
     *,
     slowest: float = 1.0,
-    noise: Noise | None = None,
 ) -> StateAffineRows:
     """Stack the rows t = n … of every trajectory, signals scaled to zero mean and unit spread.
 
-    slowest: as of `StateAffineRows`. noise: of the outputs, by which their errors are weighted
-    (None: white).
-    Raises DataError if there are too few rows, or the inputs do not excite the right basis.
+    slowest: as of `StateAffineRows`. Raises DataError if there are too few rows, or the inputs do
+    not excite the right basis.
     """
     n = model_class.lags
     short = [trial for trial in dataset if len(trial) <= n]
@@ -204,7 +198,6 @@ def build_state_affine_rows(
         errors=np.asfortranarray(errors),
         Q=np.asfortranarray(np.kron(Q, np.eye(n_y)) if n_y > 1 else Q),
         identity=identity,
-        covariance=None if noise is None else noise.covariance(row),
     )
     return StateAffineRows(
         rows, w, dataset, left, right, R, window, y_scale, u_scale, declared, W,

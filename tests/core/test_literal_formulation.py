@@ -1,4 +1,4 @@
-"""Lemmas 5.2 and 5.3, and the thesis's literal formulation with time in the program."""
+"""The thesis's literal formulation of Lemma 5.2, with time in the program."""
 
 from dataclasses import replace
 from functools import cache
@@ -7,68 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples import one_dimensional, two_lemmas
+from examples import one_dimensional
 from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.closed_loop import closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial import variables
 from nlsid_core.sos import Program, SumOfSquares, solve
-from nlsid_core.sos.search import lower_bound
-
-
-def test_example_5_1_1_is_refused() -> None:
-    """ẋ = 1: V̇ ≤ 0 on V = 1, and yet solutions leave: Lemma 5.2 asks for V̇ < 0 there."""
-    (x,) = variables("x")
-    V = 1 + (x**2 - 1) ** 3
-    assert lower_bound(-V.derivative("x"), equalities=[V - 1], degree=8).value <= 0
-
-
-@pytest.mark.parametrize(("sigma", "proved"), [(0.36, True), (0.26, True), (0.24, False)])
-def test_example_5_1_2_decays_down_to_a_quarter_and_not_below(sigma: float, proved: bool) -> None:
-    if proved:
-        assert two_lemmas.decay(sigma) > 0
-    else:
-        with pytest.raises(Infeasible):
-            two_lemmas.decay(sigma)
-
-
-def test_the_pieces_of_a_funnel_prove_a_lower_floor_than_the_thesis_states() -> None:
-    """σ = 0.36 there; none below 1/4 is true."""
-    assert two_lemmas.LEAST_SIGMA < two_lemmas.pulled_in() < 0.28 < two_lemmas.SIGMA
-
-
-@pytest.mark.parametrize(("last", "proved"), [(1.1, True), (0.8, False)])
-def test_example_5_1_2_shrinks_to_its_published_width_and_not_much_further(
-    last: float, proved: bool
-) -> None:
-    assert (not two_lemmas.invariance(last)[1].unproved) is proved
-
-
-def test_solutions_of_example_5_1_2_obey_both_guarantees() -> None:
-    t = np.linspace(0, two_lemmas.END, 2001)
-    limit = np.sqrt(two_lemmas.FIRST)
-    W = two_lemmas.solutions(np.linspace(-limit, limit, 41), t) ** 2
-    edge = np.interp(t, [0, two_lemmas.END], [two_lemmas.FIRST, two_lemmas.LAST])
-    assert (edge + 1e-9 >= W).all()
-    V = two_lemmas.solutions(np.linspace(-2, 2, 41), t) ** 2 / two_lemmas.LEVEL
-    for start in (0, 300):
-        high = V[:, start] > two_lemmas.SIGMA
-        for row in V[high]:
-            bound = two_lemmas.bound(t[start:], row[start], t[start])
-            assert (row[start:] <= bound + 1e-9).all()
-    assert V.max(axis=0)[0] == 1
-
-
-@pytest.mark.slow
-@pytest.mark.pictures
-def test_the_two_figures_are_drawn_from_what_was_proved(tmp_path: Any) -> None:
-    two_lemmas.draw(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
-
-
-# -- the literal formulation, thesis (6.4) -----------------------------------------------------
 
 
 @cache
