@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.rigorous import Undecided, bound_holds
 from examples import satellite
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import (
@@ -60,7 +59,7 @@ def test_the_number_of_points_is_the_number_of_equalities() -> None:
 
 
 @pytest.mark.slow
-def test_every_l_step_along_the_satellite_is_proved_by_the_kernel_and_shown_in_floats() -> None:
+def test_every_l_step_along_the_satellite_is_proved_by_the_kernel() -> None:
     program = SphereProgram(6)
     steps = satellite.l_steps(satellite.nominal())
     last = None
@@ -71,11 +70,8 @@ def test_every_l_step_along_the_satellite_is_proved_by_the_kernel_and_shown_in_f
         proof = sphere_proof(program, last, g)
         assert 0 < last.m - proof.bound < 1e-9
         assert prove(g, proof.bound, proof) > 0
-        assert shown(g, proof.bound, proof) > 0
         with pytest.raises((CertificateRejected, Infeasible)):
             prove(g, last.upper + 1e-3, proof)
-        with pytest.raises(Undecided):
-            shown(g, last.upper + 1e-3, proof)
 
 
 def prove(g: Polynomial, bound: float, proof: SphereProof) -> float:
@@ -87,27 +83,6 @@ def prove(g: Polynomial, bound: float, proof: SphereProof) -> float:
         equality_multipliers=[proof.multiplier],
     )
     return float(decide(document, {}).margin)
-
-
-def shown(g: Polynomial, bound: float, proof: SphereProof) -> float:
-    return bound_holds(
-        g,
-        bound,
-        proof.gram,
-        equalities=[proof.sphere],
-        equality_multipliers=[proof.multiplier],
-    )
-
-
-def test_a_warm_start_reaches_the_same_margin_in_fewer_iterations() -> None:
-    program = SphereProgram(6)
-    g = random_quartic(6, 4)(program.points)
-    start = program.solve(g, tolerance=1e-5)
-    nearby = g * 1.01 + 0.02
-    warm = program.solve(nearby, tolerance=1e-5, start=start)
-    cold = program.solve(nearby, tolerance=1e-5)
-    assert warm.iterations < cold.iterations
-    assert warm.m == pytest.approx(cold.m, abs=2e-5 * np.ptp(nearby))
 
 
 @pytest.mark.parametrize("degrees", [(1,), (2,), (4,), (0, 2, 4), (1, 2, 3, 4)])

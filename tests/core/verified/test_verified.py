@@ -47,6 +47,8 @@ CORPUS = ROOT / "tests" / "core" / "kernel" / "corpus"
 FUNNELS = CORPUS / "continuous_funnel"
 GAPS = re.compile(r"\b(Admitted|admit|Axioms?|Parameters?|Conjectures?|Unset \w+ Checking)\b")
 
+pytestmark = pytest.mark.timeout(3600)  # the theory is built once, also on a slow machine
+
 needs_coq = pytest.mark.skipif(
     shutil.which("coqc") is None or shutil.which("make") is None,
     reason="Coq is not here (Debian: apt install coq libcoq-bignums make)",
