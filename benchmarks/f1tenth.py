@@ -23,9 +23,9 @@ from benchmarks.machine import parser, tell
 from benchmarks.recorded import is_proved
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.identification import simulation_percent
-from nlsid_core.identification.moment_rie import minimise_moment_rie
-from nlsid_core.identification.moments import MonotoneClass, offsets_of, plain_moments
-from nlsid_core.identification.monotone import identify_from_repeats
+from nlsid_core.identification.polynomial.moment_rie import minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import MonotoneClass, offsets_of, plain_moments
+from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
 from nlsid_core.progress import silent
 from nlsid_core.running.reading import Status

@@ -12,10 +12,13 @@ from pathlib import Path
 from benchmarks.machine import parser, spending, tell
 from benchmarks.recorded import heat_exchanger, percent, proved, single
 from nlsid_core.identification import prove_stability
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.rie import robust_identification_error
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.rie import robust_identification_error
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 TRAINING = 1500

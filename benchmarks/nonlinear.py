@@ -55,7 +55,7 @@ from nlsid_core.identification import (
     describe,
     identify,
 )
-from nlsid_core.identification.cells import Limit
+from nlsid_core.identification.network.cells import Limit
 from nlsid_core.identification.prediction import simulate_trials
 
 SAMPLES = 10_000

@@ -22,14 +22,14 @@ from benchmarks.machine import parser, tell
 from benchmarks.recorded import proved as is_proved
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     Offsets,
     plain_moments,
     repeated_moments,
 )
-from nlsid_core.identification.monotone import (
+from nlsid_core.identification.polynomial.monotone import (
     least_squares_equation,
     minimise_monotone_simulation_error,
     simulate_banded,

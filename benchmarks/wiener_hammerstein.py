@@ -24,8 +24,8 @@ from nlsid_core.identification import (
     identify_block_cascade,
     prove_stability,
 )
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 PERIOD = 1.0 / 51200.0  # s

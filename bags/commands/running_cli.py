@@ -162,15 +162,10 @@ def view(
     bag: Annotated[
         Path | None, typer.Argument(help="A recording to replay; none: the live robot.")
     ] = None,
-    page: Annotated[
-        bool, typer.Option("--page", help="A page for any browser; else a server for Foxglove.")
-    ] = False,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(help="Port; 0: 8765 for Foxglove, 8080 for the page.", min=0, max=65535)
-    ] = 0,
+    port: Annotated[int, typer.Option(help="Port; 0: one that is free.", min=0, max=65535)] = 8080,
     monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
     funnel: Annotated[
         Path | None, typer.Option(help="For a recording: the funnel it is held against.")
@@ -185,13 +180,13 @@ def view(
     command: CommandOption = None,
     period: PeriodOption = 0.0,
 ) -> None:
-    """Show tube, signals, margin, assumption and events, live or of a recording, until Ctrl-C."""
+    """Serve a page of tube, signals, margin and events, live or of a recording, until Ctrl-C."""
     from bags.commands.viewing import view_live, view_recording
 
     if bag is None:
         if importlib.util.find_spec("rclpy") is None:
             raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
-        raise typer.Exit(view_live(monitor, page=page, host=host, port=port))
+        raise typer.Exit(view_live(monitor, host=host, port=port))
     if funnel is None:
         raise typer.BadParameter("a recording is held against a funnel: give --funnel")
     from bags.chain.config import load_config
@@ -203,7 +198,7 @@ def view(
     centre = show.centre_of(load_config(config) if config is not None else None)
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     recording = Recording(documents.load_proved(funnel, wiring=wiring), bag, centre=centre)
-    view_recording(recording, rate, page=page, host=host, port=port)
+    view_recording(recording, rate, host=host, port=port)
 
 
 def demo(

@@ -7,7 +7,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.stability import prove_stability, storage_on
+from nlsid_core.identification.proofs.stability import prove_stability, storage_on
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import Node, parse
 from nlsid_core.kernel.matrix_polynomials import Box

@@ -11,38 +11,8 @@ from scipy.linalg import LinAlgError
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
-from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
-from nlsid_core.identification.cascade_fit import MAX_RADIUS
-from nlsid_core.identification.cells import CellClass, identify_cells
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.feedback import (
-    FeedbackClass,
-    identify_feedback,
-    identify_unproved,
-)
 from nlsid_core.identification.fit import History, Proof, Step
-from nlsid_core.identification.implicit_class import (
-    ImplicitClass,
-    ImplicitRows,
-    build_implicit_rows,
-)
-from nlsid_core.identification.implicit_descent import minimise_certified_implicit
-from nlsid_core.identification.implicit_proof import ImplicitProof
-from nlsid_core.identification.implicit_search import (
-    implicit_equation_error,
-    least_squares_coefficients,
-    minimise_implicit_rie,
-    prove_in_set,
-    refuse_large_program,
-)
-from nlsid_core.identification.linear import (
-    LinearClass,
-    build_regression,
-    least_squares,
-    minimise_simulation_error,
-)
-from nlsid_core.identification.linear_states import LinearStateClass, identify_linear_states
-from nlsid_core.identification.methods import (
+from nlsid_core.identification.methods.options import (
     CertifiedRse,
     CertifiedSem,
     FirstRse,
@@ -53,35 +23,71 @@ from nlsid_core.identification.methods import (
     Rse,
     Sem,
 )
-from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.network.cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.network.cascade_fit import MAX_RADIUS
+from nlsid_core.identification.network.cells import CellClass, identify_cells
+from nlsid_core.identification.network.feedback import (
+    FeedbackClass,
+    identify_feedback,
+    identify_unproved,
+)
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.implicit_descent import minimise_certified_implicit
+from nlsid_core.identification.polynomial.implicit_rie import (
+    implicit_equation_error,
+    least_squares_coefficients,
+    minimise_implicit_rie,
+    prove_in_set,
+    refuse_large_program,
+)
+from nlsid_core.identification.polynomial.implicit_rows import (
+    ImplicitClass,
+    ImplicitRows,
+    build_implicit_rows,
+)
+from nlsid_core.identification.polynomial.linear import (
+    LinearClass,
+    build_regression,
+    least_squares,
+    minimise_simulation_error,
+)
+from nlsid_core.identification.polynomial.linear_states import (
+    LinearStateClass,
+    identify_linear_states,
+)
+from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     offsets_of,
     plain_moments,
     refuse_unexcited,
 )
-from nlsid_core.identification.monotone import (
+from nlsid_core.identification.polynomial.monotone import (
     identify_from_repeats,
     least_squares_equation,
     minimise_monotone_simulation_error,
 )
-from nlsid_core.identification.monotone_descent import minimise_certified
+from nlsid_core.identification.polynomial.monotone_descent import minimise_certified
+from nlsid_core.identification.polynomial.rie import robust_identification_error
+from nlsid_core.identification.polynomial.rows import (
+    StateAffineClass,
+    StateAffineRows,
+    build_state_affine_rows,
+)
 from nlsid_core.identification.prediction import Model
-from nlsid_core.identification.rie import robust_identification_error
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.stability import prove_stability
+from nlsid_core.identification.proofs.stability import prove_stability
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof
 from nlsid_core.identification.starts import (
     as_implicit,
     as_monotone,
     linear_start,
     reflected,
     stable_starts,
-)
-from nlsid_core.identification.state_affine import (
-    StateAffineClass,
-    StateAffineRows,
-    build_state_affine_rows,
 )
 from nlsid_core.identification.trail import Task, Trail
 from nlsid_core.identification.validation import hold_out, simulation_percent

@@ -22,7 +22,7 @@ from nlsid_core.identification import (
     Rse,
     StateAffineClass,
 )
-from nlsid_core.identification.methods import alike
+from nlsid_core.identification.methods.options import alike
 
 LEAST_OPTIONS: dict[type, dict[str, Any]] = {
     LinearClass: {"lags": 1}, StateAffineClass: {"lags": 2}, MonotoneClass: {"lags": 1},

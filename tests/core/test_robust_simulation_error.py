@@ -7,21 +7,24 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.newton import (
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.newton import (
     Descent,
     Repulsion,
     SchurBarrier,
     minimise,
     smallest_eigenvalues,
 )
-from nlsid_core.identification.prediction import one_step_residual
-from nlsid_core.identification.rie import IdentificationErrorBound, robust_identification_error
-from nlsid_core.identification.rse import Bound, robust_simulation_error
-from nlsid_core.identification.state_affine import (
+from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
+from nlsid_core.identification.polynomial.rie import (
+    IdentificationErrorBound,
+    robust_identification_error,
+)
+from nlsid_core.identification.polynomial.rows import (
     StateAffineClass,
     build_state_affine_rows,
 )
+from nlsid_core.identification.prediction import one_step_residual
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
 SOLVER = 1e-6  # agreement with a cone solver's optimum

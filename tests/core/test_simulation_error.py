@@ -17,23 +17,25 @@ from nlsid_core.identification import (
     LinearClass,
     Rse,
     identify,
-    newton,
     prove_stability,
-    rse,
     trail,
 )
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.linear import (
+from nlsid_core.identification.methods import newton, rse
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.linear import (
     build_regression,
     least_squares,
     minimise_simulation_error,
 )
-from nlsid_core.identification.rse import Bound, robust_simulation_error
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.searches import _tried
-from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.starts import companion, reduced, reflected, stable_starts
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check

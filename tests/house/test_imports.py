@@ -43,7 +43,6 @@ SOLVERS_KNOWN_TO = {
     "nlsid_core/conic.py": SOLVERS,
     "nlsid_core/design/tube_program.py": {"cvxpy"},  # a few small ones a funnel
 }
-SYMPY_EDGE = "nlsid_core/polynomial/sympy_edge.py"  # optional, and imported by nobody inside
 BAG_FORMATS = {"rosbags", "mcap"}
 
 
@@ -200,8 +199,6 @@ def test_the_core_stands_on_numpy_and_the_search_on_scipy() -> None:
         allowed = {"numpy", "nlsid_core", *sys.stdlib_module_names}
         if room(source) in BANDS["search"]:
             allowed |= {"scipy"} | SOLVERS_KNOWN_TO.get(str(source), set())
-        if str(source) == SYMPY_EDGE:
-            allowed |= {"sympy"}
         offenders += [f"{source}: {name}" for name in sorted(source.packages - allowed)]
     assert not offenders
 
