@@ -2,7 +2,7 @@
 
 python -m benchmarks.bridge_live [--seconds 60] [--json]
 
-The chain of `nlsid track run` on a swing out and back, then its funnel is tracked again and again,
+The chain of `nlsid demo` on a swing out and back, then its funnel is tracked again and again,
 pushed once in the middle. Beside what was heard live: the replay of the recorded bag, which has to
 say the same bit for bit.
 """
@@ -243,10 +243,10 @@ def _operator(stack: ExitStack) -> tuple[Node, Callable[[Callable[[], object]], 
 
 
 def design_swing(folder: Path) -> Path:
-    """`nlsid track run` on the swing; the folder of its funnel."""
+    """`nlsid demo` on the swing; the folder of its funnel."""
     out = folder / "design"
-    command = [sys.executable, "-m", "bags.commands.cli", "track", "run"]
-    options = ["--config", str(swing_config(folder)), "--out", str(out)]
+    command = [sys.executable, "-m", "bags.commands.cli", "demo"]
+    options = ["--robot", str(swing_config(folder)), "--out", str(out)]
     done = subprocess.run(command + options, capture_output=True, text=True, check=False)
     if done.returncode:
         raise NlsidError(f"the design failed: {done.stdout[-2000:]} {done.stderr[-2000:]}")

@@ -32,9 +32,9 @@ FORMER = {
     "nlsid identify": "incremental_stability state_affine_stability block_cascade_stability "
     "monotone_equation_stability implicit_stability well_posedness",
     "nlsid funnel": "energy_tube",
-    "nlsid track": "discrete_funnel implicit_funnel",
+    "nlsid funnel of a motion": "discrete_funnel implicit_funnel",
     "nlsid funnel --problem": "trajectory_funnel",
-    "nlsid compose": "funnel_composition",
+    "nlsid funnel --compose": "funnel_composition",
     "the search that wrote it": "matrix_inequality polynomial_bound region_of_attraction",
 }
 

@@ -250,7 +250,7 @@ def test_the_face_hands_names_on_and_loads_nothing_before_one_is_used() -> None:
 
 def test_help_and_check_start_without_numpy(tmp_path: Path) -> None:
     (tmp_path / "x.proof.json").write_text("{}")
-    for arguments in (["--help"], ["track", "--help"], ["check", str(tmp_path / "x.proof.json")]):
+    for arguments in (["--help"], ["bag", "--help"], ["check", str(tmp_path / "x.proof.json")]):
         loaded = modules_loaded_by(
             "from contextlib import redirect_stdout, suppress\n"
             "import io; from bags.commands.cli import app\n"

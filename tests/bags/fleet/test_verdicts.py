@@ -154,12 +154,12 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     (tmp_path / "fleet" / "robot_2" / "cut.mcap").write_bytes(b"no bag")
     pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
     table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
-    given = ["--funnel", str(design), "--out", str(table), "--manifest", str(kept)]
-    done = CliRunner().invoke(app, ["fleet", "monitor", pattern, *given])
+    given = ["--out", str(table), "--manifest", str(kept)]
+    done = CliRunner().invoke(app, ["fleet", "monitor", str(design.parent), pattern, *given])
     assert done.exit_code == 1, done.output
     assert "robot_2/cut: " in done.output
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
-    assert f"nlsid view {worst} --page --funnel {design}" in done.output
+    assert f"nlsid view {design.parent} {worst}" in done.output
     assert "is not an MCAP file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
@@ -222,9 +222,10 @@ def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: P
     drive(fleet / "a[bold][/red]\x1b[2J.mcap", samples=117)
     (fleet / "b[").mkdir()  # the rest of the name is after a slash
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
-    check, monitor = ["check", "--config", str(CONFIG)], ["monitor", "--funnel", str(design)]
+    where = [str(design.parent), str(fleet)]
+    check, monitor = ["check", *where, "--config", str(CONFIG)], ["monitor", *where]
     for given, status in ((check, 2), (monitor, 2)):  # one was not read
-        done = CliRunner().invoke(app, ["fleet", *given, str(fleet)], env={"COLUMNS": "200"})
+        done = CliRunner().invoke(app, ["fleet", *given], env={"COLUMNS": "200"})
         assert done.exit_code == status, done.output
         assert "a[bold][" in done.output
         assert "red]\N{REPLACEMENT CHARACTER}[2J" in done.output
@@ -325,7 +326,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     spoiled: Path, design: Path, tmp_path: Path
 ) -> None:
     pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
-    given = (pattern, "--funnel", str(design), "--manifest", kept)
+    given = (str(design.parent), pattern, "--manifest", kept)
     _, lines = fleet_command("monitor", *given, columns=80)
     said = "\n".join(lines)
     assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
