@@ -1,4 +1,4 @@
-"""Real recordings through the steps for a measured state: what could be proved, what was refused, and why.
+"""Real recordings of measured states: what could be proved, what was refused, and why.
 
 python -m benchmarks.bridge_recordings --data DIR [--json]
 

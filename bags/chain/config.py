@@ -266,7 +266,7 @@ class Config(Section):
         tuple[Identification, ...],
         Field(strict=False),
         Key(
-            "sections like `identification` that `nlsid identify --compare` scores (default: that one)",
+            "sections like `identification` that `nlsid identify --compare` scores (default: it)",
             example=[{"lags": 2}, {"model": "monotone", "lags": 2}],
         ),
     ] = ()

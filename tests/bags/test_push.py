@@ -1,4 +1,4 @@
-"""Bags of a robot with a friction, equations without, and the funnel that is proved between them."""
+"""Bags of a robot with a friction, equations without, and the funnel between them."""
 
 import re
 from dataclasses import replace
