@@ -420,7 +420,7 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
         proposal.walls.append(
             "one bag: a tube is designed on one trial and its level measured on another; record "
-            "more, or cut it: nlsid bag split BAG --out PART --every 5"
+            "more, or cut it: nlsid bag convert BAG --every 5"
         )
 
 

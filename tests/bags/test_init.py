@@ -729,7 +729,7 @@ def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seco
     said = nlsid("init", tmp_path / "one", bag, "--yes")
     assert "mind: one bag" in said
     parts.mkdir()
-    nlsid("bag", "split", bag, "--out", parts / "part", "--every", seconds)
+    nlsid("bag", "convert", bag, "--out", parts / "part", "--every", seconds)
     config = tmp_path / "robot.yaml"
     nlsid("init", config.parent, parts, "--yes")
     assert load_config(config).clock == "header"
