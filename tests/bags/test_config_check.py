@@ -25,7 +25,7 @@ PAGE = ROOT / "docs" / "configuration.md"
 
 def check(*arguments: object, status: int = 0) -> str:
     path, *bags = arguments
-    given = ["identify", "DIR", *map(str, bags or f1tenth()[:1]), "--config", str(path), "--check"]
+    given = ["identify", "DIR", *map(str, bags or f1tenth()), "--config", str(path), "--check"]
     done = CliRunner().invoke(app, given)
     assert done.exit_code == status, done.output
     return done.output
