@@ -193,9 +193,16 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
     for what in found.lost:
         out.print(f"lost: {what}", soft_wrap=True, markup=False)
+    if found.lost:
+        verdict = f"{len(found.lost)} losses, as said above"
+    elif found.statements:
+        verdict = f"nothing was lost of what {' and '.join(found.statements)} state"
+    else:
+        verdict = (
+            "whether messages are missing is not known: the bag does not state how many it had"
+        )
     out.print(
-        f"wrote {found.out}, {found.messages} messages, read back and compared; "
-        + ("nothing was lost" if not found.lost else f"{len(found.lost)} places were lost"),
+        f"wrote {found.out}, {found.messages} messages, read back and compared; {verdict}",
         soft_wrap=True,
         markup=False,
     )
@@ -250,6 +257,7 @@ def export_command(
             out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
         for what in rows.left_out:
             out.print(f"left out: {what}", soft_wrap=True, markup=False)
+        _say_notes(rows.notes)
         return
     if not signals:
         raise BagError("a common grid needs to know which signals: --signal")
@@ -306,13 +314,11 @@ def convert(
         )
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
         if is_split:
-            parts = edit.split(folders[0], target, repeats=repeats, every=every, progress=progress)
-            said = [f"wrote {part}" for part in parts]
+            copied = edit.split(folders[0], target, repeats=repeats, every=every, progress=progress)
         elif len(folders) > 1:
-            count = edit.merge(folders, target, progress=progress)
-            said = [f"wrote {target}, {count} messages"]
+            copied = edit.merge(folders, target, progress=progress)
         else:
-            count = edit.cut(
+            copied = edit.cut(
                 folders[0],
                 target,
                 start=start,
@@ -322,9 +328,11 @@ def convert(
                 definitions=_definitions(definitions),
                 progress=progress,
             )
-            said = [f"wrote {target}, {count} messages"]
-    for line in said:
-        out.print(line, soft_wrap=True, markup=False)
+    for part in copied.parts:
+        out.print(f"wrote {part}", soft_wrap=True, markup=False)
+    if not copied.parts:
+        out.print(f"wrote {target}, {copied.messages} messages", soft_wrap=True, markup=False)
+    _say_notes(copied.notes)
 
 
 @bag_app.command("import")
@@ -383,6 +391,11 @@ def import_command(
             "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
             soft_wrap=True, markup=False,
         )  # fmt: skip
+
+
+def _say_notes(notes: "Sequence[str]") -> None:
+    for note in notes:
+        out.print(f"not as stated: {note}", soft_wrap=True, markup=False)
 
 
 def _beside(bag: Path, what: str) -> Path:
