@@ -33,6 +33,8 @@ CASES = SHARED.parent / "cases" / "bags"
 STEP_NS = 20_000_000
 needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="needs cases/bags in ../shared")
 
+COPIES = [("convert", []), ("convert", ["--every", "10"]), ("recover", [])]
+
 
 def run(*arguments: object) -> tuple[int, str]:
     """Status and words of `nlsid bag`; an error that `nlsid` says in a line is status 2."""
@@ -185,11 +187,10 @@ def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path)
 
 
 @needs_cases
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str) -> None:
-    more = ["--every", "10"] if how == "split" else []
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str, more: list[str]) -> None:
     run(how, CASES / "what_a_copy_loses" / "a.mcap", "--out", tmp_path / "copy", *more)
-    copy = tmp_path / ("copy_01" if how == "split" else "copy")
+    copy = tmp_path / ("copy_01" if more else "copy")
     said = run("info", copy)[1]
     for word in ("/quiet", "3 sequence numbers are missing", "robot: x"):
         assert word in said
@@ -523,8 +524,8 @@ def test_one_damaged_topic_of_ros_1_does_not_spoil_the_others(tmp_path: Path) ->
     assert read_signals(tmp_path / "all", ["speed:data"])["speed:data"].values.tolist() == ramp(10)
 
 
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str, more: list[str]) -> None:
     channels = [
         ("/t", "p/msg/V", "ros2msg", text, "cdr")
         for text in ("float64 a\nfloat64 b", "float64 b\nfloat64 a")
@@ -535,10 +536,9 @@ def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
         for k in range(10)
     ]
     bag = mcap_bag(tmp_path / "a.mcap", channels, rows)
-    more = ["--every", "10"] if how == "split" else []
     run(how, bag, "--out", tmp_path / "copy", *more)
     found = []
-    with Bag(tmp_path / ("copy_01" if how == "split" else "copy")) as copy:
+    with Bag(tmp_path / ("copy_01" if more else "copy")) as copy:
         for channel, batch in copy.batches():
             types = types_in_bag(channel.msgtype, channel.definition)
             messages = [decode(batch.data(k), channel.msgtype, types) for k in range(len(batch))]
@@ -656,7 +656,7 @@ def test_nothing_was_lost_is_not_said_where_counts_differ(tmp_path: Path, stated
         lambda text: text.replace("message_count: 50", f"message_count: {stated}"),
         tmp_path / "trial",
     )
-    for how in ("cut", "export", "recover", "info"):
+    for how in ("convert", "export", "recover", "info"):
         out = [] if how == "info" else ["--out", tmp_path / how]
         status, said = run(how, bag, *out)
         assert f"states {stated} messages, 50 are there" in said
