@@ -283,7 +283,7 @@ def fleet_command(verb: str, *given: str, columns: int = 80) -> tuple[int, list[
 
 @pytest.mark.parametrize("columns", [80, 140])
 def test_check_puts_first_what_the_next_step_refuses(spoiled: Path, columns: int) -> None:
-    given = (str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
+    given = ("DIR", str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
     status, lines = fleet_command("check", *given, columns=columns)
     assert status == 1
     assert lines[0] == "15 bags: 3 not read, 2 bad, 1 copy, 0 look, 9 good"
@@ -375,7 +375,7 @@ def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_p
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     for k in range(2):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, held=0.25)
-    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines == [
         "2 bags: 0 not read, 0 bad, 0 copies, 0 look, 2 good",
@@ -388,7 +388,7 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
 ) -> None:
     for k, lost in enumerate((3, 0, None)):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, lost=lost)
-    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
     assert lines[1].split() == [
