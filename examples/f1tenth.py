@@ -1,6 +1,7 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
-from nlsid import LinearClass, Monitor, OutputTube, Status, design, f1tenth, identify, read_bags
+from bags.samples import f1tenth
+from nlsid import LinearClass, Monitor, OutputTube, Status, design, identify, read_bags
 from nlsid_core.identification import simulation_percent
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]

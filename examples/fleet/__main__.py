@@ -20,7 +20,7 @@ from pathlib import Path
 
 import boto3
 
-from nlsid import f1tenth
+from bags.samples import f1tenth
 
 BUCKET = "fleet"
 CONFIG = Path(__file__).with_name("robot.yaml")
