@@ -337,7 +337,7 @@ def convert(
 
 @bag_app.command("import")
 def import_command(
-    tables: Annotated[list[Path], typer.Argument(help="CSV, MAT or HDF5 files.")],
+    tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
