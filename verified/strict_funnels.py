@@ -155,16 +155,12 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     need(len(set(inputs)) == len(inputs), "limits: an input twice")
     need(all(low < high for _, low, high in rows), "limits: low >= high")
     claim, limits = document["claim"], len(rows)
-    members(claim, "claim", "kind about", "goal hold error decay")
+    members(claim, "claim", "kind about", "goal hold error")
     if "goal" in claim:
         members(claim["goal"], "goal", "centre P")
         reals(claim["goal"]["centre"], "goal", n)
         matrix(claim["goal"]["P"], "goal", n, n)
-    held, decays, errors = "hold" in claim, "decay" in claim, [Fraction(0)]
-    if decays:
-        members(claim["decay"], "decay", "rate floor")
-        need(real(claim["decay"]["rate"], "rate") > 0, "decay: rate > 0")
-        need(0 <= real(claim["decay"]["floor"], "floor") < 1, "decay: 0 <= floor < 1")
+    held, errors = "hold" in claim, [Fraction(0)]
     if held:
         need(real(claim["hold"], "hold") > 0, "hold > 0")
     if "error" in claim:
@@ -175,21 +171,18 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
         for e in row[1 + n : 1 + n + m]
     )  # fmt: skip
     need(affine or not claim.keys() & {"hold", "error"}, "the equations are not affine in an input")
-    required = "basis pieces" + " margin multiplier" * (not decays)
-    required += " sides" * (limits > 0 or held or decays)
+    required = "basis pieces margin multiplier" + " sides" * (limits > 0 or held)
     required += " goal_multiplier" * ("goal" in claim) + " rates rate_pieces" * held
     proof = members(document["proof"], "proof", required, "kappa" if uncertain else "")
-    if not decays:
-        need(real(proof["margin"], "margin") > 0, "the margin should be > 0")
+    need(real(proof["margin"], "margin") > 0, "the margin should be > 0")
     if "goal" in claim:
         real(proof["goal_multiplier"], "goal_multiplier")
     if "kappa" in proof:
         for row in matrix(proof["kappa"], "kappa", intervals, uncertain):
             need(min(row) > 0, "kappa > 0")
-    terms = 0 if decays else len(monomials(proof["multiplier"], "multiplier", n))
-    sizes = basis(proof["basis"], "basis", n), terms
-    sides = basis(proof["sides"], "sides", n) if limits or held or decays else 0
-    modes = " mode" * (limits > 0) + " tau" * (limits > 0 or decays)
+    sizes = basis(proof["basis"], "basis", n), len(monomials(proof["multiplier"], "multiplier", n))
+    sides = basis(proof["sides"], "sides", n) if limits or held else 0
+    modes = " mode tau" * (limits > 0)
     corners = 2**m if held or any(errors) else 1
 
     def place(piece: dict[str, Any], vertices: int, taus: int) -> None:
@@ -207,11 +200,8 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
 
     vertices = corners * (1 if "kappa" in proof else 2**uncertain)
     for piece in listed(proof["pieces"], "pieces", 0, PIECES):
-        names = "interval vertex level index columns squares" + " mu" * (not decays)
-        members(piece, "piece", names + modes)
-        place(piece, vertices, limits + 2 * decays)
-        if decays:
-            continue
+        members(piece, "piece", "interval vertex level index columns squares mu" + modes)
+        place(piece, vertices, limits)
         mu = members(piece["mu"], "mu", "shifts start end")
         for name in ("shifts", "start", "end"):
             for entry in listed(mu[name], name, sizes[1], sizes[1]):
