@@ -397,6 +397,7 @@ def verdict_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator
     ]
     required = {"stale_after": PATIENT, "require_monitor": True, "monitor_patience": STALE}
     rig.said.clear()
+    rig.node.destroy_publisher(rig.command)
     chosen = [case for case in cases if only in case[0]]
     if chosen:
         with python(*node(CONTROLLER, highest=0.4, **required)):
@@ -472,6 +473,7 @@ def _held(rig: Rig, name: str, text: str, period: float, said: dict[str, str]) -
         python(*node(MONITOR, **given)),
         python(*node(CONTROLLER, lowest=-9.0, highest=9.0, **given)),
     ):
+        rig.node.destroy_publisher(rig.command)
         rig.design.publish(String(data=text))
         ready = "^(idle$|design refused)"
         rig.need("the controller", lambda: rig.has_said(CONTROLLER, ready) >= 0)
@@ -613,6 +615,7 @@ def design_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[
     names = [name for name, _, _ in bundles(good, other)] + [name for name, _ in seconds]
     if not any(only in name for name in names):
         return
+    rig.node.destroy_publisher(rig.command)  # from here on the controller's are the only commands
     rig.said.clear()
     stale = {"stale_after": PATIENT}
     with ExitStack() as stack:
