@@ -209,7 +209,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
     for what in found.lost:
         out.print(f"lost: {what}", soft_wrap=True, markup=False)
     if found.lost:
-        verdict = f"{len(found.lost)} losses, as said above"
+        verdict = "what was lost is said above"
     elif found.statements:
         verdict = f"nothing was lost of what {' and '.join(found.statements)} state"
     else:

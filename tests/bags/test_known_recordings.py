@@ -10,6 +10,7 @@ import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from bags.commands.bag_cli import bag_app
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types, types_in_bag
 from bags.signals.reader import read_signals
+from bags.tools.info import bag_info
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import CMD_TYPE, START_NS, command, speed_bag
@@ -364,7 +366,8 @@ def test_a_message_that_cannot_be_unpacked_is_named_and_left_out_of_copies(tmp_p
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
 def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: str) -> None:
-    plain = tmp_path / f"a{suffix}"
+    plain = tmp_path / "run" / f"a{suffix}"
+    plain.parent.mkdir()
     rows = [float_message(k) for k in range(20)]
     if suffix == ".mcap":
         mcap_bag(plain, [FLOAT], ((0, START_NS + k, data) for k, data in enumerate(rows)))
@@ -372,10 +375,12 @@ def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: 
         sqlite_bag(plain, [("/x", FLOAT[1], data) for data in rows])
     else:
         ros1_bag(plain, [(0, data[4:]) for data in rows])
-    packed = tmp_path / f"a{suffix}.zstd"
+    packed = plain.with_name(f"{plain.name}.zstd")
     packed.write_bytes(zstd(plain.read_bytes()))
+    plain.unlink()
     signal = "speed:data" if suffix == ".bag" else "/x:data"
     assert read_signals(packed, [signal])[signal].values.tolist() == ramp(20)
+    assert "20 messages" in run("info", packed.parent)[1]
     packed.write_bytes(packed.read_bytes()[:-40])
     with pytest.raises(BagError, match=packed.name):
         read_signals(packed, [signal])
@@ -700,3 +705,46 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
     run("merge", tmp_path / "one", merged, "--out", tmp_path / "both")
     assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
+
+
+def test_of_a_damaged_sqlite_file_both_ends_come_back(tmp_path: Path) -> None:
+    rows = [("/x", FLOAT[1], float_message(k)) for k in range(3000)]
+    file = sqlite_bag(tmp_path / "a.db3", rows)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2 // 4096 * 4096
+    content[middle : middle + 8192] = b"\xab" * 8192
+    file.write_bytes(content)
+    with pytest.raises(BagError, match=file.name):
+        read_signals(file, ["/x:data"])
+    found = recover(file, tmp_path / "whole")
+    assert 2500 < found.messages < 3000
+    assert "messages from" in found.lost[0]
+    values = read_signals(tmp_path / "whole", ["/x:data"])["/x:data"].values
+    assert {0.0, 2999.0} < set(values) < set(ramp(3000))
+    file.write_bytes(content[: middle - 100])
+    cut = recover(file, tmp_path / "cut")
+    assert 1000 < cut.messages < 2000
+    assert any("bytes are not there" in what for what in cut.lost)
+
+
+@pytest.mark.parametrize("form", ["sqlite", "ros1", "mcap", "zstd"])
+def test_any_changed_byte_ends_in_a_reading_or_an_error_that_names_the_file(
+    tmp_path: Path, form: str
+) -> None:
+    rows = [float_message(k) for k in range(30)]
+    plain = tmp_path / "a.mcap"
+    if form == "sqlite":
+        sqlite_bag(plain, [("/x", FLOAT[1], data) for data in rows])
+    elif form == "ros1":
+        ros1_bag(plain, [(0, data[4:]) for data in rows], compression="bz2")
+    else:
+        mcap_bag(plain, [FLOAT], ((0, START_NS + k, data) for k, data in enumerate(rows)))
+    content = plain.read_bytes() if form != "zstd" else zstd(plain.read_bytes())
+    rng = np.random.default_rng(2)
+    for k in range(60):
+        changed = bytearray(content)
+        changed[int(rng.integers(len(content)))] ^= int(rng.integers(1, 256))
+        plain.write_bytes(changed)
+        for act in (lambda: bag_info(plain), lambda k=k: recover(plain, tmp_path / f"out_{k}")):
+            with suppress(BagError):
+                act()
