@@ -35,6 +35,8 @@ CASES = SHARED.parent / "cases" / "bags"
 STEP_NS = 20_000_000
 needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="needs cases/bags in ../shared")
 
+COPIES = [("convert", []), ("convert", ["--every", "10"]), ("recover", [])]
+
 
 def run(*arguments: object) -> tuple[int, str]:
     """Status and words of `nlsid bag`; an error that `nlsid` says in a line is status 2."""
@@ -155,7 +157,7 @@ def test_integers_keep_every_digit_and_their_types(tmp_path: Path) -> None:
 @needs_cases
 def test_what_else_the_known_recordings_are_to_say(tmp_path: Path) -> None:
     assert "100 messages, 60 are there" in run("info", CASES / "counts_disagree" / "a")[1]
-    cut = run("cut", CASES / "counts_disagree" / "a", "--out", tmp_path / "c")
+    cut = run("convert", CASES / "counts_disagree" / "a", "--out", tmp_path / "c")
     assert "100 messages, 60 are there" in cut[1]
     signals = run("signals", CASES / "no_slash" / "a.bag")[1]
     assert "speed:data" in signals
@@ -175,23 +177,22 @@ def test_what_else_the_known_recordings_are_to_say(tmp_path: Path) -> None:
 @needs_cases
 def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path) -> None:
     source = CASES / "two_definitions" / "a.mcap"
-    run("cut", source, "--out", tmp_path / "cut", "--end", "0.1")
+    run("convert", source, "--out", tmp_path / "cut", "--end", "0.1")
     assert exported(tmp_path / "cut", tmp_path / "e", "t", "a") == [1.0] * 5
-    run("split", source, "--out", tmp_path / "part", "--every", "0.2")
+    run("convert", source, "--out", tmp_path / "part", "--every", "0.2")
     for copy in (tmp_path / "part_01", tmp_path / "part_02"):
         values = read_signals(copy, ["/t:a", "/t:b"])
         assert set(values["/t:a"].values) == {1.0}
         assert set(values["/t:b"].values) == {2.0}
-    run("merge", source, "--out", tmp_path / "all")
+    run("convert", source, "--out", tmp_path / "all")
     assert "parts with different definitions" in run("info", tmp_path / "all")[1]
 
 
 @needs_cases
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str) -> None:
-    more = ["--every", "10"] if how == "split" else []
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str, more: list[str]) -> None:
     run(how, CASES / "what_a_copy_loses" / "a.mcap", "--out", tmp_path / "copy", *more)
-    copy = tmp_path / ("copy_01" if how == "split" else "copy")
+    copy = tmp_path / ("copy_01" if more else "copy")
     said = run("info", copy)[1]
     for word in ("/quiet", "3 sequence numbers are missing", "robot: x"):
         assert word in said
@@ -434,7 +435,7 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
     data = bytes(types.serialize_cdr(message, kind))
     bag = sqlite_bag(tmp_path / "a.db3", [("/x", kind, data)] * 3, release=release)
     assert read_signals(bag, [signal], clock="log time")[signal].values == pytest.approx(wanted)
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     assert read_signals(tmp_path / "cut", [signal], clock="log time")[signal].values[0] == wanted
 
 
@@ -456,7 +457,7 @@ def test_definitions_are_read_whatever_their_lines_end_with(
     data = b"\0\1\0\0" + struct.pack("<iId", 1, 2, 0.5)
     bag = mcap_bag(tmp_path / "a.mcap", [("/x", "p/msg/L", form, text, "cdr")], [(0, 5, data)])
     assert read_signals(bag, ["/x:i.a"])["/x:i.a"].values.tolist() == [0.5]
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     assert read_signals(tmp_path / "cut", ["/x:i.a"])["/x:i.a"].values.tolist() == [0.5]
 
 
@@ -513,7 +514,7 @@ def test_definitions_and_padding_of_ros_1_are_read_as_they_come(
     channel = ("/x", f"{package}/{name}", "ros1msg", text, "ros1")
     mcap = mcap_bag(tmp_path / "a.mcap", [channel], [(0, 5, data)])
     assert read_signals(mcap, [f"/x:{field}"])[f"/x:{field}"].values.tolist() == [0.5]
-    run("merge", mcap, "--out", tmp_path / "copy")
+    run("convert", mcap, "--out", tmp_path / "copy")
     assert read_signals(tmp_path / "copy", [f"/x:{field}"])[f"/x:{field}"].values[0] == 0.5
 
 
@@ -524,12 +525,12 @@ def test_one_damaged_topic_of_ros_1_does_not_spoil_the_others(tmp_path: Path) ->
     assert "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1" in run("info", bad)[1]
     status, said = run("export", bad, "--out", tmp_path / "out")
     assert (status, "nothing was exported" in said) == (2, True)
-    run("merge", good, bad, "--out", tmp_path / "all")
+    run("convert", good, bad, "--out", tmp_path / "all")
     assert read_signals(tmp_path / "all", ["speed:data"])["speed:data"].values.tolist() == ramp(10)
 
 
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str, more: list[str]) -> None:
     channels = [
         ("/t", "p/msg/V", "ros2msg", text, "cdr")
         for text in ("float64 a\nfloat64 b", "float64 b\nfloat64 a")
@@ -540,10 +541,9 @@ def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
         for k in range(10)
     ]
     bag = mcap_bag(tmp_path / "a.mcap", channels, rows)
-    more = ["--every", "10"] if how == "split" else []
     run(how, bag, "--out", tmp_path / "copy", *more)
     found = []
-    with Bag(tmp_path / ("copy_01" if how == "split" else "copy")) as copy:
+    with Bag(tmp_path / ("copy_01" if more else "copy")) as copy:
         for channel, batch in copy.batches():
             types = types_in_bag(channel.msgtype, channel.definition)
             messages = [decode(batch.data(k), channel.msgtype, types) for k in range(len(batch))]
@@ -556,7 +556,7 @@ def test_a_schema_that_is_not_read_is_copied_as_it_is(tmp_path: Path) -> None:
     bag = mcap_bag(
         tmp_path / "a.mcap", [channel, FLOAT], [(0, 1, b"xyz"), (1, 2, float_message(0))]
     )
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     with Bag(bag) as before, Bag(tmp_path / "cut") as after:
         assert [c.definition for c in before.channels] == [c.definition for c in after.channels]
         assert [m.data for m in before.messages()] == [m.data for m in after.messages()]
@@ -665,7 +665,7 @@ def test_nothing_was_lost_is_not_said_where_counts_differ(tmp_path: Path, stated
         lambda text: text.replace("message_count: 50", f"message_count: {stated}"),
         tmp_path / "trial",
     )
-    for how in ("cut", "export", "recover", "info"):
+    for how in ("convert", "export", "recover", "info"):
         out = [] if how == "info" else ["--out", tmp_path / how]
         status, said = run(how, bag, *out)
         assert f"states {stated} messages, 50 are there" in said
@@ -701,13 +701,13 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
         writer.add_metadata("calibration", {"k": "1"})
         writer.finish()  # type: ignore[no-untyped-call]
     assert channel[0] == "/cmd"
-    run("cut", file, "--out", tmp_path / "one")
-    run("merge", tmp_path / "one", "--out", tmp_path / "two")
+    run("convert", file, "--out", tmp_path / "one")
+    run("convert", tmp_path / "one", "--out", tmp_path / "two")
     assert "4 sequence numbers are missing" in run("info", tmp_path / "two")[1]
     with Bag(tmp_path / "two") as bag:
         assert len(list(bag.kept_beside)) == 2
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
-    run("merge", tmp_path / "one", merged, "--out", tmp_path / "both")
+    run("convert", tmp_path / "one", merged, "--out", tmp_path / "both")
     assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
 
 
