@@ -7,7 +7,7 @@ Source: M. Tobenkin, PhD thesis, MIT, 2014, Example 2.3.1.
 
 import numpy as np
 
-from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 

@@ -26,7 +26,6 @@ POLICY = "policy.json"
 FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
 COMPOSITION = "composition.proof.json"  # of funnels that follow each other, its stages beside it
-HYBRID = "hybrid.proof.json"  # of funnels that jump into each other, stages and jumps beside it
 
 D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
 P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)
@@ -103,9 +102,9 @@ def load_design(folder: Path | str) -> AnyDesign:
     proof itself pass through.
     """
     path = Path(folder) / PROOF
-    for name in (COMPOSITION, HYBRID):
-        if not path.exists() and path.with_name(name).exists():
-            raise DocumentError(f"{path.with_name(name)} is about several funnels, not about one")
+    several = path.with_name(COMPOSITION)
+    if not path.exists() and several.exists():
+        raise DocumentError(f"{several} is about several funnels, not about one")
     verdict = proofs.check(path)
     document = _read(path, verdict.digests["proof"])
     about = document["claim"]["about"]

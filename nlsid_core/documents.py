@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.dynamics import Jump, VectorField
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
@@ -29,7 +29,7 @@ from nlsid_core.policies.tube import TubePolicy
 
 Noun: TypeAlias = (
     ContinuousFunnel | SampledFunnel | TubeFunnel
-    | ContinuousPolicy | SampledPolicy | TubePolicy | VectorField | Jump
+    | ContinuousPolicy | SampledPolicy | TubePolicy | VectorField
     | BlockCascade | CellNetwork | DifferenceEquation | ImplicitModel | MonotoneEquation
     | StateAffineModel | StateModel | TrapezoidalModel
 )  # fmt: skip
@@ -40,7 +40,6 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
         ("nlsid/funnel", "continuous"): ContinuousFunnel.from_document,
         ("nlsid/policy", "continuous"): ContinuousPolicy.from_document,
         ("nlsid/vector_field", None): VectorField.from_document,
-        ("nlsid/jump", None): Jump.from_document,
         ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
         ("nlsid/funnel", "tube"): TubeFunnel.from_document,
         ("nlsid/policy", "tube"): TubePolicy.from_document,

@@ -1,14 +1,17 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
 import gc
+import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import traceback
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, ClassVar, NamedTuple
 
 import rclpy
 from lifecycle_msgs.msg import Transition
@@ -19,11 +22,14 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rclpy.exceptions import ParameterException
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -31,6 +37,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
+from nlsid_ros import shared_memory, watchdog
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -63,11 +70,17 @@ class ManagedNode(LifecycleNode):
 
     Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
-    those instead of the process's.
+    those instead of the process's. is_watched: it ends if its executor stands still
+    (`nlsid_ros.watchdog`); so it must not sleep for long.
     """
 
+    is_watched: ClassVar[bool] = False
+
     def __init__(self, name: str, arguments: Arguments = None) -> None:
-        super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
+        try:
+            super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
+        except (RuntimeError, NameValidationException) as error:
+            raise _unreadable(error) from error
         self.declared: list[Declared] = []
         self._is_configured = False
         self.add_on_set_parameters_callback(self._on_parameters)
@@ -209,7 +222,10 @@ class ManagedNode(LifecycleNode):
 
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
-            work()
+            try:
+                work()
+            except NameValidationException as error:
+                raise _unreadable(error) from error
         except (NlsidError, OSError) as error:
             self.failure = error
             self.get_logger().error(str(error))
@@ -219,6 +235,27 @@ class ManagedNode(LifecycleNode):
             self.get_logger().fatal(traceback.format_exc())
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
+
+    def create_subscription(  # type: ignore[override]
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[..., None],
+        qos_profile: QoSProfile | int,
+        *,
+        callback_group: CallbackGroup | None = None,
+        raw: bool = False,
+    ) -> Subscription:
+        """As rclpy does it, without the middleware's events: to take one can wait for ever."""
+        return super().create_subscription(
+            msg_type,
+            topic,
+            callback,
+            qos_profile,
+            callback_group=callback_group,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=raw,
+        )
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """As rclpy does it; what had arrived is let go (see `_let_go`)."""
@@ -274,7 +311,11 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
     the node could send a last command. Raises what made the node fail to start.
     """
     woken = _wake_on_signals()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    shared_memory.avoid_what_is_stale()
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise _unreadable(error) from error
     nodes: list[ManagedNode] = []
     try:
         for make in makes:
@@ -283,12 +324,35 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
                 nodes[-1].start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        _spin_until_signalled(nodes, woken)
+        with _watched(nodes):
+            _spin_until_signalled(nodes, woken)
     finally:
         with ExitStack() as ending:  # each is stopped, also if another cannot be
             ending.callback(try_shutdown)
             for node in reversed(nodes):
                 ending.callback(node.destroy_node)
+
+
+@contextmanager
+def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
+    """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
+    if not all(node.is_watched for node in nodes):
+        yield
+        return
+    names = ", ".join(node.get_name() for node in nodes)
+    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
+        try:
+            yield
+        finally:
+            watching.kill()
+
+
+def _unreadable(error: Exception) -> DataError:
+    """What ROS cannot use of arguments or names, without where its code says so."""
+    said = str(error).partition(". Error:")[0].partition(", at /")[0]
+    hint = "; a namespace begins with a slash: /robot1" if "__ns" in said else ""
+    return DataError(f"ROS refuses: {' '.join(said.split())}{hint}")
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""Node `viewer`: serves what the monitor says to a browser (`page`) or to Foxglove.
+"""Node `viewer`: serves a page of what the monitor says to any browser.
 
 Hears ~/margin and ~/forecast of `monitor` and /diagnostics, and publishes nothing. It listens to
 the margins as best effort, so that a slow viewer never holds up the monitor; what it shows is the
@@ -12,8 +12,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 
+from bags.viewing.page import LOCAL, PORT, serve_page
 from bags.viewing.scene import Scene
-from bags.viewing.serving import LOCAL, serve
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
@@ -33,13 +33,10 @@ class Viewer(ManagedNode):
     def read_parameters(self) -> None:
         """Declare them; take the values that they have now."""
         self._monitor = declare_text(self, "monitor", "funnel_monitor", "node that is shown")
-        self._page = bool(declare(self, "page", False, "true: a page for browsers, not Foxglove"))
         self._host = declare_text(
             self, "host", LOCAL, "address to serve on; 0.0.0.0: the whole network"
         )
-        port: Any = declare(
-            self, "port", 0, "port; 0: 8765 for Foxglove, 8080 for the page", between=(0, 65535)
-        )
+        port: Any = declare(self, "port", PORT, "port; 0: one that is free", between=(0, 65535))
         self._port = port
 
     def start(self) -> None:
@@ -51,7 +48,7 @@ class Viewer(ManagedNode):
         ahead = f"/{self._shown}/forecast"
         self.create_subscription(JointState, ahead, self._on_forecast, qos.SENSOR)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, qos.EVENTS)
-        server = serve(self._scene, page=self._page, host=self._host, port=self._port)
+        server = serve_page(self._scene, host=self._host, port=self._port)
         address = self._served.enter_context(server)
         self.get_logger().info(f"{self._shown} is shown at {address}")
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     Offsets,
 )

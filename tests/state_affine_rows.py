@@ -3,8 +3,8 @@
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.state_affine import (
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.polynomial.rows import (
     StateAffineClass,
     StateAffineRows,
     build_state_affine_rows,

@@ -38,7 +38,7 @@ from nlsid_core.identification import (
     identify,
     methods_of,
 )
-from nlsid_core.identification.methods import alike
+from nlsid_core.identification.methods.options import alike
 from nlsid_core.progress import Progress, silent
 
 CLASSES: dict[str, type] = {

@@ -25,9 +25,8 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
-MEMBERS = ("format", "version", "shape", "gain", "search_gain", "objective", "vector_field",
-           "nominal", "goal", "Q", "R", "limits", "hold", "error", "decay", "push",
-           "stability")  # fmt: skip
+MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field",
+           "nominal", "goal", "Q", "R", "limits", "hold", "error", "push")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +49,7 @@ class FunnelProblem:
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
-    decay: float | None = None
     push: MeasuredPush | None = None
-    search_gain: bool = False
-    stability: float = 0.0
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -63,7 +59,6 @@ class FunnelProblem:
             "version": files.VERSION,
             "shape": self.shape,
             "gain": self.gain,
-            "search_gain": self.search_gain,
             "objective": self.objective,
             "vector_field": self.field.document(),
             "nominal": {
@@ -77,8 +72,6 @@ class FunnelProblem:
             "limits": self.limits.tolist(),
             "hold": self.hold,
             "error": None if self.error is None else self.error.tolist(),
-            "decay": self.decay,
-            "stability": self.stability,
             "push": None if self.push is None else self.push.document(),
         }
 
@@ -106,12 +99,8 @@ class FunnelProblem:
         hold = document.get("hold")
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
-        decay = document.get("decay")
-        if decay is not None:
-            decay = files.member(document, "decay", (int, float), source=source)
         usual = {
-            "shape": "rho", "gain": "constant", "search_gain": False, "objective": "volume",
-            "stability": 0.0,
+            "shape": "rho", "gain": "constant", "objective": "volume",
         }  # fmt: skip
         words = usual | document
         return cls(
@@ -126,10 +115,7 @@ class FunnelProblem:
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
-            decay,
             _push(document, field.n, source),
-            files.member(words, "search_gain", bool, source=source),
-            float(files.member(words, "stability", (int, float), source=source)),
         )
 
     def design(
@@ -145,12 +131,9 @@ class FunnelProblem:
             Q=self.Q,
             R=self.R,
             gain=self.gain,
-            search_gain=self.search_gain,
             limits=self.limits if len(self.limits) else None,
             hold=self.hold,
             error=self.error,
-            decay=self.decay,
-            stability=self.stability,
         )
         return design(problem, executor=executor, progress=progress)
 

@@ -1,21 +1,21 @@
-"""The command line `nlsid`: its verbs; `bag`, `track`, `config`, `fleet` have verbs of their own.
+"""The command line `nlsid`: its verbs; `bag` and `fleet` have verbs of their own.
 
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
+import io
 import os
 import sys
-from typing import Annotated
+import warnings
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from bags.commands import designs_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
-from bags.commands.config_cli import config_app
 from bags.commands.fleet_cli import fleet_app
 from bags.commands.options import err
-from bags.commands.tracking_cli import app as track_app
 from nlsid_core.errors import NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -27,29 +27,24 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-app.add_typer(track_app, name="track")
-app.add_typer(bag_app)
-app.add_typer(config_app)
-app.add_typer(fleet_app)
-for verb in (
-    models_cli.init,
-    models_cli.identify,
-    models_cli.select,
-    models_cli.compare,
-    designs_cli.funnel,
-    designs_cli.push,
-    designs_cli.gain,
-    designs_cli.compose,
-    designs_cli.check,
-    designs_cli.report,
-    running_cli.monitor,
-    designs_cli.tolerances,
-    running_cli.live,
-    running_cli.call,
-    running_cli.view,
-    running_cli.demo,
-):
-    app.command()(verb)
+GROUPS = {
+    "The steps": (
+        models_cli.init,
+        models_cli.identify,
+        designs_cli.funnel,
+        designs_cli.check,
+        designs_cli.report,
+        running_cli.monitor,
+        designs_cli.export,
+    ),
+    "Live": (running_cli.run, running_cli.view),
+    "More": (running_cli.demo,),
+}
+for group, verbs in GROUPS.items():
+    for verb in verbs:
+        app.command(rich_help_panel=group)(verb)
+app.add_typer(bag_app, rich_help_panel="More")
+app.add_typer(fleet_app, rich_help_panel="More")
 
 
 def _say_version(wanted: bool) -> None:
@@ -70,11 +65,45 @@ def nlsid(
     """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
 
 
+class _Written(io.FileIO):
+    """A standard stream whose reader may leave early (`nlsid ... | head`): the rest is dropped.
+
+    What a command finds, and the status that says it, is the same whoever reads along.
+    """
+
+    def write(self, content: Any, /) -> int:
+        """Write the content, or count it as written where nobody reads it."""
+        try:
+            return super().write(content)
+        except BrokenPipeError:
+            return memoryview(content).nbytes
+
+
+def _prepare_streams() -> None:
+    """Let readers leave early, and keep the warnings of libraries from people.
+
+    Warnings are for who writes programs: `python -W` brings them back.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of the processes that share the work
+
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper):  # not where it is closed
+            written = io.BufferedWriter(_Written(stream.fileno(), "wb", closefd=False))
+            patient = io.TextIOWrapper(
+                written, stream.encoding, stream.errors, line_buffering=stream.line_buffering
+            )
+            setattr(sys, name, patient)
+
+
 def main() -> None:
     """Entry point: errors made for people are shown as one message and end with status 2.
 
     Status 0 says yes, 1 no (not fit, outside, rejected), 2 that it could not be done or judged.
     """
+    _prepare_streams()
     try:
         app()
     except NlsidError as error:

@@ -81,19 +81,23 @@ def run_init(
         robot=robot,
         definitions=definitions,
         types=types,
+        named=[*responses, *excitations],
         widen=not excitations and not asked,
         alone=not (responses or asked),
     )
+    if not yes:
+        _settle(console, proposal)
     if definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
             os.path.relpath(path, target.parent) for path in definitions
         ]
+    target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, yaml_text(proposal).encode())
     roles = ("excitation", "response")
     taken = [signal["path"] for role in roles for signal in proposal.content["signals"][role]]
     for text in taken:
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
-    for wall in dict.fromkeys(proposal.walls):
+    for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
@@ -111,20 +115,30 @@ def run_init(
         )  # fmt: skip
         said = ", ".join(topics)
         console.print(
-            "  python -m nlsid_ros.trajectory_recorder --ros-args "
-            f"-p \"topics:=[{said}]\" -p bag:=TRIALS/trial_1",
+            f"  nlsid run record \"topics:=[{said}]\" bag:=TRIALS/trial_1",
             soft_wrap=True, markup=False, highlight=False,
         )  # fmt: skip
-    steps = [f"nlsid identify {given} --config {target} --out out"]
+    folder = shlex.quote(str(target.parent))
+    steps = [f"nlsid identify {folder} {given}"]
     if "funnel" in proposal.content:
         steps += [
-            f"nlsid funnel --model out/model.json --config {target} --out out",
-            "nlsid check out/model.proof.json out/funnel.proof.json",
-            f"nlsid monitor --replay {given} --funnel out/funnel.json --config {target}",
+            f"nlsid funnel {folder}",
+            f"nlsid check {folder}",
+            f"nlsid monitor {folder} {given}",
         ]
     for step in steps:
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
     return proposal
+
+
+def _settle(console: Console, proposal: Proposal) -> None:
+    """Ask what seems wrong; DataError unless somebody says that it is right."""
+    for doubt in dict.fromkeys(proposal.doubts):
+        if not sys.stdin.isatty():
+            raise DataError(f"{doubt} Give --yes to take it as it is")
+        console.print(doubt, soft_wrap=True, markup=False, style="dark_orange3")
+        if not typer.confirm("take it as it is?", default=False):
+            raise DataError("nothing was written: give what is right")
 
 
 def said_briefly(bags: Sequence[Path]) -> str:

@@ -19,9 +19,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from bags.chain.shipped import shipped_file
 from nlsid_core.errors import DataError
 
-WORKFLOWS = ("monitor", "closed_loop", "identify")  # that `nlsid live` lists
+WORKFLOWS = ("monitor", "record", "control", "excite", "identify")  # that `nlsid run` lists
 LOOK = 0.2  # s between looks at whether all still run
 PATIENCE = 20.0  # s for a node to end when asked to
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -84,6 +85,11 @@ class LaunchFile:
         return "\n".join([f"{self.path.name}:", *lines])
 
 
+def launch_file(workflow: str) -> LaunchFile:
+    """The shipped launch file of a workflow; DataError if it was not installed."""
+    return LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
+
+
 def in_one_process(commands: Sequence[Sequence[str]]) -> list[str]:
     """The command of one process that holds the nodes of all these commands."""
     nodes = [[module.rpartition(".")[2], *given] for _, _, module, *given in commands]
@@ -140,7 +146,8 @@ def _command(node: Element, values: Mapping[str, str]) -> list[str]:
     def filled(element: Element, attribute: str) -> str:
         return _filled(element.attrib[attribute], values)
 
-    renamed = [("__node", filled(node, "name")), ("__ns", filled(node, "namespace"))]
+    namespace = "/" + filled(node, "namespace").lstrip("/")  # as ROS launch takes `robot1`
+    renamed = [("__node", filled(node, "name")), ("__ns", namespace)]
     renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
     settings = [part for old, new in renamed for part in ("-r", f"{old}:={new}")]
     for each in node.iter("param"):

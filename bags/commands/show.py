@@ -1,7 +1,7 @@
 """What the commands of the chain print."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from rich.box import SIMPLE_HEAD
@@ -12,7 +12,6 @@ from rich.text import Text
 
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
-from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
@@ -21,6 +20,7 @@ from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
 from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
@@ -101,75 +101,10 @@ def notes(result: Identified) -> list[str]:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
     if said := said_filled(result.trials.filled, sum(map(len, result.trials.every))):
         lines.append(said)
-    lines += result.trials.apart
-    if result.trials.absent:
-        lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")
+    lines += [*said_restarts(result.trials.every), *result.trials.apart]
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
-
-
-def gain_lines(found: Gain) -> list[str]:
-    """What was proved of a model's gain or passivity, and how near two runs of it come."""
-    number, unit = Fraction(found.proof.number), found.unit and f" {found.unit}"
-    fading = "" if found.proof.discount == 1.0 else f", with discount {found.proof.discount!r}"
-    least = found.proof.kind == "gain"
-    bound = f"gain at most {text.above(number)}" if least else (
-        f"passivity index at least {text.below(number)}"
-    )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
-    if (seen := found.reached) is None:
-        lines.append("not compared with simulated runs")
-    else:
-        value, (_, inputs) = Fraction(seen.value), signals(found.model)
-        bound = f"at least {text.below(value)}" if least else f"at most {text.above(value)}"
-        where = ", ".join(
-            f"{signal.name} {size:.3g} around {around:.3g} {signal.unit}".rstrip()
-            for signal, size, around in zip(inputs, seen.amplitude, seen.around, strict=True)
-        )
-        shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
-        lines.append(f"{bound}{unit}: {shown}")
-    return [*lines, *str(found.verdict).splitlines()]
-
-
-def _gain_conditions(found: Gain) -> str:
-    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
-    outputs, inputs = signals(found.model)
-    scales = [*zip(outputs, found.proof.y_scales, strict=True),
-              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
-    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
-    said = f", {' and '.join(counted)}" if counted else ""
-    if found.proof.box is None:
-        return said
-    ranges = [
-        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
-        f"{signal.unit}".rstrip()
-        for key, group in (("y", outputs), ("u", inputs))
-        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
-    ]
-    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
-
-
-def named_number(given: str) -> tuple[str, float]:
-    """NAME=VALUE as an option has it; DataError if it is none."""
-    name, found, value = given.rpartition("=")
-    try:
-        number = float(value)
-    except ValueError:
-        found = ""
-    if not (found and name) or not math.isfinite(number):
-        raise DataError(f"'{given}' should be NAME=VALUE, as speed=0.5")
-    return name, number
-
-
-def named_numbers(given: Iterable[str], option: str) -> dict[str, float]:
-    """`named_number` of each; DataError where a name comes twice."""
-    found: dict[str, float] = {}
-    for name, number in map(named_number, given):
-        if name in found:
-            raise DataError(f"{option} {name} is given twice")
-        found[name] = number
-    return found
 
 
 def selection_table(selection: Selection[Model]) -> Table:
@@ -331,6 +266,13 @@ def _soon(caught: Caught) -> str:
     return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
 
 
+def warn(console: Console, line: str) -> None:
+    """Say what a person should know before they trust what was made."""
+    console.print(
+        f"warning: {line}", soft_wrap=True, markup=False, highlight=False, style="dark_orange3"
+    )
+
+
 def say_catching(console: Console, catching: Catching, require: float | None) -> None:
     """The widths, the table, and what is to be known of a tube that is too wide."""
     for line in width_lines(catching):
@@ -343,15 +285,14 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
         said = "a sensor's fault is in one output at a time; above is the one caught least: "
         console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
     if false := catching.rows[0].funnel.count:
-        console.print(
-            f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "
+        warn(
+            console,
+            f"{false} of {catching.trials} held-back trials, nothing put into them, "
             f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
-            soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
-        )  # fmt: skip
+        )
     for line in (*catching.beyond, *catching.still):
-        said = f"warning: {line}"
-        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+        warn(console, line)
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "

@@ -22,6 +22,7 @@ POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
 MODEL_PROOF = "model.proof.json"
 TRAINING = "training.npz"
 HELD_BACK = "held_back.npz"
+FLEET = "fleet.sqlite"  # what was read of many bags
 REPORT = "report.html"
 DESIGN_REPORT = "design.html"
 SELECTION_PLOT = "select.png"
@@ -62,8 +63,8 @@ def load_model(path: Path | str) -> DifferenceEquation:
 
 def funnel_of(folder: Path) -> Path:
     """What `load_proved` reads in a design folder: a proof of several funnels, or its funnel."""
-    several = (folder / name for name in (designs.COMPOSITION, designs.HYBRID))
-    return next((path for path in several if path.is_file()), folder / FUNNEL)
+    several = folder / designs.COMPOSITION
+    return several if several.is_file() else folder / FUNNEL
 
 
 def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:
@@ -96,7 +97,7 @@ def load_proved_funnel(path: Path | str) -> Proved[WiredTube]:
     """`load_proved` for a tube; DocumentError if it is another."""
     proved: Proved[Any] = load_proved(path)
     if not isinstance(proved.design.funnel, TubeFunnel):
-        raise DocumentError(f"{path}: not a tube; `nlsid track` reads sampled funnels")
+        raise DocumentError(f"{path}: not a tube; this reads tubes only")
     return cast(Proved[WiredTube], proved)
 
 

@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     Channel,
     ChunkIndex,
@@ -30,7 +29,6 @@ from mcap.records import (
 )
 
 from bags.recordings.mcap_records import (
-    INDEX_ENTRY,
     MAGIC,
     RECORD,
     Block,
@@ -38,6 +36,7 @@ from bags.recordings.mcap_records import (
     Record,
     add_channel,
     add_schema,
+    index_entries,
     parse,
     uncompressed,
     walk_records,
@@ -59,16 +58,11 @@ _INDEX: Final = struct.Struct("<BQHI")  # a message index record before its entr
 class ListedBlock(Block):
     """A chunk as the summary lists it: `index` has (offset, bytes) of its channels' index records.
 
-    record, end: bytes in the file where its record begins, and where its message indexes end.
+    record, last: bytes in the file where its record begins, and where its message indexes end.
     """
 
     record: int = 0
-    end: int = 0
-
-    @property
-    def indexes(self) -> int:
-        """The byte where its message indexes begin."""
-        return self.offset + self.size
+    last: int = 0
 
 
 def summarised(path: RemotePath) -> Contents | None:
@@ -116,7 +110,11 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
         elif opcode == Opcode.METADATA_INDEX:
             metadata.append(parse(MetadataIndex.read, content))
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            found.attachments.append(_attachment(parse(AttachmentIndex.read, content), start))
+            attached = parse(AttachmentIndex.read, content)
+            if attached.offset + attached.length > start:
+                raise BagError(f"the attachment at byte {attached.offset} lies outside the file")
+            place = attached.offset + RECORD.size, attached.length - RECORD.size
+            found.attachments.append(place)
     if found.stated is None:
         return None
     found.blocks.sort(key=lambda block: block.offset)
@@ -174,16 +172,6 @@ def _listed(chunk: ChunkIndex, limit: int) -> ListedBlock:
     )  # fmt: skip
 
 
-def _attachment(index: AttachmentIndex, limit: int) -> Attachment:
-    """The attachment's header; `data` holds (offset, size) of its data, which stay in place."""
-    names = len(index.name.encode()) + len(index.media_type.encode())
-    offset = index.offset + RECORD.size + 16 + 4 + 4 + names + 8
-    if offset + index.data_size > min(limit, index.offset + index.length):
-        raise BagError(f"the attachment at byte {index.offset} is longer than its record")
-    place = struct.pack("<QQ", offset, index.data_size)
-    return Attachment(index.create_time, index.log_time, index.name, index.media_type, place)
-
-
 class Prepared:
     """The chunks of a file that were fetched for some channels, a window of them at a time."""
 
@@ -221,7 +209,7 @@ class Prepared:
             self._prepare(list(self._window(self._place[first.offset])))
         if first.compression:
             offsets = self._ready[first.offset]
-            header = self._path.read_range(first.record, first.end)
+            header = self._path.read_range(first.record, first.last)
             crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
             at = first.offset - first.record
             content = uncompressed(replace(first, crc=crc), header[at : at + first.size])
@@ -273,7 +261,7 @@ class Prepared:
         if the index of the last chunk, which tells, would have to be fetched for it.
         """
         last = self._blocks[-1]
-        if last.compression or not self._path.holds(last.indexes, last.end):
+        if last.compression or not self._path.holds(last.end, last.last):
             return 0
         self._ready = {last.offset: self._entries_of(last)}
         _, ends = self._runs_of([last])
@@ -283,11 +271,11 @@ class Prepared:
     def _span(self, block: ListedBlock, ahead: int) -> tuple[int, int]:
         """What is fetched of a block before its indexes are known; with so much of the next."""
         if block.compression:
-            return block.record, block.end
+            return block.record, block.last
         following = self._place[block.offset] + 1
         if following == len(self._blocks) or not self._is_wanted(self._blocks[following]):
-            return block.indexes, block.end
-        return block.indexes, min(block.end + ahead, self._blocks[following].indexes)
+            return block.end, block.last
+        return block.end, min(block.last + ahead, self._blocks[following].end)
 
     def _runs_of(self, blocks: Sequence[ListedBlock]) -> tuple[IntArray, IntArray]:
         """First bytes and ends, in the file, of the wanted messages' records: of runs in a block
@@ -310,20 +298,14 @@ class Prepared:
 
     def _entries_of(self, block: ListedBlock) -> dict[int, IntArray]:
         """Offsets of each channel's messages in the chunk, as its index records have them."""
-        records = self._path.read_range(block.indexes, block.end)
+        records = self._path.read_range(block.end, block.last)
         found = {}
         for channel, (at, length) in (block.index or {}).items():
-            start, where = at - block.indexes, f"the message index at byte {at}"
-            if length < _INDEX.size:
-                raise BagError(f"{where} is damaged")
-            opcode, size, of, entries = _INDEX.unpack_from(records, start)
-            fits = RECORD.size + size <= length and 6 + entries == size
-            if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or entries % 16:
-                raise BagError(f"{where} is damaged")
-            listed: Any = np.frombuffer(records, INDEX_ENTRY, entries // 16, start + _INDEX.size)
-            if len(listed) and listed["offset"].max() >= block.uncompressed_size:
+            start, where = at - block.end, f"the message index at byte {at}"
+            listed = index_entries(records[start : start + length], channel, where)
+            if len(listed) and listed.max() >= block.uncompressed_size:
                 raise BagError(f"{where} points outside its chunk")
-            found[channel] = listed["offset"].astype(np.int64)
+            found[channel] = listed
         return found
 
 

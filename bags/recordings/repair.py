@@ -11,11 +11,11 @@ from mcap.reader import make_reader
 from bags.recordings.description import (
     METADATA,
     FileDescription,
-    TopicDescription,
+    Topic,
     write_metadata,
 )
-from bags.recordings.part import CUSTOM_DATA, TYPE_HASH, Part, topic_like
-from bags.recordings.storage import McapStorage
+from bags.recordings.part import Part, topic_like
+from bags.recordings.storage import Storage
 from bags.recordings.writer import RESERVE
 from nlsid_core.errors import BagError
 
@@ -38,23 +38,19 @@ def repair(bag: Path) -> int:
     if not _is_unfinished(bag):
         raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
     files: list[FileDescription] = []
-    topics: dict[str, TopicDescription] = {}
+    topics: list[Topic] = []
     custom: dict[str, str] = {}
     scratch = Path(tempfile.mkdtemp(dir=bag.parent, prefix=f".{bag.name}.repair."))
     try:
         for file in _files(bag):
-            storage = McapStorage([file], CUSTOM_DATA, salvage=True)
+            storage = Storage([file], salvage=True)
             try:
                 finished = _finished(file)
                 files.append(finished or _rewritten(storage, scratch / file.name))
             finally:
                 storage.close()
             custom |= storage.custom
-            for channel in storage.channels:
-                type_hash = channel.metadata.get(TYPE_HASH, "")
-                topics[channel.topic] = TopicDescription(
-                    channel.msgtype, channel.encoding, type_hash, channel.offered
-                )
+            topics += map(topic_like, storage.channels)
             if finished is None:
                 (scratch / file.name).replace(file)
         write_metadata(bag, files, topics, custom)
@@ -82,17 +78,14 @@ def _finished(file: Path) -> FileDescription | None:
     return FileDescription(file.name, counts, first_ns, there.message_end_time)
 
 
-def _rewritten(storage: McapStorage, target: Path) -> FileDescription:
+def _rewritten(storage: Storage, target: Path) -> FileDescription:
     """A finished copy of the messages that are there."""
     part = Part(target)
     part.annotate(storage.custom)
     for channel in storage.channels:
-        if channel.topic not in part.counts:
-            part.add_topic(topic_like(channel))
-    for message in storage.messages(range(len(storage.channels))):
-        topic = storage.channels[message.key].topic
-        count = part.counts[topic]
-        part.write(topic, message.data, message.log_ns, message.publish_ns, count)
+        part.add_topic(topic_like(channel))
+    for raw in storage.messages(range(len(storage.channels)), nearly=True):
+        part.write(raw.key, raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
     part.finish()
     return part.description
 

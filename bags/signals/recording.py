@@ -9,6 +9,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Regularity, Sequence
 
+UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"
 UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
 
 
@@ -22,7 +23,6 @@ class Recording:
     def __init__(self, bag: BagWriter, *, least_free: float) -> None:
         self.bag = bag
         self.ended = ""
-        self.paused = False
         self._least_free = least_free  # MB
         self._lost: dict[str, int] = {}
         self._sequence: dict[str, Sequence] = {}
@@ -42,25 +42,22 @@ class Recording:
         self.expect(topic)
         self.bag.add_topic(topic, definition.msgtype, definition=definition, offered=offered)
 
-    def add(self, arrival: Arrival, stamp_ns: int, number: int | None = None) -> None:
-        """Take a message; `stamp_ns` is what its regularity is judged by, `number` its publisher's
-        count.
-        """
+    def add(self, arrival: Arrival, stamp_ns: int) -> None:
+        """Take a message; `stamp_ns` is what its regularity is judged by."""
         if self._closed:
             return
-        topic, msgtype, data, log_ns, publish_ns = arrival
+        topic, msgtype, data, log_ns, publish_ns, number = arrival
         self._regularity[topic].update(stamp_ns)
         if number is not None:
             self._sequence[topic].update(number)
-        if self.paused:
-            return
+        times = {"log_time_ns": log_ns, "publish_time_ns": publish_ns}
         try:
-            self.bag.write(topic, msgtype, data, log_time_ns=log_ns, publish_time_ns=publish_ns)
+            self.bag.write(topic, msgtype, data, **times, sequence=number)
         except OSError as error:
             self._end(str(error))
 
     def lose(self, topic: str, count: int) -> None:
-        """Count messages that the middleware says it lost."""
+        """Count messages that were lost before any was handed on."""
         self._lost[topic] += count
 
     def annotate(self, custom: Mapping[str, str]) -> None:
@@ -108,7 +105,8 @@ class Recording:
         values = {}
         for topic, regularity in self._regularity.items():
             values[f"{topic} received"] = str(self.bag.counts.get(topic, 0))
-            values[f"{topic} lost"] = str(self._lost_on(topic))
+            mixed = self._sequence[topic].mixed
+            values[f"{topic} lost"] = UNCOUNTED if mixed else str(self._lost_on(topic))
             values[f"{topic} gaps"] = str(regularity.gaps)
             values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
             values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
@@ -118,14 +116,17 @@ class Recording:
         """What a person should look at."""
         silent = [topic for topic in self._lost if not self.bag.counts.get(topic)]
         losing = [topic for topic in self._lost if self._lost_on(topic)]
+        mixed = [topic for topic in self._lost if self._sequence[topic].mixed]
         return [
             *(f"nothing on {topic} yet" for topic in silent),
             *(f"messages lost on {topic}" for topic in losing),
+            *(f"{topic}: {UNCOUNTED}" for topic in mixed),
         ]
 
     def _lost_on(self, topic: str) -> int:
-        """By the middleware's count or by the publisher's, whichever knows of more."""
-        return max(self._lost[topic], self._sequence[topic].missing)
+        """Before they could be handed on, and by the publisher's count since then."""
+        sequence = self._sequence[topic]
+        return self._lost[topic] + (0 if sequence.mixed else sequence.missing)
 
     def _end(self, why: str) -> None:
         self.ended = f"recording stopped: {why}"

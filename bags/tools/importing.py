@@ -1,4 +1,4 @@
-"""Tables (CSV, MAT, HDF5) to a bag of standard messages."""
+"""Tables (CSV, MAT) to a bag of standard messages."""
 
 import csv
 import math
@@ -24,6 +24,7 @@ from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
+TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
 MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
 _COLUMN: Final = re.compile(
     r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
@@ -121,7 +122,7 @@ def read_tables(files: Sequence[Path | str]) -> Tables:
 
     A CSV file without a header is one table by the file's name; with one, each column is a table by
     its own name, an empty cell is NaN, and a column without a number is left out. In MAT (up to
-    version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one, those in a struct by
+    version 7.2) files each numeric array is one, those in a struct by
     `struct.field`; nothing in them is evaluated. A file is called by its stem,
     with the folder before it where two have one stem. Raises DataError for a file that is none of
     these or holds no numbers.
@@ -131,8 +132,7 @@ def read_tables(files: Sequence[Path | str]) -> Tables:
     for path, label in _labels([Path(file) for file in files]):
         if path.stat().st_size > MAX_TABLE_BYTES:
             raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
-        readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat, ".h5": _hdf5}
-        readers |= {".hdf5": _hdf5}
+        readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat}
         reader = readers.get(path.suffix.lower())
         if reader is None:
             raise DataError(f"{path}: unknown kind; known are {', '.join(readers)}")
@@ -153,6 +153,26 @@ def _labels(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
         while count < len(parts) and sum(o[-count:] == parts[-count:] for o in whole) > 1:
             count += 1
         yield path, "/".join(parts[-count:])
+
+
+def every_column(
+    files: Sequence[Path | str], time: str | None, period: float | None
+) -> tuple[str | None, list[str], dict[str, str]]:
+    """The time column, and every other column as a number on a topic of its name.
+
+    Returns the time column (None: rows are `period` s apart), the assignments and the topics'
+    types. Raises DataError if two columns would be one topic.
+    """
+    tables = read_tables(files)
+    names = [name for name, owners in tables.files.items() if len(owners) == 1]
+    if time is None and period is None:
+        time = next((name for name in names if name.lower() in TIMES), None)
+    columns = [n for n in names if n != time and tables.arrays[tables.whole_name(n)].ndim == 1]
+    topics = [f"/{re.sub(r'^(?=[0-9])|[^A-Za-z0-9_]', '_', name)}" for name in columns]
+    if twice := next((topic for topic in topics if topics.count(topic) > 1), None):
+        raise DataError(f"two columns would be {twice}; name them with --signal")
+    assignments = [f"{t}:data={name}" for t, name in zip(topics, columns, strict=True)]
+    return time, assignments, dict.fromkeys(topics, "std_msgs/msg/Float64")
 
 
 def import_tables(
@@ -353,8 +373,8 @@ def _csv_by_cells(
 def _mat(path: Path) -> dict[str, FloatArray]:
     try:
         content = loadmat(path, squeeze_me=False)
-    except NotImplementedError:
-        return _hdf5(path)  # what SciPy says of version 7.3, which is HDF5
+    except NotImplementedError as error:
+        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
     except Exception as error:  # scipy raises what the bytes make it raise
         raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
     found: dict[str, FloatArray] = {}
@@ -371,27 +391,6 @@ def _collect(name: str, value: Any, found: dict[str, FloatArray], depth: int = 0
     elif isinstance(value, np.ndarray) and value.size == 1 and depth < MAX_STRUCT_DEPTH:
         for field in value.dtype.names or ():
             _collect(f"{name}.{field}", value.flat[0][field], found, depth + 1)
-
-
-def _hdf5(path: Path) -> dict[str, FloatArray]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise DataError(f"{path}: HDF5 needs h5py: pip install 'nlsid[export]'") from error
-    found: dict[str, FloatArray] = {}
-
-    def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim in (1, 2) and item.nbytes < MAX_TABLE_BYTES:
-            value = item[()]
-            if _is_table(value):
-                found[name] = _column(value)
-
-    try:
-        with h5py.File(path, "r") as content:
-            content.visititems(visit)
-    except OSError as error:
-        raise DataError(f"{path} is not an HDF5 file: {error}") from error
-    return found
 
 
 def _is_table(value: Any) -> bool:

@@ -1,1 +1,1 @@
-"""What a person looks at while a robot runs, or a recording is replayed: a page, or Foxglove."""
+"""What a person looks at while a robot runs, or a recording is replayed: a page."""

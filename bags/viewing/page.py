@@ -20,7 +20,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from bags.viewing.scene import MONITORING, Event, Sample, Scene
+from nlsid_core.errors import DataError
 
+LOCAL: Final = "127.0.0.1"
+PORT: Final = 8080
 TICK: Final = 0.1  # s between what is sent
 PER_TICK: Final = 20  # samples at most; of more the worst
 PER_START: Final = 2000  # samples of the past that a new reader gets
@@ -35,9 +38,12 @@ _INLINE = re.compile(r"<(script|style)>(.*?)</\1>", re.DOTALL)
 def serve_page(scene: Scene, *, host: str, port: int) -> Iterator[str]:
     """Serve until the block ends; gives the address. port 0: a free one.
 
-    OSError if the port is taken or the host is none of this machine's.
+    DataError if the port is taken or the host is none of this machine's.
     """
-    server = _Server(scene, host, port)
+    try:
+        server = _Server(scene, host, port)
+    except OSError as error:
+        raise DataError(f"cannot serve on {host}, port {port}: {error}") from error
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": TICK})
     thread.start()
     try:

@@ -11,9 +11,7 @@ from nlsid_core.design.continuous.tvlqr import (
     nominal_through,
     tvlqr,
 )
-from nlsid_core.design.cycle import closed_cycle
 from nlsid_core.design.design import design
-from nlsid_core.design.hybrid import compose_jumps, goal_before
 from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.riccati import Feedback, discrete_tvlqr
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
@@ -27,14 +25,11 @@ __all__ = [
     "OutputTubeDesign",
     "SampledTracking",
     "Tracking",
-    "closed_cycle",
     "compose_funnels",
-    "compose_jumps",
     "design",
     "design_funnel",
     "design_output_tube",
     "discrete_tvlqr",
-    "goal_before",
     "integrate_nominal",
     "lyapunov",
     "nominal_through",

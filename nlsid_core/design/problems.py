@@ -10,7 +10,7 @@ from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
 from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
-from nlsid_core.dynamics import Jump, Nominal, VectorField
+from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.models import StableModel
@@ -107,8 +107,7 @@ class ContinuousTracking:
     that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
     R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
     given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
-    knots: "constant", "linear" or "cubic". search_gain: whether K is then changed so that V falls
-    faster, with inputs that are no larger at the knots. limits: rows (input, low, high), or one
+    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one
     pair (low, high) for each input, at which inputs saturate; the proof then covers every mode.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
@@ -116,12 +115,6 @@ class ContinuousTracking:
     assumed to act continuously). K is then linear between knots. error: (n,)
     bounds of how much each state is measured wrong (None: not at all).
 
-    decay: 1/s, λ of a claim that V falls: V̇ ≤ λ(σ - V) wherever σ ≤ V ≤ 1, for the least floor σ
-    that is found; V is 1 on the funnel's boundary of that time (None: only that V stays below 1).
-    stability: 1/s, α of a prescribed degree of stability: with A + αI/2 for A in these equations V
-    of the linear closed loop falls at least as exp(-αt).
-    jump: what the motion ends with (None: nothing). The funnel is then above its guard where that
-    begins to be watched, to first order in the guard; a hold is refused.
 
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
@@ -136,29 +129,19 @@ class ContinuousTracking:
     Q: ArrayLike | None = None
     R: ArrayLike | None = None
     gain: str = "constant"
-    search_gain: bool = False
     limits: ArrayLike | None = None
     uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None
     error: ArrayLike | None = None
-    decay: float | None = None
-    stability: float = 0.0
-    jump: Jump | None = None
 
     def __post_init__(self) -> None:
-        require_at_least(self, "stability", 0.0)
         if not isinstance(self.nominal, Nominal):
             raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
         if not isinstance(self.policy, ContinuousPolicy | None):
             raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
-        if not isinstance(self.jump, Jump | None):
-            raise OptionError("jump", self.jump, "a Jump, or None")
-        if self.decay is not None:
-            require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))
         require_one_of(self, "objective", get_args(Objective))
         require_one_of(self, "gain", GAINS)
-        require_one_of(self, "search_gain", (False, True))
 
 
 Problem = OutputTube | SampledTracking | ContinuousTracking

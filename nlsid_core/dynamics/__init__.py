@@ -1,7 +1,6 @@
 """Continuous time: polynomial dynamics, motions, and functions of time in pieces."""
 
 from nlsid_core.dynamics.identified import identified_field
-from nlsid_core.dynamics.jump import Jump
 from nlsid_core.dynamics.measured import MeasuredPush, measured_push
 from nlsid_core.dynamics.nominal import Nominal
 from nlsid_core.dynamics.piecewise import (
@@ -15,7 +14,6 @@ from nlsid_core.dynamics.taylor_model import TaylorModel, solve
 from nlsid_core.dynamics.vector_field import VectorField
 
 __all__ = [
-    "Jump",
     "MeasuredPush",
     "Nominal",
     "PiecewisePolynomial",

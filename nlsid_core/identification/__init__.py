@@ -1,24 +1,8 @@
 """Identification: a dataset in, a stable model with its proof out (thesis Part I)."""
 
-from nlsid_core.identification.block_cascade import (
-    BlockCascadeClass,
-    CascadeFit,
-    identify_block_cascade,
-)
-from nlsid_core.identification.cells import CellClass
-from nlsid_core.identification.dissipation import (
-    DissipationProof,
-    prove_gain,
-    prove_passivity,
-)
-from nlsid_core.identification.feedback import FeedbackClass
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import Selection, Tried, identify, select
-from nlsid_core.identification.implicit_class import ImplicitClass
-from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
-from nlsid_core.identification.linear import LinearClass
-from nlsid_core.identification.linear_states import LinearStateClass
-from nlsid_core.identification.methods import (
+from nlsid_core.identification.methods.options import (
     METHODS,
     CertifiedRse,
     CertifiedSem,
@@ -32,14 +16,25 @@ from nlsid_core.identification.methods import (
     Sem,
     describe,
 )
-from nlsid_core.identification.moment_rie import MomentFit
-from nlsid_core.identification.moments import MonotoneClass
-from nlsid_core.identification.monotone import identify_from_repeats
+from nlsid_core.identification.network.cascade import (
+    BlockCascadeClass,
+    CascadeFit,
+    identify_block_cascade,
+)
+from nlsid_core.identification.network.cells import CellClass
+from nlsid_core.identification.network.feedback import FeedbackClass
+from nlsid_core.identification.polynomial.implicit_rows import ImplicitClass
+from nlsid_core.identification.polynomial.linear import LinearClass
+from nlsid_core.identification.polynomial.linear_states import LinearStateClass
+from nlsid_core.identification.polynomial.moment_rie import MomentFit
+from nlsid_core.identification.polynomial.moments import MonotoneClass
+from nlsid_core.identification.polynomial.monotone import identify_from_repeats
+from nlsid_core.identification.polynomial.rows import StateAffineClass
 from nlsid_core.identification.prediction import Model, predict, simulate_trial
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.identification.repeats import RepeatTest, compare_repeats
 from nlsid_core.identification.searches import methods_of
-from nlsid_core.identification.stability import StabilityProof, prove_stability
-from nlsid_core.identification.state_affine import StateAffineClass
 from nlsid_core.identification.validation import (
     Residual,
     Validation,
@@ -56,7 +51,6 @@ __all__ = [
     "CellClass",
     "CertifiedRse",
     "CertifiedSem",
-    "DissipationProof",
     "FeedbackClass",
     "FirstRse",
     "Fit",
@@ -91,9 +85,7 @@ __all__ = [
     "identify_from_repeats",
     "methods_of",
     "predict",
-    "prove_gain",
     "prove_implicit",
-    "prove_passivity",
     "prove_stability",
     "select",
     "simulate_trial",

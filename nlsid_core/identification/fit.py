@@ -8,7 +8,7 @@ from typing import Any, Generic, Protocol
 from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.methods import M, Method
+from nlsid_core.identification.methods.options import M, Method
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
 
 AT_BOUND = 1.15  # of 1 - max_rate: a search keeps 1.1 (`rates.ROOM`), and a proof loses a little

@@ -15,7 +15,14 @@ import numpy as np
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, SolverError
 from nlsid_core.identification.fit import Fit
-from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, alike, describe
+from nlsid_core.identification.methods.options import (
+    METHODS,
+    M,
+    Method,
+    ModelClass,
+    alike,
+    describe,
+)
 from nlsid_core.identification.rates import default_max_rate
 from nlsid_core.identification.searches import OFFERS, methods_of
 from nlsid_core.identification.trail import Task

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification.rollout import simulate_together
+from nlsid_core.identification.polynomial.rollout import simulate_together
 from nlsid_core.models import (
     BlockCascade,
     CellNetwork,

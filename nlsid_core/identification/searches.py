@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,39 +11,8 @@ from scipy.linalg import LinAlgError
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
-from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
-from nlsid_core.identification.cascade_fit import MAX_RADIUS
-from nlsid_core.identification.cells import CellClass, identify_cells
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.coloured import fit_in_turn
-from nlsid_core.identification.feedback import (
-    FeedbackClass,
-    identify_feedback,
-    identify_unproved,
-)
 from nlsid_core.identification.fit import History, Proof, Step
-from nlsid_core.identification.implicit_class import (
-    ImplicitClass,
-    ImplicitRows,
-    build_implicit_rows,
-)
-from nlsid_core.identification.implicit_descent import minimise_certified_implicit
-from nlsid_core.identification.implicit_proof import ImplicitProof
-from nlsid_core.identification.implicit_search import (
-    implicit_equation_error,
-    least_squares_coefficients,
-    minimise_implicit_rie,
-    prove_in_set,
-    refuse_large_program,
-)
-from nlsid_core.identification.linear import (
-    LinearClass,
-    build_regression,
-    least_squares,
-    minimise_simulation_error,
-)
-from nlsid_core.identification.linear_states import LinearStateClass, identify_linear_states
-from nlsid_core.identification.methods import (
+from nlsid_core.identification.methods.options import (
     CertifiedRse,
     CertifiedSem,
     FirstRse,
@@ -55,36 +23,71 @@ from nlsid_core.identification.methods import (
     Rse,
     Sem,
 )
-from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.network.cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.network.cascade_fit import MAX_RADIUS
+from nlsid_core.identification.network.cells import CellClass, identify_cells
+from nlsid_core.identification.network.feedback import (
+    FeedbackClass,
+    identify_feedback,
+    identify_unproved,
+)
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.implicit_descent import minimise_certified_implicit
+from nlsid_core.identification.polynomial.implicit_rie import (
+    implicit_equation_error,
+    least_squares_coefficients,
+    minimise_implicit_rie,
+    prove_in_set,
+    refuse_large_program,
+)
+from nlsid_core.identification.polynomial.implicit_rows import (
+    ImplicitClass,
+    ImplicitRows,
+    build_implicit_rows,
+)
+from nlsid_core.identification.polynomial.linear import (
+    LinearClass,
+    build_regression,
+    least_squares,
+    minimise_simulation_error,
+)
+from nlsid_core.identification.polynomial.linear_states import (
+    LinearStateClass,
+    identify_linear_states,
+)
+from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     offsets_of,
     plain_moments,
     refuse_unexcited,
 )
-from nlsid_core.identification.monotone import (
+from nlsid_core.identification.polynomial.monotone import (
     identify_from_repeats,
     least_squares_equation,
     minimise_monotone_simulation_error,
 )
-from nlsid_core.identification.monotone_descent import minimise_certified
-from nlsid_core.identification.noise import Noise
+from nlsid_core.identification.polynomial.monotone_descent import minimise_certified
+from nlsid_core.identification.polynomial.rie import robust_identification_error
+from nlsid_core.identification.polynomial.rows import (
+    StateAffineClass,
+    StateAffineRows,
+    build_state_affine_rows,
+)
 from nlsid_core.identification.prediction import Model
-from nlsid_core.identification.rie import robust_identification_error
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.stability import prove_stability
+from nlsid_core.identification.proofs.stability import prove_stability
+from nlsid_core.identification.proofs.stable_sets import ImplicitProof
 from nlsid_core.identification.starts import (
     as_implicit,
     as_monotone,
     linear_start,
     reflected,
     stable_starts,
-)
-from nlsid_core.identification.state_affine import (
-    StateAffineClass,
-    StateAffineRows,
-    build_state_affine_rows,
 )
 from nlsid_core.identification.trail import Task, Trail
 from nlsid_core.identification.validation import hold_out, simulation_percent
@@ -109,15 +112,8 @@ CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: c
 
 
 def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
-    """Difference equations of one input and one output, of white noise or of coloured."""
-    search = partial(_linear, model_class)
-    return fit_in_turn(search, train, model_class.noise_lags, task)
-
-
-def _linear(
-    model_class: LinearClass, train: Dataset, task: Task, noise: Noise | None
-) -> Trail[DifferenceEquation]:
-    regression = build_regression(train, model_class.lags, noise=noise)
+    """Difference equations of one input and one output."""
+    regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
     radius = task.searched_rate
@@ -161,15 +157,8 @@ def _linear(
 def state_affine(
     train: Dataset, model_class: StateAffineClass, task: Task
 ) -> Trail[StateAffineModel]:
-    """State-affine models, of several inputs and outputs, of white noise or of coloured."""
-    search = partial(_state_affine, model_class)
-    return fit_in_turn(search, train, model_class.noise_lags, task)
-
-
-def _state_affine(
-    model_class: StateAffineClass, train: Dataset, task: Task, noise: Noise | None
-) -> Trail[StateAffineModel]:
-    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate, noise=noise)
+    """State-affine models, of several inputs and outputs."""
+    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
     if problem.rows.errors.size > MOST_ENTRIES:
         beside = [m for m in task.comparators if isinstance(m, LeastSquares)]
         left_out = ", ".join(m.name for m in task.comparators if m not in beside)

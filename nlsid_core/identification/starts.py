@@ -17,13 +17,13 @@ from scipy.linalg import LinAlgError, eig, svd
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.identification.implicit_class import ImplicitRows
-from nlsid_core.identification.linear import SLOWEST_POLE
-from nlsid_core.identification.moments import MonotoneClass
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows
+from nlsid_core.identification.polynomial.linear import SLOWEST_POLE
+from nlsid_core.identification.polynomial.moments import MonotoneClass
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.regressors import lagged, signal_scale
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.models import MonotoneEquation, StateAffineModel
 
 LINEAR_ITERATES = 10  # of the robust simulation error, for the linear model of other classes

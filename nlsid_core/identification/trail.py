@@ -13,7 +13,6 @@ from scipy.linalg import LinAlgError
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError, SolverError
-from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.fit import (
     Candidate,
     History,
@@ -22,11 +21,12 @@ from nlsid_core.identification.fit import (
     rate_text,
     stated_rate,
 )
-from nlsid_core.identification.methods import FirstRse, Method, Rse
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.options import FirstRse, Method, Rse
+from nlsid_core.identification.methods.rse import Iterate, affordable_steps, robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rates import is_too_slow, searched_rate
-from nlsid_core.identification.rse import Iterate, affordable_steps, robust_simulation_error
-from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.progress import Progress, silent
 
 T = TypeVar("T", bound=Model)

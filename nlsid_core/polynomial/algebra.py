@@ -91,11 +91,6 @@ class Polynomial:
         found = np.flatnonzero((self.exponents == np.asarray(exponent)).all(axis=1))
         return self.coefficients[found[0]] if found.size else 0
 
-    def homogeneous(self, degree: int) -> "Polynomial":
-        """The part of total degree `degree`."""
-        keep = self.exponents.sum(axis=1) == degree
-        return Polynomial(self.exponents[keep], self.coefficients[keep], self.names)
-
     def exact(self) -> "Polynomial":
         """The same polynomial with rational coefficients; nothing is rounded."""
         rationals = np.array([Fraction(c) for c in self.coefficients.tolist()], dtype=object)

@@ -15,7 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, apart
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.factor import UNIT, refuse_unmonitorable
+from nlsid_core.funnels.factor import UNIT, refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
@@ -114,6 +114,13 @@ class PlanComparison:
         self.model, self._funnels = model, tuple(funnels)
         self.period, self.lags = model.period, len(model)
         self._plans = [policy.plan(model) for policy in policies]
+        self._hidden: list[list[float]] = []  # of each plan's tubes, what rounding can hide
+        for plan, funnel in zip(self._plans, funnels, strict=True):
+            most_x, most_y = np.abs(plan.x).max(axis=0), np.abs(plan.y).max(keepdims=True)
+            hidden = [tube.hidden(most_x, most_y) for tube in funnel.tubes]
+            for tube, part in zip(funnel.tubes, hidden, strict=True):
+                refuse_coarse(part, tube.half_widths, "the plan")
+            self._hidden.append([float(part[0]) for part in hidden])
         self.last = [
             min(plan.last, funnel.last) for plan, funnel in zip(self._plans, funnels, strict=True)
         ]
@@ -185,7 +192,9 @@ class PlanComparison:
             spent[j] = (tube.rho * spent[j] + tube.R[0, 0] * e * e) * (1.0 + 8.0 * UNIT)
             if tube.samples is not None and k >= tube.samples:
                 continue
-            size = max(size, abs(away) / (float(tube.half_widths[0]) * (1.0 - ROUNDING)))
+            size = max(
+                size, (abs(away) + self._hidden[i][j]) / (tube.half_widths[0] * (1.0 - ROUNDING))
+            )
             part = spent[j] / (tube.level * (1.0 - ROUNDING))
             if not part <= used:
                 used, most = part, j
@@ -222,6 +231,7 @@ class SampledComparison:
     def __init__(self, model: MeasuredState, policy: SampledPolicy, funnel: SampledFunnel) -> None:
         self.model, self._policy, self._funnel = model, policy, funnel
         refuse_unmonitorable(funnel)
+        refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
         self.period, self.last = model.period, [funnel.last]
         a = funnel.assumption
         self.assuming = [f"the disturbance's {a.form} ≤ {a.bound:.4g}"]
@@ -401,8 +411,7 @@ class ContinuousComparison:
         self._proved = self._proved or (size <= 1.0 and (starts or not hold))
         if not self._proved:
             broken = "the run did not start in the funnel: nothing is proved of it"
-        if hold and not age <= hold * (1.0 + COMMAND_TOLERANCE):
-            broken = f"the input was held for {age:.6g} s at t = {t:g} s; proved for {hold:g} s"
+        broken = held.overdue(age, t) or broken
         return Compared(
             [size],
             [age / hold if self._measures else np.nan],

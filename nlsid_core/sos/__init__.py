@@ -15,7 +15,6 @@ from nlsid_core.sos.program import (
     template,
 )
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
-from nlsid_core.sos.sphere_proof import SphereProof, sphere_proof
 
 __all__ = [
     "Compiled",
@@ -25,7 +24,6 @@ __all__ = [
     "Program",
     "Solution",
     "SphereProgram",
-    "SphereProof",
     "SphereSolution",
     "SumOfSquares",
     "Zero",
@@ -33,7 +31,6 @@ __all__ = [
     "forms_of",
     "matrix_sum_of_squares",
     "solve",
-    "sphere_proof",
     "symmetric_template",
     "template",
 ]

@@ -28,7 +28,6 @@ from nlsid_core.sos.program import (
     Zero,
     scaling,
 )
-from nlsid_core.sos.quotient import Quotient
 from nlsid_core.sos.terms import (
     Block,
     candidates,
@@ -36,7 +35,6 @@ from nlsid_core.sos.terms import (
     free_terms,
     gram_terms,
     inner_degree,
-    reduced,
 )
 
 Values: TypeAlias = Mapping[str, float]
@@ -155,7 +153,7 @@ class Builder:
             self._add_squares(constraint)
         elif isinstance(constraint, Zero):
             exponents, decision, feature, value = self._split(constraint.p)
-            self._rows(exponents, decision, feature, value, None)
+            self._rows(exponents, decision, feature, value)
         elif isinstance(constraint, NonNegative):
             self._affine_rows((constraint.p,), Cone("nonnegative", 1))
         else:
@@ -167,14 +165,12 @@ class Builder:
         exponents, decision, feature, value = self._split(constraint.p)
         domain = [g.over(names) for g in constraint.domain]
         equalities = [h.over(names) for h in constraint.equalities]
-        quotient = None if constraint.modulo is None else Quotient(constraint.modulo.over(names))
         inner = np.array([name not in constraint.forms for name in names])
         given = [exponents, *(g.exponents for g in domain + equalities)]
         least = max(inner_degree(rows, inner) for rows in given)
         degree = least + least % 2 if constraint.degree is None else constraint.degree
 
         parts = [g.exponents for g in domain + equalities]
-        parts += [quotient.generator.exponents] if quotient else []
         symmetry = np.concatenate([exponents, *parts])
         pieces = [(exponents, decision, feature, value)]
         support = [exponents]
@@ -182,7 +178,6 @@ class Builder:
         for g in domain:
             room = max(degree - inner_degree(g.exponents, inner), 0)
             basis = candidates(names, constraint.forms, room // 2)
-            basis = basis[2 * basis.sum(axis=1) >= constraint.lowest]
             if constraint.vanishing:
                 basis = basis[
                     basis[:, [name in constraint.vanishing for name in names]].any(axis=1)
@@ -199,28 +194,20 @@ class Builder:
             pieces.append(free_terms(basis, start, h))
             support.append(pieces[-1][0])
         everything = np.unique(np.concatenate(support), axis=0)
-        main = self._block(self._main_basis(constraint, everything, degree, quotient), symmetry)
+        main = self._block(self._main_basis(constraint, everything, degree), symmetry)
         unit = Polynomial(np.zeros((1, len(names)), dtype=np.int64), np.ones(1), names)
         pieces.append(gram_terms(main, unit))
         columns = [np.concatenate([piece[k] for piece in pieces]) for k in range(4)]
         columns[3] = np.concatenate([pieces[0][3], *(-piece[3] for piece in pieces[1:])])
-        self._rows(columns[0], columns[1], columns[2], columns[3], quotient)
+        self._rows(columns[0], columns[1], columns[2], columns[3])
         self.solved.append(_Solved(constraint, main, blocks, free))
 
-    def _main_basis(
-        self,
-        constraint: SumOfSquares,
-        support: IntArray,
-        degree: int,
-        quotient: Quotient | None,
-    ) -> IntArray:
+    def _main_basis(self, constraint: SumOfSquares, support: IntArray, degree: int) -> IntArray:
         if constraint.basis is not None:
             return np.asarray(constraint.basis, dtype=np.int64)
-        if quotient is None and not constraint.forms:
+        if not constraint.forms:
             return gram_basis(support)
         everything = candidates(self.program.indeterminates, constraint.forms, degree // 2)
-        if quotient is not None:
-            return quotient.standard(everything)
         return drop_inconsistent(everything, support)
 
     def _block(self, basis: IntArray, symmetry: IntArray) -> Block:
@@ -245,12 +232,8 @@ class Builder:
         column: IntArray,
         feature: IntArray,
         value: FloatArray,
-        quotient: Quotient | None,
     ) -> None:
         """One equality row per monomial: Σ value·x[column] = 0, constants to the right."""
-        if quotient is not None:
-            exponents, spread, factor = reduced(exponents, quotient)
-            column, feature, value = column[spread], feature[spread], value[spread] * factor
         monomials_used, row = np.unique(exponents, axis=0, return_inverse=True)
         # Row of x^α in variables of size 1: times size^α.
         value = value * np.prod(self.size**exponents, axis=1)

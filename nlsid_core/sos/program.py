@@ -24,9 +24,7 @@ class SumOfSquares:
 
     p: polynomial, affine in the decisions. domain: the g_i ≥ 0. equalities: the h_j = 0, with free
     multipliers. degree: of each summand, in the indeterminates; default: the least even degree
-    that fits p and the domain. modulo: one polynomial h; the identity then holds modulo h, without
-    a multiplier (the sphere form). basis: (k, n) monomials v; default: chosen from the support.
-    lowest: the least degree of the multipliers σ_i, for a p that vanishes at 0 to that order.
+    that fits p and the domain. basis: (k, n) monomials v; default: chosen from the support.
     vanishing: variables at whose common zero p vanishes to second order; every monomial of the
     multipliers then holds one, or no Gram matrix could be definite.
     forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
@@ -36,9 +34,7 @@ class SumOfSquares:
     domain: tuple[Polynomial, ...] = ()
     equalities: tuple[Polynomial, ...] = ()
     degree: int | None = None
-    modulo: Polynomial | None = None
     basis: IntArray | None = None
-    lowest: int = 0
     vanishing: tuple[str, ...] = ()
     forms: tuple[str, ...] = ()
     name: str = ""

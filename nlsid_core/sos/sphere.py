@@ -163,10 +163,6 @@ class SphereProgram:
             centred=found.centred,
         )
 
-    def orthonormal(self) -> FloatArray:
-        """(N, k) combinations of v at the points, orthonormal in the mean over them."""
-        return np.asarray(np.linalg.qr(self._V)[0] * np.sqrt(len(self.points)))
-
     def gram(self, solution: SphereSolution) -> FloatArray:
         """(k, k) Gram matrix of the solution in the monomials `basis`."""
         Q = self._whiten.T @ solution.X @ self._whiten

@@ -10,7 +10,6 @@ from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.polynomial import Gram, Polynomial, monomials
 from nlsid_core.sos.basis import parity_kernel
-from nlsid_core.sos.quotient import Quotient
 
 # Exponents in the indeterminates, column of the unknown, parameter monomial, value.
 TermColumns: TypeAlias = tuple[IntArray, IntArray, IntArray, FloatArray]
@@ -92,19 +91,4 @@ def free_terms(basis: IntArray, start: int, h: Polynomial) -> TermColumns:
         column,
         np.zeros_like(column),
         np.tile(h.coefficients.astype(np.float64), len(basis)),
-    )
-
-
-def reduced(exponents: IntArray, quotient: Quotient) -> tuple[IntArray, IntArray, FloatArray]:
-    """Normal forms of monomials: exponents, which monomial each came from, and factors."""
-    rows, origin, factors = [], [], []
-    for k, exponent in enumerate(exponents.tolist()):
-        for key, factor in quotient.remainder(tuple(exponent)).items():
-            rows.append(key)
-            origin.append(k)
-            factors.append(factor)
-    return (
-        np.array(rows, dtype=np.int64).reshape(-1, exponents.shape[1]),
-        np.array(origin, dtype=np.int64),
-        np.array(factors, dtype=np.float64),
     )

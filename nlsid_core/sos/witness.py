@@ -15,10 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from math import ceil, lcm, log2
+from math import ceil, log2
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cholesky
 
 from nlsid_core.arrays import FloatArray, IntArray, Json
@@ -135,47 +135,14 @@ def multiplier(
     return _written(monomials, columns, bits, roots)
 
 
-def exact_witness(basis: ArrayLike, Q: NDArray[np.object_] | Sequence[Sequence[Fraction]]) -> Json:
-    """The same of v'Qv exactly, for a rational Q ⪰ 0 that may be singular: Q = Σ d_i l_i l_i'.
-
-    Raises Infeasible if Q is not positive semidefinite.
-    """
-    rest = [[Fraction(entry) for entry in row] for row in Q]
-    size, squares = len(rest), []
-    for k in range(size):
-        pivot, row = rest[k][k], rest[k][k:]
-        if pivot < 0 or (pivot == 0 and any(row)):
-            raise Infeasible("the rational Gram matrix is not positive semidefinite")
-        if pivot == 0:
-            continue
-        common = lcm(*(entry.denominator for entry in row))
-        whole = [int(entry * common) for entry in row]
-        squares.append(([0] * k + whole, 1 / (pivot * common**2)))
-        for i in range(k, size):
-            for j in range(k, size):
-                rest[i][j] -= row[i - k] * row[j - k] / pivot
-    scale = lcm(*(weight.denominator for _, weight in squares))
-    return {
-        "basis": np.asarray(basis).tolist(),
-        "columns": [0] * size,
-        "squares": {
-            "unit": 0,
-            "scale": write_whole(scale),
-            "weights": [write_whole(int(weight * scale)) for _, weight in squares],
-            "factors": [[_row(row) for row, _ in squares]],
-        },
-    }
-
-
 def expanded(squares: Json) -> dict[tuple[int, ...], list[Fraction]]:
     """What `{basis, columns, squares}` is exactly: Bernstein control points of each monomial."""
     parts, columns = squares["squares"], squares["columns"]
     monomials, factors = [tuple(row) for row in squares["basis"]], parts["factors"]
-    scale = Fraction(4) ** -parts["unit"] / int(parts.get("scale", 1))
+    scale = Fraction(4) ** -parts["unit"]
     result: dict[tuple[int, ...], list[Fraction]] = {}
     for at, rows in enumerate(factors):
-        weights = [int(w) for w in parts.get("weights", [1] * len(rows))]
-        for weight, row in zip(weights, rows, strict=True):
+        for row in rows:
             start = len(monomials) - len(row)
             entries = [
                 (monomials[start + k], Fraction(2) ** columns[start + k] * int(entry))
@@ -186,7 +153,7 @@ def expanded(squares: Json) -> dict[tuple[int, ...], list[Fraction]]:
                 for right, b in entries:
                     key = tuple(i + j for i, j in zip(left, right, strict=True))
                     control = result.setdefault(key, [Fraction(0)] * len(factors))
-                    control[at] += scale * weight * a * b
+                    control[at] += scale * a * b
     return result
 
 

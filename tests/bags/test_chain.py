@@ -1,8 +1,11 @@
 """The chain on the shipped F1TENTH bags, through the command line, with the promised figures."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +21,7 @@ from bags.chain.training import load_training
 from bags.commands.cli import app
 from bags.commands.show import paced_lines, replay_lines
 from bags.designs import documents
+from bags.designs.provenance import of_proof
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
@@ -107,14 +111,13 @@ def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
         assert {name for name, _ in tube.measured_on} == set(config.split.calibration)
         assert set(tube.designed_on) == set(model.bags)
         assert not {d for _, d in tube.measured_on} & {d for _, d in model.bags}
-    assert "exceeds their largest with probability at most 1/17)" in proved.verdict.assumptions[1]
+    said = of_proof(chain / documents.FUNNEL_PROOF).said[0]
+    assert "exceeds their largest with probability at most 1/17" in said
 
 
 def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
-    out, model = str(tmp_path / "again"), str(chain / documents.MODEL)
-    made = CliRunner().invoke(
-        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", out]
-    )
+    again = shutil.copytree(chain, tmp_path / "again")
+    made = CliRunner().invoke(app, ["funnel", str(again), "--config", str(CONFIG)])
     said = " ".join(made.output.replace("│", " ").split())
     tube = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.tubes[0]
     level, measured = re.search(r"E <= (\S+) .*? taken whole, (\S+), safety", said).groups()  # type: ignore[union-attr]
@@ -128,8 +131,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
     out = tmp_path / "copy"
     shutil.copytree(chain, out)
-    model = str(out / documents.MODEL)
-    arguments = ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
+    arguments = ["funnel", str(out), "--config", str(CONFIG)]
     made = CliRunner().invoke(app, arguments)
     assert made.exit_code == 0, made.output
     lines = {line[:20].strip(): line[20:].split() for line in made.output.splitlines()}
@@ -156,10 +158,9 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
 def test_a_tube_wider_than_required_ends_with_status_1(
     chain: Path, tmp_path: Path, require: str, status: int
 ) -> None:
-    model, out = str(chain / documents.MODEL), str(tmp_path)
+    again = shutil.copytree(chain, tmp_path / "again")
     made = CliRunner().invoke(
-        app,
-        ["funnel", "--model", model, "--config", str(CONFIG), "--out", out, "--require", require],
+        app, ["funnel", str(again), "--config", str(CONFIG), "--require", require]
     )
     assert made.exit_code == status
     assert ("error: the half-width of speed" in made.output) == bool(status)
@@ -173,11 +174,11 @@ def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     for name in (documents.MODEL, documents.TRAINING):
         shutil.copy(chain / name, tmp_path)
     yaml_file = edited(tmp_path, split__calibration=[])
-    arguments = ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(yaml_file)]
-    made = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
+    arguments = ["funnel", str(tmp_path), "--config", str(yaml_file)]
+    made = CliRunner().invoke(app, arguments)
     assert made.exit_code == 0, made.output
     assert "what it catches is not known" in made.output
-    required = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--require", "0.9"])
+    required = CliRunner().invoke(app, [*arguments, "--require", "0.9"])
     assert required.exit_code == 2, "not measured is neither yes nor no"
 
 
@@ -186,17 +187,16 @@ def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_
     path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
     content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
     path.write_text(json.dumps(content))
-    common = ["--config", str(path), "--out", str(tmp_path)]
-    made = CliRunner().invoke(app, ["identify", str(trial("41")), *common])
+    common = ["--config", str(path)]
+    made = CliRunner().invoke(app, ["identify", str(tmp_path), str(trial("41")), *common])
     assert made.exit_code == 0, made.output
-    model = str(tmp_path / documents.MODEL)
-    made = CliRunner().invoke(app, ["funnel", "--model", model, *common])
+    made = CliRunner().invoke(app, ["funnel", str(tmp_path), *common])
     assert made.exit_code == 0, made.output
     assert "of 1 held-back trial," in made.output
     proved = documents.load_proved_funnel(tmp_path / documents.FUNNEL)
-    said = proved.verdict.assumptions[1]
-    assert "largest of 1 distinct window, taken whole, " in said
-    assert said.endswith("as windows of one recording are hardly exchangeable)")
+    said = of_proof(tmp_path / documents.FUNNEL_PROOF).said[0]
+    assert "largest of 1 distinct window " in said
+    assert said.endswith("as windows of one recording are hardly exchangeable")
     (digest,) = {digest for _, digest in proved.design.model.bags}
     for tube in proved.design.funnel.tubes:
         assert tube.designed_on == (("trial_41[0:44]", f"{digest}[0:44]"),)
@@ -266,19 +266,15 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     path = edited(tmp_path, funnel={"safety_factor": 1.5})
     for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
-    done = CliRunner().invoke(
-        app,
-        ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(path),
-         "--out", str(tmp_path)],
-    )  # fmt: skip
+    done = CliRunner().invoke(app, ["funnel", str(tmp_path), "--config", str(path)])
     assert done.exit_code == 0, done.output
     assert "for ever" in done.output
     assert not (tmp_path / documents.POLICY).exists()
     done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
     assert done.exit_code == 0, done.output
     bags = [str(trial("05")), str(trial("11"))]
-    held = ["monitor", *bags, "--replay", "--funnel", str(tmp_path / documents.FUNNEL)]
-    done = CliRunner().invoke(app, held)
+    held = ["monitor", str(tmp_path)]
+    done = CliRunner().invoke(app, [*held, *bags])
     assert done.exit_code == 0, done.output
     proved = documents.load_proved(tmp_path / documents.FUNNEL)
     replayed = replay_bag(proved, trial("05"), centre=Centre.COMMAND)
@@ -288,7 +284,7 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     write_faulty_copy(
         trial("05"), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS["zero after 1 s"]
     )
-    done = CliRunner().invoke(app, [held[0], str(tmp_path / "bag"), *held[3:]])
+    done = CliRunner().invoke(app, [*held, str(tmp_path / "bag")])
     assert done.exit_code == 1, done.output
 
 
@@ -322,12 +318,17 @@ def replay(chain: Path, bag: Path) -> Replay:
     return replay_bag(proved, bag, centre=Centre.COMMAND)
 
 
-def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
-    split = config.split.model_copy(update={"test": ("trial_05", "trial_5"), "calibration": ()})
-    bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
-    given = config.model_copy(update={"split": split})
-    trials = read_trials(bags, given, progress=silent)
-    assert trials.absent == ("trial_5",)
+@pytest.mark.parametrize("use", ["test", "validation", "calibration"])
+@pytest.mark.parametrize("name", ["trial_5", "trial_?", "trial_04.2"])
+def test_a_name_in_the_split_that_no_bag_has_is_refused(
+    config: Config, use: str, name: str
+) -> None:
+    split = {"test": ("trial_05",), "calibration": ()}
+    split[use] = (*split.get(use, ()), name)
+    given = config.model_copy(update={"split": config.split.model_copy(update=split)})
+    bags = [bag for bag in f1tenth() if bag.name in ("trial_04", "trial_05", "trial_06")]
+    with pytest.raises(DataError, match=rf"split\.{use} names {re.escape(name)}"):
+        read_trials(bags, given, progress=silent)
 
 
 def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Path) -> None:
@@ -458,9 +459,7 @@ def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
 @pytest.mark.pictures
 def test_monitor_command_summarises_draws_and_ends_with_status_0(chain: Path) -> None:
     bags = [str(trial(name)) for name in TEST]
-    done = CliRunner().invoke(
-        app, ["monitor", "--funnel", str(chain / documents.FUNNEL), "--replay", *bags]
-    )
+    done = CliRunner().invoke(app, ["monitor", str(chain), *bags])
     assert done.exit_code == 0, done.output
     assert done.output.count("inside") == len(TEST)
     picture = (chain / documents.MARGIN_PLOT).read_bytes()
@@ -473,10 +472,8 @@ def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
     write_faulty_copy(
         trial("05"), tmp_path / "bad", "/odom:twist.twist.linear.x", FAULTS["scaled by 0.6"]
     )
-    funnel, plot = str(chain / documents.FUNNEL), str(tmp_path / "plot.png")
-    done = CliRunner().invoke(
-        app, ["monitor", "--funnel", funnel, "--plot", plot, "--replay", str(tmp_path / "bad")]
-    )
+    plot = str(tmp_path / "plot.png")
+    done = CliRunner().invoke(app, ["monitor", str(chain), str(tmp_path / "bad"), "--out", plot])
     assert done.exit_code == 1
     assert "innovation energy" in done.output
 
@@ -514,6 +511,44 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
     with pytest.raises(DataError, match="not the data the model was fitted to"):
         design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
     assert not (tmp_path / documents.FUNNEL).exists()
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("monitor", "DIR", "BAG"),
+        ("check", "DIR"),
+        ("bag", "info", "BAG"),
+        ("bag", "signals", "BAG", "--json"),
+        ("fleet", "monitor", "DIR", "BAG"),
+    ],
+)
+def test_the_status_is_the_same_where_nobody_reads_what_is_said(
+    chain: Path, verb: tuple[str, ...]
+) -> None:
+    """As in `nlsid ... | head`: status 1 means outside, bad or rejected, and nothing is."""
+    words = {"DIR": chain, "BAG": trial("05")}
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "bags.commands.cli", *(str(words.get(w, w)) for w in verb)]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.pictures
+def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_path: Path) -> None:
+    with Bag(trial("05")) as source, BagWriter(tmp_path / "short") as target:
+        for message in list(source.messages())[:9]:
+            kind, _ = source.types_on(message.topic)
+            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
+            target.write(message.topic, kind, message.data, **times)
+    picture = tmp_path / "monitor.png"
+    picture.write_bytes(b"of another run")
+    arguments = ["monitor", str(chain), str(tmp_path / "short"), "--out", str(picture)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2
+    assert picture.read_bytes() == b"of another run"
 
 
 def edited(tmp_path: Path, **changes: object) -> Path:
@@ -563,9 +598,10 @@ def test_a_configuration_that_is_no_mapping_is_refused(tmp_path: Path, text: str
     [
         (["nowhere"], {}, "there is no bag"),
         (["01", "02"], {}, "none of the bags is a test trial"),
-        (["05", "11"], {}, "all of the bags are test trials"),
+        (["05"], {}, "all of the bags are test trials"),
+        (["01", "05", "06"], {"split__test": ["trial_05", "trial_6"]}, "no bag is called so"),
         (["01", "05"], {"grid__period": 0.05}, "period"),
-        (["06", "07", "08", "11"], {}, "constant"),
+        (["06", "07", "05"], {}, "constant"),
         (["01", "02", "05"], {"identification__lags": 40}, "rows for 82 parameters"),
     ],
 )
@@ -574,8 +610,9 @@ def test_bad_input_ends_in_one_message_and_leaves_nothing_behind(
 ) -> None:
     out = tmp_path / "out"
     paths = [str(trial(b)) if b.isdigit() else str(tmp_path / b) for b in bags]
-    arguments = ["identify", *paths, "--config", str(edited(tmp_path, **changes))]
-    done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+    split = {"split__test": ["trial_05"], "split__calibration": []}
+    config = str(edited(tmp_path, **(split | changes)))
+    done = CliRunner().invoke(app, ["identify", str(out), *paths, "--config", config])
     assert isinstance(done.exception, NlsidError)
     assert reason in str(done.exception)
     assert not out.exists()

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
-from bags.designs.bundle import Bundle, decide
+from bags.designs.bundle import Bundle
 from bags.designs.design import Wiring
 from bags.designs.documents import load_proved
 from bags.monitoring.replay import replay_messages
@@ -23,6 +23,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Limits
 from nlsid_core.running.reading import Reading, Status
+from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
 
 RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"
@@ -82,9 +83,8 @@ def test_it_is_driven_from_stage_to_stage_and_held_against_each(
         r for _, r, _ in replay_messages(design, tmp_path / "bag") if r.status.value != "unknown"
     ]
     assert [r.margin for r in replayed] == [r.margin for r in readings]
-    runner, where = CliRunner(), ["--funnel", str(folder / designs.COMPOSITION)]
-    where += ["--response", RESPONSE, "--command", COMMAND, "--period", "0.05"]
-    said = runner.invoke(app, ["monitor", "--replay", *where, str(tmp_path / "bag")])
+    where = ["-y", RESPONSE, "-u", COMMAND, "--period", "0.05"]
+    said = CliRunner().invoke(app, ["monitor", str(folder), str(tmp_path / "bag"), *where])
     assert (said.exit_code, "inside" in said.output) == (0, True), said.output
     scene = Scene("a recording", "replay")
     recording = Recording(

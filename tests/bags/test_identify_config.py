@@ -92,7 +92,7 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
          r"identification.iterations: should be a whole number from 1 to 1000 \(found 0\)"),
         ({"lags": 2, "iterations": 2.5}, r"iterations: Input should be a valid integer"),
         ({"lags": 2, "iterations": 4, "method": "least_squares"},
-         r"identification.iterations: there is no such key; there are: model, lags, noise_lags, m"),
+         r"identification.iterations: there is no such key; there are: model, lags, method"),
         ({"lags": 2, "transient": -1}, r"identification.transient: Input should be greater than"),
         ({"lags": 2, "allow_unproved": "yes"}, r"allow_unproved: Input should be a valid boolean"),
         ({"model": "block_cascade", "orders": [1, 2.5]}, r"orders.1: Input should be a valid int"),

@@ -8,12 +8,12 @@ from scipy.signal import lfilter
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.polynomial.moments import (
     MonotoneClass,
     offsets_of,
     repeated_moments,
 )
-from nlsid_core.identification.monotone import identify_from_repeats
+from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
 from tests.repeated import CLASS, OFFSETS, pair
 

@@ -4,12 +4,10 @@ import http.client
 import json
 import math
 import shutil
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 from xml.etree import ElementTree
 
@@ -20,18 +18,15 @@ from bags.chain.shipped import config_file
 from bags.designs import documents
 from bags.monitoring.replay import replay_messages
 from bags.samples import f1tenth
-from bags.viewing import foxglove, scene
+from bags.viewing import scene
 from bags.viewing.drawn import HalfWidths
-from bags.viewing.foxglove import serve_foxglove
 from bags.viewing.page import MOST_READERS, PAGE, serve_page
 from bags.viewing.replay import Recording
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
-from bags.viewing.serving import serve
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from tests.browser import CHROMIUM, MISSING, Page, browser
-from tests.websocket import WebSocket
 
 LOCAL = "127.0.0.1"
 GOOD = {"margin": 0.5, "assumption": 0.1, "nominal": 1.0, "measured": 1.1, "half_width": 0.4}
@@ -245,7 +240,7 @@ def test_a_port_that_is_taken_is_said(watched: Scene) -> None:
         port = urlsplit(address).port
         assert port is not None
         said = f"cannot serve on {LOCAL}, port {port}"
-        with pytest.raises(DataError, match=said), serve(watched, page=True, host=LOCAL, port=port):
+        with pytest.raises(DataError, match=said), serve_page(watched, host=LOCAL, port=port):
             pass
 
 
@@ -377,108 +372,6 @@ def test_a_replay_keeps_the_pace_of_the_stamps_and_stops_when_asked(funnel: Path
     recording.play(again, 1.0, closing)
     assert again.samples_after(0, 10**9)[0] < len(stamps)
     assert again.verdict().word != "recording over"
-
-
-def test_foxglove_gets_margins_signals_forecasts_status_and_events(watched: Scene) -> None:
-    pytest.importorskip("foxglove", reason="needs foxglove-sdk (extra `view`)")
-    with serve_foxglove(watched, host=LOCAL, port=0) as address:
-        port = urlsplit(address).port
-        assert port is not None
-        with WebSocket(port, protocol="foxglove.sdk.v1") as client:
-            assert client.accepted
-            channels: dict[str, int] = {}
-            while len(channels) < 5:
-                message = json.loads(client.receive())
-                for each in message.get("channels", ()):
-                    channels[each["topic"]] = each["id"]
-            wanted = [{"id": i, "channelId": i} for i in channels.values()]
-            client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-            heard: dict[str, list[tuple[int, dict[str, Any]]]] = {}
-            names = {i: topic for topic, i in channels.items()}
-            deadline, k = time.monotonic() + 60, 1
-            while not set(channels) <= set(heard):
-                assert time.monotonic() < deadline, heard
-                k += 1
-                watched.sample(k * 10**9, GOOD | {"time_to_exit": math.inf})
-                watched.forecast(k * 10**9 + 5 * 10**8, {"low": 0.9, "high": 1.3, "ahead": 0.5})
-                watched.say(k * 10**9, "monitor", OK, "inside")
-                watched.say(k * 10**9, "controller", OK, f"sample {k}")
-                data = client.receive()
-                if data[:1] != b"\x01":
-                    continue
-                identifier, stamp_ns = struct.unpack("<IQ", data[1:13])
-                topic = names[identifier]
-                body = {} if topic == foxglove.EVENTS else json.loads(data[13:])
-                if topic == foxglove.EVENTS:
-                    assert b"monitor" in data or b"controller" in data
-                heard.setdefault(topic, []).append((stamp_ns, body))
-    stamp_ns, margin = heard[foxglove.MARGIN][0]
-    assert stamp_ns % 10**9 == 0
-    assert margin == {"margin": 0.5, "assumption": 0.1}, "inf is left out"
-    [signal] = heard[foxglove.SIGNALS][0][1]["signals"]
-    assert signal == pytest.approx(
-        {"name": "speed [m/s]", "nominal": 1.0, "lower": 0.6, "upper": 1.4, "measured": 1.1}
-    )
-    assert heard[foxglove.STATUS][0][1]["word"] == "inside"
-    stamp_ns, ahead = heard[foxglove.FORECAST][0]
-    assert stamp_ns % 10**9 == 0, "logged when it was made"
-    assert ahead["ahead"] == 0.5
-    assert ahead["signals"] == [{"name": "speed [m/s]", "lower": 0.9, "upper": 1.3}]
-
-
-def test_who_opens_foxglove_late_is_told_what_happened_before() -> None:
-    pytest.importorskip("foxglove", reason="needs foxglove-sdk (extra `view`)")
-    over = Scene("a recording", "replay")
-    with serve_foxglove(over, host=LOCAL, port=0) as address:
-        port = urlsplit(address).port
-        assert port is not None
-        over.say(10**9, "monitor", ERROR, "outside: speed")
-        time.sleep(4 * foxglove.TICK)  # told to nobody
-        for _viewer in range(2):  # the second one comes after the first has gone
-            with WebSocket(port, protocol="foxglove.sdk.v1") as client:
-                channels: dict[str, int] = {}
-                while len(channels) < 5:
-                    for each in json.loads(client.receive()).get("channels", ()):
-                        channels[each["topic"]] = each["id"]
-                wanted = [{"id": i, "channelId": i} for i in channels.values()]
-                client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-                heard = dict[int, bytes]()
-                while channels[foxglove.EVENTS] not in heard:
-                    data = client.receive()
-                    if data[:1] == b"\x01":
-                        heard[struct.unpack("<I", data[1:5])[0]] = data[13:]
-            assert b"outside: speed" in heard[channels[foxglove.EVENTS]]
-            time.sleep(4 * foxglove.TICK)
-
-
-def test_without_foxglove_it_says_what_to_install(
-    watched: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with (
-        pytest.raises(DataError, match="pip install 'nlsid\\[view\\]', or use --page"),
-        serve_foxglove(watched, host=LOCAL, port=0),
-    ):
-        pass
-
-
-def test_the_foxglove_layout_asks_for_what_is_published() -> None:
-    layout = json.loads(config_file("foxglove_layout.json").read_text())
-    panels = layout["configById"]
-    paths = [p["value"] for panel in panels.values() for p in panel.get("paths", ())]
-    paths += [panel["path"] for panel in panels.values() if "path" in panel]
-    for path in filter(lambda path: path.startswith("/"), paths):
-        topic, _, fields = path.partition(".")
-        schema = {"properties": foxglove.SCHEMAS[topic]}
-        for field in fields.split("."):
-            name, _, index = field.partition("[")
-            schema = schema["properties"][name]
-            schema = schema["items"] if index else schema
-        assert schema["type"] in ("number", "string")  # type: ignore[comparison-overlap]
-    assert panels["RosOut!events"]["topicToRender"] == foxglove.EVENTS
-    assert set(json.dumps(layout["layout"]).split('"')) >= set(panels)
-    words = {rule["rawValue"] for rule in panels["Indicator!verdict"]["rules"]}
-    assert words >= set(scene.WORDS) | {"late", "stale", "waiting", "recording over", "error"}
 
 
 def test_the_plotjuggler_layout_asks_for_what_is_published(funnel: Path) -> None:

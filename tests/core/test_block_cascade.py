@@ -11,17 +11,21 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import prove_stability
-from nlsid_core.identification.block_cascade import (
+from nlsid_core.identification.network.cascade import (
     BlockCascadeClass,
     CascadeFit,
     identify_block_cascade,
 )
-from nlsid_core.identification.cascade_fit import (
+from nlsid_core.identification.network.cascade_fit import (
     Parameters,
     Trial,
     second_inputs,
 )
-from nlsid_core.identification.cascade_starts import mean_square, with_intervals, with_phases
+from nlsid_core.identification.network.cascade_starts import (
+    mean_square,
+    with_intervals,
+    with_phases,
+)
 from nlsid_core.models import BlockCascade, Spline
 from tests.cascades import recording, truth, two_phases
 

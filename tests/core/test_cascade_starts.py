@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
-from nlsid_core.identification.cascade_fit import Parameters, Trial, sensitivities, simulate
+from nlsid_core.identification.network.cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.network.cascade_fit import Parameters, Trial, sensitivities, simulate
 from nlsid_core.models import BlockCascade
 from tests.cascades import in_motion, truth, two_phases, wiener
 

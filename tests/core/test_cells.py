@@ -22,7 +22,7 @@ from nlsid_core.identification import (
     prove_stability,
     select,
 )
-from nlsid_core.identification.cells import Cascade, Limit, Trial
+from nlsid_core.identification.network.cells import Cascade, Limit, Trial
 from nlsid_core.identification.prediction import predict, simulate_trial
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from tests.core.kernel.stability_claims import network

@@ -17,12 +17,12 @@ from nlsid_core.identification import (
     Sem,
     identify,
 )
-from nlsid_core.identification.implicit_class import build_implicit_rows
-from nlsid_core.identification.implicit_descent import ImplicitSet
-from nlsid_core.identification.implicit_search import least_squares_coefficients
-from nlsid_core.identification.moment_rie import Problem
-from nlsid_core.identification.moments import Offsets, offsets_of, plain_moments
-from nlsid_core.identification.monotone_descent import MonotoneSet
+from nlsid_core.identification.polynomial.implicit_descent import ImplicitSet
+from nlsid_core.identification.polynomial.implicit_rie import least_squares_coefficients
+from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
+from nlsid_core.identification.polynomial.moment_rie import Problem
+from nlsid_core.identification.polynomial.moments import Offsets, offsets_of, plain_moments
+from nlsid_core.identification.polynomial.monotone_descent import MonotoneSet
 from nlsid_core.identification.starts import as_implicit, as_monotone, linear_start
 from tests.repeated import CLASS, run, truth
 

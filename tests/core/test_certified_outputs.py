@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from nlsid_core.identification import certified, prove_stability
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.matrix_set import MatrixSet, slowest_rate
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.state_affine import StateAffineClass, StateAffineRows
+from nlsid_core.identification import prove_stability
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial import certified
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.matrix_set import MatrixSet, slowest_rate
+from nlsid_core.identification.polynomial.rows import StateAffineClass, StateAffineRows
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check
 from tests.state_affine_rows import problem

@@ -24,7 +24,6 @@ from nlsid_core.design.tube import design_output_tube
 from nlsid_core.designs import (
     COMPOSITION,
     FUNNEL,
-    HYBRID,
     MODEL,
     POLICY,
     PROOF,
@@ -169,16 +168,13 @@ def test_a_folder_without_a_proof_is_an_error_of_the_files(
         load_design(tmp_path)
 
 
-@pytest.mark.parametrize("name", [COMPOSITION, HYBRID])
-def test_a_claim_about_several_funnels_is_no_design(
-    any_design: AnyDesign, tmp_path: Path, name: str
-) -> None:
+def test_a_claim_about_several_funnels_is_no_design(any_design: AnyDesign, tmp_path: Path) -> None:
     any_design.save(tmp_path)
-    (tmp_path / PROOF).rename(tmp_path / name)
-    with pytest.raises(DocumentError, match=f"{name} is about several funnels, not about one"):
+    (tmp_path / PROOF).rename(tmp_path / COMPOSITION)
+    with pytest.raises(DocumentError, match="is about several funnels, not about one"):
         load_design(tmp_path)
-    with pytest.raises(DocumentError, match=f"{name} is a proof: give one of the files"):
-        documents.load(tmp_path / name)
+    with pytest.raises(DocumentError, match=f"{COMPOSITION} is a proof: give one of the files"):
+        documents.load(tmp_path / COMPOSITION)
 
 
 def test_a_proof_of_something_else_is_no_design(

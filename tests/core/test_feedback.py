@@ -17,8 +17,8 @@ from nlsid_core.identification import (
     identify,
     prove_stability,
 )
-from nlsid_core.identification.feedback import Scaled, identify_loop, network_of
-from nlsid_core.identification.feedback_fit import (
+from nlsid_core.identification.network.feedback import Scaled, identify_loop, network_of
+from nlsid_core.identification.network.feedback_fit import (
     Basis,
     Stage,
     Trial,

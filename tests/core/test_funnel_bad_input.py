@@ -168,7 +168,7 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
     files.write_document(problem, spoil(fair()))
     with pytest.raises(NlsidError, match=message):
         FunnelProblem.load(problem).design()
-    given = ["nlsid", "funnel", "--problem", str(problem), "--out", str(out)]
+    given = ["nlsid", "funnel", str(out), "--problem", str(problem)]
     monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
@@ -192,11 +192,6 @@ def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -
     files.write_document(tmp_path / "problem.json", problem | {"hold": 0.01, "error": [0.001, 0.0]})
     found = FunnelProblem.load(tmp_path / "problem.json").design()
     assert (found.claim["hold"], found.claim["error"]) == (0.01, [0.001, 0.0])
-    files.write_document(tmp_path / "problem.json", problem | {"decay": 0.5})
-    assert FunnelProblem.load(tmp_path / "problem.json").design().claim["decay"]["rate"] == 0.5
-    files.write_document(tmp_path / "problem.json", problem | {"decay": -1.0})
-    with pytest.raises(OptionError, match="decay is -1"):
-        FunnelProblem.load(tmp_path / "problem.json").design()
     files.write_document(tmp_path / "problem.json", problem | {"hold": "longest"})
     with pytest.raises(OptionError, match="hold is 'longest'"):
         FunnelProblem.load(tmp_path / "problem.json").design()

@@ -14,8 +14,8 @@ from nlsid_core.identification import (
     prove_stability,
     simulation_percent,
 )
-from nlsid_core.identification.linear import build_regression, least_squares
-from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.linear import build_regression, least_squares
 from nlsid_core.models import DifferenceEquation, Signal
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
 

@@ -22,7 +22,7 @@ from nlsid_core.identification import (
     Rse,
     StateAffineClass,
 )
-from nlsid_core.identification.methods import alike
+from nlsid_core.identification.methods.options import alike
 
 LEAST_OPTIONS: dict[type, dict[str, Any]] = {
     LinearClass: {"lags": 1}, StateAffineClass: {"lags": 2}, MonotoneClass: {"lags": 1},
@@ -32,9 +32,7 @@ LEAST_OPTIONS: dict[type, dict[str, Any]] = {
 # class, option -> its smallest and largest allowed values, and the nearest that are refused
 LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (LinearClass, "lags"): ((1, 100), (0, 101, 2.5, True)),
-    (LinearClass, "noise_lags"): ((0, 200), (-1, 201, 2.5)),
     (StateAffineClass, "lags"): ((2, 100), (0, 101)),
-    (StateAffineClass, "noise_lags"): ((0, 200), (-1, 201)),
     (StateAffineClass, "delays"): (((0,), (2,), None), ((-1,), (3,), ())),
     (StateAffineClass, "leading_degree"): ((0, 5), (-1, 6)),
     (StateAffineClass, "lagged_degree"): ((0, 5), (-1, 6)),

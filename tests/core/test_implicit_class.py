@@ -21,8 +21,8 @@ from nlsid_core.identification import (
     predict,
     simulate_trial,
 )
-from nlsid_core.identification.implicit_class import StableSet, build_implicit_rows
-from nlsid_core.identification.implicit_search import minimise_implicit_rie
+from nlsid_core.identification.polynomial.implicit_rie import minimise_implicit_rie
+from nlsid_core.identification.polynomial.implicit_rows import StableSet, build_implicit_rows
 from nlsid_core.models import ImplicitModel
 from nlsid_core.proofs import check, proof_document
 from tests import implicit_models

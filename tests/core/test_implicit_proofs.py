@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
-from nlsid_core.identification.implicit_proof import prove_implicit, prove_well_posed
+from nlsid_core.identification.proofs.stable_sets import prove_implicit, prove_well_posed
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check, proof_document

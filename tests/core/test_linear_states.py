@@ -9,9 +9,12 @@ from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError
 from nlsid_core.identification import LinearClass, identify, prove_stability
-from nlsid_core.identification.linear_states import LinearStateFit, identify_linear_states
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.linear_states import (
+    LinearStateFit,
+    identify_linear_states,
+)
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
 

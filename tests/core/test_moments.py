@@ -10,20 +10,20 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.moment_rie import (
+from nlsid_core.identification.polynomial.moment_rie import (
     Layout,
     MomentFit,
     minimise_moment_rie,
     moment_bound,
 )
-from nlsid_core.identification.moments import (
+from nlsid_core.identification.polynomial.moments import (
     Moments,
     MonotoneClass,
     offsets_of,
     plain_moments,
     repeated_moments,
 )
-from nlsid_core.identification.monotone import (
+from nlsid_core.identification.polynomial.monotone import (
     identify_from_repeats,
     least_squares_equation,
     minimise_monotone_simulation_error,

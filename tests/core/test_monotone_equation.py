@@ -9,9 +9,9 @@ import pytest
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification import LeastSquares, Rie, Sem, identify, prove_stability
-from nlsid_core.identification.moment_rie import MomentFit
-from nlsid_core.identification.moments import MonotoneClass
-from nlsid_core.identification.monotone import (
+from nlsid_core.identification.polynomial.moment_rie import MomentFit
+from nlsid_core.identification.polynomial.moments import MonotoneClass
+from nlsid_core.identification.polynomial.monotone import (
     identify_from_repeats,
     simulate_banded,
 )

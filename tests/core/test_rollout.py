@@ -8,7 +8,7 @@ import pytest
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification.rollout import Rollout, simulate_together
+from nlsid_core.identification.polynomial.rollout import Rollout, simulate_together
 from nlsid_core.models import ImplicitModel, Signal
 from nlsid_core.models.polynomials import Polynomials
 from tests import implicit_models

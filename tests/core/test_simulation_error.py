@@ -1,6 +1,5 @@
-"""Simulation error: its derivatives, weights, and the last step that keeps the certificate."""
+"""Simulation error: its derivatives, and the last step that keeps the certificate."""
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,31 +11,31 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, ShapeError, SolverError
+from nlsid_core.errors import ShapeError, SolverError
 from nlsid_core.identification import (
     CertifiedSem,
     LinearClass,
     Rse,
     identify,
-    newton,
     prove_stability,
-    rse,
     trail,
 )
-from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.linear import (
+from nlsid_core.identification.methods import newton, rse
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
+from nlsid_core.identification.methods.simulation_error import SimulationError
+from nlsid_core.identification.polynomial.certified import (
+    certified_simulation_error,
+    descend_certified,
+)
+from nlsid_core.identification.polynomial.linear import (
     build_regression,
     least_squares,
     minimise_simulation_error,
 )
-from nlsid_core.identification.newton import minimise
-from nlsid_core.identification.rie import robust_identification_error
-from nlsid_core.identification.rse import Bound, robust_simulation_error
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.searches import _tried
-from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.starts import companion, reduced, reflected, stable_starts
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check
@@ -47,52 +46,24 @@ from tests.state_affine_rows import EXACT, dense, near_identity, problem
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
-def with_covariance(rows: Rows, *, moving_average: float) -> Rows:
-    """Weights that are not diagonal: W⁻¹ = B B' with B = I + moving_average·shift."""
-    N = len(rows)
-    inside = (np.arange(N) >= 1).astype(float)
-    size = 1.0 + 0.5 * np.cos(np.arange(N))
-    diagonal = size**2 + moving_average**2 * np.concatenate([[0.0], size[:-1] ** 2])
-    below = moving_average * inside * np.concatenate([[0.0], size[:-1] ** 2])
-    above = np.concatenate([below[1:], [0.0]])
-    return Rows(
-        rows.offsets, rows.weights, rows.errors, rows.Q, rows.identity,
-        covariance={0: diagonal, 1: below, -1: above},
-    )  # fmt: skip
-
-
-def dense_covariance(rows: Rows) -> np.ndarray:
-    assert rows.covariance is not None
-    N = len(rows)
-    S = np.zeros((N, N))
-    for D, entries in rows.covariance.items():
-        r = np.arange(max(D, 0), N + min(D, 0))
-        S[r, r - D] = entries[r]
-    return S
-
-
 def largest(values: FloatArray) -> float:
     return float(np.max(np.abs(values)))
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
-@pytest.mark.parametrize("moving_average", [0.0, 0.4])
 @pytest.mark.parametrize("first", [True, False])
-def test_the_weighted_bound_and_its_derivatives_equal_the_dense_formula(
-    outputs: int, moving_average: float, first: bool
-) -> None:
-    """J = ε'P (P'G + G'P - W)⁻¹ P'ε with P = G_m⁻ᵀ W, written as in the thesis."""
-    rows = with_covariance(problem(outputs=outputs).rows, moving_average=moving_average)
+def test_the_bound_and_its_derivatives_equal_the_dense_formula(outputs: int, first: bool) -> None:
+    """J = ε'P (P'G + G'P - I)⁻¹ P'ε with P = G_m⁻ᵀ, written as in the thesis."""
+    rows = problem(outputs=outputs).rows
     theta_m = rows.identity if first else near_identity(rows, 1, 0.05)
     theta = theta_m + 0.01 * (near_identity(rows, 0, 1.0) - rows.identity)
     bound = Bound(rows, None if first else theta_m)
     point = bound.at(theta)
-    W = np.linalg.inv(dense_covariance(rows))
-    P = np.linalg.inv(dense(rows, theta_m)).T @ W
+    P = np.linalg.inv(dense(rows, theta_m)).T
 
     def value(theta: np.ndarray) -> float:
         G = dense(rows, theta)
-        middle = np.linalg.inv(P.T @ G + G.T @ P - W)
+        middle = np.linalg.inv(P.T @ G + G.T @ P - np.eye(len(rows)))
         weight = P @ middle @ P.T
         L = np.linalg.cholesky((weight + weight.T) / 2).T
         left, right = L @ (rows.errors @ theta), L @ rows.Q
@@ -111,14 +82,9 @@ def test_the_weighted_bound_and_its_derivatives_equal_the_dense_formula(
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
-@pytest.mark.parametrize("moving_average", [None, 0.4])
-def test_the_simulation_error_of_the_rows_is_that_of_the_model(
-    outputs: int, moving_average: float | None
-) -> None:
+def test_the_simulation_error_of_the_rows_is_that_of_the_model(outputs: int) -> None:
     stacked = problem(outputs=outputs)
     rows = stacked.rows
-    if moving_average is not None:
-        rows = with_covariance(rows, moving_average=moving_average)
     theta = near_identity(rows, 4, 0.05)
     objective = SimulationError(rows)
     point = objective.at(theta)
@@ -127,8 +93,7 @@ def test_the_simulation_error_of_the_rows_is_that_of_the_model(
         ((model.simulate(trial.u, trial.y[: len(model)]) - trial.y) / model.y_scale)[len(model) :]
         for trial in stacked.dataset
     ]).ravel()  # fmt: skip
-    W = np.eye(len(rows)) if moving_average is None else np.linalg.inv(dense_covariance(rows))
-    assert pytest.approx(errors @ W @ errors, rel=1e-9) == point.J
+    assert pytest.approx(errors @ errors, rel=1e-9) == point.J
     assert pytest.approx(point.J, rel=1e-9) == Bound(rows, theta).at(theta).J
     gradient, hessian = objective.derivatives(point)
     step = 1e-6
@@ -140,43 +105,14 @@ def test_the_simulation_error_of_the_rows_is_that_of_the_model(
     assert np.linalg.eigvalsh(hessian)[0] >= -EXACT * largest(hessian)
 
 
-def test_weighted_iterates_never_go_up_and_end_at_the_weighted_simulation_error() -> None:
-    rows = with_covariance(problem(trials=2, samples=120).rows, moving_average=0.3)
+def test_iterates_never_go_up_and_end_at_the_simulation_error() -> None:
+    rows = problem(trials=2, samples=120).rows
     iterates = list(robust_simulation_error(rows, iterations=8))
     bounds = [iterate.J for iterate in iterates]
     assert len(bounds) > 2
     assert bounds == sorted(bounds, reverse=True)
     at_last = SimulationError(rows).at(iterates[-1].theta).J
     assert at_last <= bounds[-1] * (1 + EXACT)
-
-
-def test_a_weight_buys_accuracy_where_it_is_put() -> None:
-    """A wrong second half pulls the fit; weighing it down brings the fit of the first half back."""
-    stacked = problem(trials=1, samples=400, noise=0.02, model_class=StateAffineClass(1))
-    rows = stacked.rows
-    half = len(rows) // 2
-    weights = np.where(np.arange(len(rows)) < half, 1.0, 1e-4)
-
-    def first_half(used: Rows) -> float:
-        *_, last = robust_simulation_error(used, iterations=10)
-        model = stacked.model(last.theta, last.p)
-        trial = stacked.dataset.trajectories[0]
-        error = model.simulate(trial.u, trial.y[:1]) - trial.y
-        return float(np.sum(error[1 : 1 + half] ** 2))
-
-    weighted = first_half(rows.weighted(weights))
-    assert weighted < 0.999 * first_half(rows)
-    same = minimise(Bound(rows.weighted(np.full(len(rows), 2.0)), None), rows.identity).point
-    plain = minimise(Bound(rows, None), rows.identity).point
-    assert pytest.approx(2.0 * plain.J, rel=1e-6) == same.J
-
-
-def test_weights_that_make_no_sense_are_refused() -> None:
-    stacked = problem(model_class=StateAffineClass(1))
-    rows = stacked.rows
-    for wrong in (np.ones(len(rows) - 1), np.zeros(len(rows)), np.full(len(rows), np.nan)):
-        with pytest.raises(DataError, match="weights should be"):
-            rows.weighted(wrong)
 
 
 @pytest.mark.slow
@@ -254,13 +190,6 @@ def test_the_last_step_refuses_classes_it_has_no_certificate_for() -> None:
     other = problem(model_class=StateAffineClass(2, lagged_degree=2, delays=(0,)))
     with pytest.raises(ShapeError, match="degree 1 at most"):
         descend_certified(other, model, proof)
-
-
-def test_the_identification_error_has_no_weights() -> None:
-    stacked = problem(model_class=StateAffineClass(1))
-    weighted = replace(stacked, rows=stacked.rows.weighted(np.full(len(stacked.rows), 2.0)))
-    with pytest.raises(ShapeError, match="weights"):
-        robust_identification_error(weighted)
 
 
 def two_resonances(seed: int, *, noise: float) -> Dataset:

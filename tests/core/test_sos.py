@@ -1,6 +1,4 @@
-"""Sums of squares: bases, symmetry, multipliers, quotients, parameters, exact decompositions."""
-
-from fractions import Fraction
+"""Sums of squares: bases, symmetry, multipliers, parameters."""
 
 import numpy as np
 import pytest
@@ -21,9 +19,6 @@ from nlsid_core.sos import (
     template,
 )
 from nlsid_core.sos.basis import gram_basis, sign_blocks
-from nlsid_core.sos.exact import exact_gram
-from nlsid_core.sos.quotient import Quotient, divide
-from nlsid_core.sos.search import lower_bound, lyapunov
 
 x, y = variables("x y")
 (t,) = variables("t")
@@ -90,26 +85,13 @@ def test_a_disc_domain_uses_a_sum_of_squares_multiplier() -> None:
     assert np.linalg.eigvalsh(found["p"].multipliers[0].Q)[0] > -1e-8
 
 
-def test_an_equation_takes_a_free_multiplier_and_its_quotient_none() -> None:
+def test_an_equation_takes_a_free_multiplier() -> None:
     circle = 1 - x**2 - y**2
     p = x**3 + x * y - y**4
     full = Program(("x", "y"), (SumOfSquares(p - t, equalities=(circle,), name="p"),), maximise=t)
-    quotient = Program(("x", "y"), (SumOfSquares(p - t, modulo=circle, name="p"),), maximise=t)
-    a, b = solve(full), solve(quotient)
     angle = np.linspace(0, 2 * np.pi, 100_001)
     least = p(np.c_[np.cos(angle), np.sin(angle)]).min()
-    assert a.objective == pytest.approx(least, abs=1e-6)
-    assert b.objective == pytest.approx(least, abs=1e-6)
-    assert len(b["p"].gram) < len(a["p"].gram)
-
-
-def test_division_by_one_polynomial_leaves_the_normal_form() -> None:
-    circle = 1 - x**2 - y**2
-    p = x**4 * y + 3 * x**2 - y
-    mu, r = divide(p.exact(), circle.exact())
-    assert mu * circle + r == p
-    quotient = Quotient(circle)
-    assert all(quotient.remainder(e) == {e: 1.0} for e, _ in r.terms())
+    assert solve(full).objective == pytest.approx(least, abs=1e-6)
 
 
 def test_parameters_change_and_the_pattern_is_compiled_once() -> None:
@@ -181,33 +163,6 @@ def test_products_of_unknowns_are_refused() -> None:
 def test_a_polynomial_that_is_negative_somewhere_is_infeasible() -> None:
     with pytest.raises(Infeasible):
         solve(Program(("x", "y"), (SumOfSquares(x**2 - 0.1 * y**2 * x**2 - 1),)))
-
-
-def test_an_exact_gram_matrix_is_rational_and_meets_the_identity_exactly() -> None:
-    p = (x - y / 3) ** 2 * (x + 1) ** 2 + (x * y - Fraction(1, 7)) ** 2 + 1
-    third = exact_gram(p)
-    assert third.polynomial() == p
-    assert third.Q.dtype == object
-
-
-def test_a_bound_with_a_zero_needs_the_zero() -> None:
-    p = (x**2 - 2 * x * y + y**2).exact()
-    gram = exact_gram(p, zeros=[(1, 1)])
-    assert gram.polynomial() == p
-    with pytest.raises(Infeasible):
-        exact_gram(p - Fraction(1, 10**6), zeros=[])
-
-
-def test_a_linear_system_has_a_quadratic_lyapunov_function_and_an_unstable_one_none() -> None:
-    assert lyapunov((-x + 2 * y, -3 * y)).level is None
-    with pytest.raises(Infeasible):
-        lyapunov((x + 2 * y, -3 * y))
-
-
-def test_a_proved_bound_is_below_the_minimum() -> None:
-    found = lower_bound(CAMEL)
-    assert found.value < found.optimum + 1e-9
-    assert found.value == pytest.approx(-1.0316284535, abs=1e-7)
 
 
 def test_solvers_through_cvxpy_agree_with_clarabel() -> None:

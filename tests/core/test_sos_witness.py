@@ -9,10 +9,10 @@ import pytest
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
-from nlsid_core.kernel.polynomials import Ring, Work, at_width
-from nlsid_core.kernel.positivity import positive, read_witness
+from nlsid_core.kernel.polynomials import Ring, at_width
+from nlsid_core.kernel.positivity import positive, read_squares
 from nlsid_core.polynomial import monomials
-from nlsid_core.sos.witness import exact_witness, expanded, multiplier, witness
+from nlsid_core.sos.witness import expanded, multiplier, witness
 
 Coefficients = dict[tuple[int, ...], list[Fraction]]
 
@@ -21,11 +21,12 @@ def decide(c: Coefficients, squares: Any, *, strict: bool = True) -> None:
     """`positive` of Σ_j B_j(s) c_j(x), given by Bernstein control points."""
     count = len(squares["basis"][0])
 
-    def build(ring: Ring) -> None:
+    def build(ring: Ring, _: None) -> None:
         parts = [ring.bernstein(control) * ring.monomial(e) for e, control in c.items()]
-        positive(ring.sum(parts), read_witness(Node(squares, "c"), ring), ring, "c", strict=strict)
+        members = Node(squares, "c").members("basis columns squares")
+        positive(ring.sum(parts), read_squares(members, ring), ring, "c", strict=strict)
 
-    at_width(count, Work(), build)
+    at_width(count, [None], build)
 
 
 def of_grams(basis: Any, grams: Any) -> Coefficients:
@@ -76,25 +77,6 @@ def test_what_is_not_definite_is_refused_with_its_eigenvalue() -> None:
         witness([[0], [1]], np.array([[1.0, 1.0], [1.0, 1.0]]))
     with pytest.raises(Infeasible, match="not positive definite"):
         witness([[0], [1]], np.array([[1.0, 2.0], [2.0, 1.0]]))
-
-
-def test_a_singular_rational_gram_matrix_is_written_exactly() -> None:
-    """Motzkin's polynomial times (1 + x² + y²) is not in here; (x - y)²/3 + (x + 2y)²/7 - is."""
-    third, seventh = Fraction(1, 3), Fraction(1, 7)
-    Q = [
-        [third + seventh, -third + 2 * seventh, Fraction(0)],
-        [-third + 2 * seventh, third + 4 * seventh, Fraction(0)],
-        [Fraction(0), Fraction(0), Fraction(0)],
-    ]
-    basis = [[1, 0], [0, 1], [1, 1]]
-    found = exact_witness(basis, Q)
-    c: Coefficients = {(2, 0): [Q[0][0]], (1, 1): [2 * Q[0][1]], (0, 2): [Q[1][1]]}
-    assert {key: v for key, v in expanded(found).items() if any(v)} == c
-    decide(c, found, strict=False)
-    with pytest.raises(Rejected):
-        decide(c, found)
-    with pytest.raises(Infeasible):
-        exact_witness(basis, [[Fraction(-1), 0, 0], [0, 0, 0], [0, 0, 0]])  # type: ignore[list-item]
 
 
 def test_a_multiplier_is_the_gram_matrix_to_its_bits_and_what_expanded_says_exactly() -> None:

@@ -3,29 +3,21 @@
 import numpy as np
 import pytest
 
-from benchmarks.rigorous import Undecided, bound_holds
-from examples import satellite
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import (
-    CertificateRejected,
     DataError,
-    Infeasible,
     ShapeError,
     SolverError,
 )
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.proofs import decide
 from nlsid_core.sos import (
     Program,
     SphereProgram,
-    SphereProof,
     SumOfSquares,
     solve,
-    sphere_proof,
 )
 from nlsid_core.sos import sphere as sphere_module
-from nlsid_core.sos.proofs import bound_document
 
 TWICE_SOLVER = 1e-6  # of the spread: Clarabel stops at 1e-8 of quantities of size 1, not of g
 
@@ -39,7 +31,8 @@ def random_quartic(n: int, seed: int) -> Polynomial:
 def oracle(g: Polynomial) -> float:
     (m,) = variables("m")
     sphere: Polynomial = 1 - sum((z**2 for z in variables(g.names)), constant(0.0))
-    return solve(Program(g.names, (SumOfSquares(g - m, modulo=sphere),), maximise=m)).objective
+    squares = SumOfSquares(g - m, equalities=(sphere,))
+    return solve(Program(g.names, (squares,), maximise=m)).objective
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
@@ -57,46 +50,6 @@ def test_the_number_of_points_is_the_number_of_equalities() -> None:
     assert program.points.shape == (182, 6)
     assert program.basis.shape == (27, 6)
     assert np.linalg.norm(program.points, axis=1) == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-def test_every_l_step_along_the_satellite_is_proved_by_the_kernel_and_shown_in_floats() -> None:
-    program = SphereProgram(6)
-    steps = satellite.l_steps(satellite.nominal())
-    last = None
-    for step in steps[::24]:
-        g = step.polynomial()
-        last = program.solve(step.values(program.points), tolerance=1e-5, start=last)
-        assert g(program.points) == pytest.approx(step.values(program.points), abs=1e-12)
-        proof = sphere_proof(program, last, g)
-        assert 0 < last.m - proof.bound < 1e-9
-        assert prove(g, proof.bound, proof) > 0
-        assert shown(g, proof.bound, proof) > 0
-        with pytest.raises((CertificateRejected, Infeasible)):
-            prove(g, last.upper + 1e-3, proof)
-        with pytest.raises(Undecided):
-            shown(g, last.upper + 1e-3, proof)
-
-
-def prove(g: Polynomial, bound: float, proof: SphereProof) -> float:
-    document = bound_document(
-        g,
-        bound,
-        proof.gram,
-        equalities=[proof.sphere],
-        equality_multipliers=[proof.multiplier],
-    )
-    return float(decide(document, {}).margin)
-
-
-def shown(g: Polynomial, bound: float, proof: SphereProof) -> float:
-    return bound_holds(
-        g,
-        bound,
-        proof.gram,
-        equalities=[proof.sphere],
-        equality_multipliers=[proof.multiplier],
-    )
 
 
 def test_a_warm_start_reaches_the_same_margin_in_fewer_iterations() -> None:
@@ -139,8 +92,6 @@ def test_clarabel_steps_in_when_the_interior_point_gives_up(
     found = program.solve(values, start=expected)
     assert found.iterations == 0
     assert found.m == pytest.approx(expected.m, abs=1e-6 * float(np.ptp(values)))
-    proof = sphere_proof(program, found, g)
-    assert prove(g, proof.bound, proof) > 0
 
 
 def test_a_useless_warm_start_still_solves() -> None:
@@ -159,10 +110,8 @@ def test_fewer_monomials_suffice_where_few_states_enter_nonlinearly() -> None:
     A = rng.normal(size=(k, k))
     g = Gram(program.basis, A + A.T, tuple("abcde")).polynomial()
     found = program.solve(g(program.points))
-    proof = sphere_proof(program, found, g)
-    assert prove(g, proof.bound, proof) > 0
     points = rng.normal(size=(20_000, 5))
-    assert proof.bound <= np.min(g(points / np.linalg.norm(points, axis=1)[:, None]))
+    assert found.m <= np.min(g(points / np.linalg.norm(points, axis=1)[:, None]))
 
 
 @pytest.mark.parametrize("nonlinear", [(2,), (1, 2)])

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from examples import not_a_contraction
 from nlsid_core import files
 from nlsid_core.errors import CertificateRejected, Infeasible, ShapeError, SolverError
-from nlsid_core.identification import conditions
-from nlsid_core.identification.conditions import Inequality, constraint
+from nlsid_core.identification.proofs import conditions
+from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.polynomial import variables
 from nlsid_core.proofs import check, proof_document
 from nlsid_core.sos import Program, SumOfSquares, forms_of, solve, symmetric_template

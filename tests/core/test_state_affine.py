@@ -13,9 +13,9 @@ from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import prove_stability
-from nlsid_core.identification.certified import certified_simulation_error
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import (
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.certified import certified_simulation_error
+from nlsid_core.identification.polynomial.rows import (
     StateAffineClass,
     StateAffineRows,
     build_state_affine_rows,

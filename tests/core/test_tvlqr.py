@@ -44,20 +44,6 @@ def test_from_the_algebraic_solution_the_riccati_equation_stays_there() -> None:
     assert found.policy.K(0.3) == pytest.approx(np.linalg.inv(R) @ B.T @ still, rel=1e-7)
 
 
-def test_a_degree_of_stability_shifts_the_poles_and_v_falls_so_fast() -> None:
-    """Anderson and Moore: it is the Riccati equation of A + αI/2, stationary and not."""
-    field, nominal = linear_motion()
-    alpha = 3.0
-    still = solve_continuous_are(A + alpha / 2 * np.eye(2), B, Q, R)
-    found = tvlqr(field, nominal, Q=Q, R=R, S_final=(still + still.T) / 2, stability=alpha)
-    assert pytest.approx(np.broadcast_to(still, found.S.shape), rel=1e-7) == found.S
-    K = found.policy.K(0.3)
-    falls = -((A - B @ K).T @ still + still @ (A - B @ K))
-    assert np.linalg.eigvals(np.linalg.solve(still, falls)).real.min() > alpha
-    P = lyapunov(field, found.policy, Q=Q + K.T @ R @ K, P_final=found.S[-1], stability=alpha)
-    assert pytest.approx(np.broadcast_to(still, P.shape), rel=1e-7) == P
-
-
 def test_the_recursion_stays_at_the_discrete_algebraic_solution() -> None:
     step, push = expm(0.1 * A), 0.1 * B
     still = solve_discrete_are(step, push, Q, R)

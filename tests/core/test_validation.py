@@ -8,10 +8,10 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, apart, percent
-from nlsid_core.identification.linear import build_regression, least_squares
+from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification.polynomial.linear import build_regression, least_squares
+from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.prediction import predict
-from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.validation import validate, without_missing
 from nlsid_core.models import DifferenceEquation, Signal
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset

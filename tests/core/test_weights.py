@@ -17,8 +17,8 @@ from nlsid_core.identification import (
     identify,
     simulation_percent,
 )
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.starts import stable_starts
-from nlsid_core.identification.state_affine import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 W = (100.0, 0.01)

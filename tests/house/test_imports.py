@@ -5,10 +5,12 @@ import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+import nlsid
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, modules_loaded_by, sources
 
 # Each package may import itself and those before it.
@@ -16,6 +18,7 @@ DOWNWARD = {
     "nlsid_core": {"nlsid_core"},
     "bags": {"nlsid_core", "bags"},
     "nlsid_ros": {"nlsid_core", "bags", "nlsid_ros"},
+    "nlsid": {"nlsid_core", "bags"},  # hands names on, and nothing inside uses it
 }
 # The rooms of bags, each standing on those before it.
 ROOMS = (
@@ -28,7 +31,7 @@ BANDS = {
     "run": {"running"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs", "designs"},
-    "base": {"errors", "arrays", "files", "options", "progress"},
+    "base": {"errors", "arrays", "files", "options", "progress", "native"},
     "kernel": {"kernel"},
 }
 BELOW = {
@@ -43,7 +46,6 @@ SOLVERS_KNOWN_TO = {
     "nlsid_core/conic.py": SOLVERS,
     "nlsid_core/design/tube_program.py": {"cvxpy"},  # a few small ones a funnel
 }
-SYMPY_EDGE = "nlsid_core/polynomial/sympy_edge.py"  # optional, and imported by nobody inside
 BAG_FORMATS = {"rosbags", "mcap"}
 
 
@@ -200,8 +202,6 @@ def test_the_core_stands_on_numpy_and_the_search_on_scipy() -> None:
         allowed = {"numpy", "nlsid_core", *sys.stdlib_module_names}
         if room(source) in BANDS["search"]:
             allowed |= {"scipy"} | SOLVERS_KNOWN_TO.get(str(source), set())
-        if str(source) == SYMPY_EDGE:
-            allowed |= {"sympy"}
         offenders += [f"{source}: {name}" for name in sorted(source.packages - allowed)]
     assert not offenders
 
@@ -235,9 +235,22 @@ def test_importing_the_packages_loads_nothing_else() -> None:
     assert loaded_by(["nlsid_core.kernel"]) == {"nlsid_core"}
 
 
+def test_the_face_hands_names_on_and_loads_nothing_before_one_is_used() -> None:
+    assert loaded_by(["nlsid"]) == {"nlsid"}
+    assert 25 <= len(nlsid.__all__) <= 40
+    written = sources("nlsid")[0].imports
+    said = {entry.name: entry.module for entry in written if entry.package != "typing"}
+    for name in nlsid.__all__:
+        thing = getattr(nlsid, name)
+        there = getattr(thing, "__name__", name)
+        assert getattr(import_module(said[there]), there) is thing, name
+    with pytest.raises(AttributeError, match="no attribute 'Kalman'"):
+        nlsid.Kalman  # noqa: B018
+
+
 def test_help_and_check_start_without_numpy(tmp_path: Path) -> None:
     (tmp_path / "x.proof.json").write_text("{}")
-    for arguments in (["--help"], ["track", "--help"], ["check", str(tmp_path / "x.proof.json")]):
+    for arguments in (["--help"], ["bag", "--help"], ["check", str(tmp_path / "x.proof.json")]):
         loaded = modules_loaded_by(
             "from contextlib import redirect_stdout, suppress\n"
             "import io; from bags.commands.cli import app\n"

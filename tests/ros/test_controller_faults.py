@@ -15,9 +15,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.designs.documents import MODEL, load_model
+from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
+from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.ros.processes import call, node_here, process, ros_test
@@ -38,13 +41,19 @@ class Driven(Robot):
         self.controller = stack.enter_context(process(CONTROLLER, **given))
         super().__init__(node, spin_until, funnel.parent)
         self.commands: dict[int, float] = {}
+        self.run = f"{self.bundle.digest} {WAITING}"  # as a monitor's verdict names it
         node.create_subscription(TwistStamped, "/cmd_vel", self._command, qos.STREAM)
+        node.create_subscription(String, f"/{NAME}/run", self._begun, qos.DOCUMENT)
         spin_until(lambda: self.has_said("idle", NAME))
         spin_until(lambda: self.odom.get_subscription_count() >= 1)
         spin_until(lambda: node.count_publishers("/cmd_vel") >= 2)
 
     def _command(self, message: TwistStamped) -> None:
         self.commands[stamp_ns_of(message)] = message.twist.linear.x
+
+    def _begun(self, message: String) -> None:
+        run = Run.from_document(files.parse_document(message.data))
+        self.run = f"{run.funnel} {WAITING}" if run.ended else run.name
 
     def call(self, service: str) -> Trigger.Response:
         """The answer of a service of the controller."""
@@ -57,11 +66,13 @@ class Driven(Robot):
         self.spin_until(lambda: self.call("start").success)
 
     def feed(
-        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None
-    ) -> list[int]:
+        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None,
+        judging: str = "",
+    ) -> list[int]:  # fmt: skip
         """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
 
-        margin_at: a monitor's verdict comes with each, stamped so many s from it.
+        margin_at: a monitor's verdict comes with each, stamped so many s from it. judging: of which
+        funnel and run it says to be; empty: of the controller's.
         """
         first = time.time_ns() + round(ahead * 1e9)
         began = time.monotonic()
@@ -75,6 +86,7 @@ class Driven(Robot):
                 said = JointState(name=["margin", "assumption"], position=[0.5, math.nan])
                 of_ns = stamp_ns + round(margin_at * 1e9)
                 said.header.stamp.sec, said.header.stamp.nanosec = divmod(of_ns, 10**9)
+                said.header.frame_id = judging or self.run
                 self.margin.publish(said)
             due = began + (k + 1) * PERIOD_NS * 1e-9
             self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
@@ -192,6 +204,38 @@ def test_a_verdict_that_is_not_of_this_run_and_of_now_is_none(
     robot.expect_stop("funnel_monitor has judged nothing for 1 s")
 
 
+OTHER = "sha256:" + 64 * "0"
+
+
+@pytest.mark.parametrize(
+    ("judging", "because"),
+    [
+        (" ", "funnel_monitor judges a funnel that it does not name, not sha256:"),
+        ("odom", "funnel_monitor judges the funnel odom, not sha256:"),
+        (f"{OTHER} {WAITING}", f"funnel_monitor judges the funnel {OTHER}, not sha256:"),
+        (f"{{digest}} {UNANNOUNCED}", "funnel_monitor judges no run: set its controller"),
+        ("{digest} 7", "funnel_monitor has judged nothing for 1 s"),
+    ],
+)
+def test_verdicts_of_another_funnel_or_run_end_it_before_it_moves(
+    stack: ExitStack, funnel: Path, judging: str, because: str
+) -> None:
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
+    robot.watch()
+    robot.feed(80, margin_at=0.0, judging=judging.format(digest=robot.bundle.digest))
+    robot.expect_stop(because)
+    assert set(robot.commands.values()) <= {0.0}
+
+
+def test_a_second_node_that_publishes_verdicts_ends_it(stack: ExitStack, funnel: Path) -> None:
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
+    robot.watch()
+    robot.node.create_publisher(JointState, "/funnel_monitor/margin", qos.STREAM)
+    robot.feed(40, margin_at=0.0)
+    robot.expect_stop("2 nodes publish /funnel_monitor/margin")
+    assert "2 nodes publish /funnel_monitor/margin" in robot.call("start").message
+
+
 def test_with_fresh_verdicts_it_tracks_to_the_end_of_the_plan(
     stack: ExitStack, funnel: Path
 ) -> None:
@@ -213,6 +257,8 @@ def test_without_the_monitor_it_requires_it_neither_starts_nor_goes_on(
     assert robot.commands == {}
     watching = {"nominal": "profile", "controller": NAME, "command_wait": 0.5, "stale_after": LATE}
     plant = {"model": funnel.with_name("model.json")}
+    for publisher in (robot.odom, robot.command):  # the plant is the only robot
+        robot.node.destroy_publisher(publisher)
     stack.enter_context(process("nlsid_ros.plant", **plant))
     monitor = stack.enter_context(process("nlsid_ros.funnel_monitor", **watching))
     robot.spin_until(lambda: robot.has_said("waiting for the controller"))

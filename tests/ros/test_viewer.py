@@ -61,7 +61,7 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(funnel: Path) -
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, **signals, **names, **shared) as monitor,
-        process("nlsid_ros.viewer", page=True, port=port, **names) as viewer,
+        process("nlsid_ros.viewer", port=port, **names) as viewer,
     ):
         robot = Robot(node, spin_until, funnel.parent)
         robot.ready()

@@ -114,7 +114,7 @@ class Cliques:
 
 
 class CliqueSteps(LSteps):
-    """L-steps whose programs are `Cliques`; there are no limits, no w, no hold and no decay."""
+    """L-steps whose programs are `Cliques`; there are no limits, no w and no hold."""
 
     carries = False
 
@@ -122,7 +122,7 @@ class CliqueSteps(LSteps):
     def of(cls, steps: LSteps) -> "CliqueSteps | None":
         """The same L-steps by cliques, where that is possible and takes less time."""
         field = steps.field
-        plain = not (len(steps.limits) or len(field.uncertain) or steps.decay or steps.pushed)
+        plain = not (len(steps.limits) or len(field.uncertain) or steps.pushed)
         if not plain or steps.widths is not None or field.n < LARGE or field.degree > MAX_DEGREE:
             return None
         cliques = cliques_of(field)

@@ -25,7 +25,7 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
 
-SHARED = ("basis", "kappa", "decay")  # by all pieces of a proof
+SHARED = ("basis", "kappa")  # by all pieces of a proof
 CELLS = 6_000_000  # Gram entries held at once
 
 
@@ -38,8 +38,6 @@ class Pieces:
     kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
     mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
     y = (1, z) the multiplier of what holds in that mode. push: (B, m) that the input is off.
-    decay: (λ, σ) with V̇ ≤ λ(σ - V) where σ ≤ V ≤ 1, if that is what is proved; then there is no
-    multiplier mu, and tau has two more, of ρ - W and W - σρ, before the others.
     stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
     """
 
@@ -56,7 +54,6 @@ class Pieces:
     push: FloatArray
     stated: NDArray[np.object_]
     kappa: FloatArray | None = None
-    decay: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.interval)
@@ -100,8 +97,7 @@ def closed_loop_polynomial(
 
     c = dρ/ds - 2x̄'P(hf - dx₀/ds) - x̄'(dP/ds)x̄ + μ(ρ - x̄'Px̄) - Στq, x̄ = Tz, s in [0, 1] on the
     piece; derivatives are with respect to s on the whole interval, of length h. Where inputs are
-    limited, f is that of the piece's mode, and what holds in the mode is taken off. For a decay
-    c = W dρ/ds - ρ dW/ds + hλρ(σρ - W) - τ(ρ - W) - τ'(W - σρ) - Στq.
+    limited, f is that of the piece's mode, and what holds in the mode is taken off.
     """
     n, k = field.n, pieces.interval
     loop = _Loop(field, policy, funnel, pieces, end=end)
@@ -121,18 +117,7 @@ def closed_loop_polynomial(
     for i in range(n):
         c = add(c, multiply({1: -PdotT[:, :, i]}, x_bar[i], n))
     gap, rise = loop.gap(), {0: (rho[:, 1] - rho[:, 0])[:, None, None]}
-    if pieces.decay is None:
-        c = add(add(c, rise), multiply(loop.multiplier(), gap, n))
-    else:
-        rate, floor = pieces.decay
-        level = {0: loop.restricted(rho)[:, :, None]}
-        W = add(level, negative(gap))
-        above = add(W, {0: -floor * level[0]})
-        h = np.diff(funnel.t)[k][:, None, None]
-        c = add(multiply(level, c, n), multiply(rise, W, n))
-        c = add(c, multiply({0: -rate * h * level[0]}, above, n))
-        for place, shell in enumerate((gap, above)):
-            c = add(c, negative(multiply(loop.squares(place), shell, n)))
+    c = add(add(c, rise), multiply(loop.multiplier(), gap, n))
     for term in loop.held():
         c = add(c, negative(term))
     return c

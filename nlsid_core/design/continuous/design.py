@@ -13,8 +13,6 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design.continuous.cliques import CliqueSteps
-from nlsid_core.design.continuous.counterexample import try_to_miss
-from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.finer import (
@@ -25,7 +23,6 @@ from nlsid_core.design.continuous.finer import (
     most_knots,
     refusal_time,
 )
-from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.held_sweep import (
     changes_by_size,
@@ -40,22 +37,21 @@ from nlsid_core.design.continuous.setting import MOST_KNOTS, Goal, Setting, fina
 from nlsid_core.design.continuous.shape import (
     enlarge_shape,
     refuse_shape,
-    solve_ends,
     validity_caps,
 )
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
-from nlsid_core.dynamics import Jump, Nominal, PiecewisePolynomial, VectorField
+from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
+from nlsid_core.running.held import slowest
 
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
-PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 GROWTH = 4.0  # of the margin, where some piece is not proved
@@ -106,14 +102,10 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
-    search_gain: bool = False,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
-    decay: float | None = None,
-    stability: float = 0.0,
-    jump: Jump | None = None,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> FunnelDesign:
@@ -123,31 +115,25 @@ def design_funnel(
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
     started = time.perf_counter()
-    decay = None if decay is None else float(decay)
     prepared = partial(
-        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain,
-        limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,
-        stability=stability, jump=jump,
+        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain,
+        limits=limits, uncertain=uncertain, hold=hold, error=error,
     )  # fmt: skip
     setting = prepared(nominal)
     if policy is None:
         setting = _with_knots(setting, prepared)
-    if decay is not None:
-        refuse_decay(setting.steps)
     if shape == "P":
         refuse_shape(setting.steps)
-        if setting.hold is not None or decay is not None or jump is not None:
-            raise DataError("V-steps search without hold, error, decay or jump: take shape rho")
+        if setting.hold is not None:
+            raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     try:
         again = prepared if policy is None else None
         gains = () if policy is not None or R is not None or not setting.steps.field.m else FACTORS
         (setting, funnel, proved, margin), tried = _with_gains(setting, again, gains, progress)
-        if decay is not None:
-            proved = prove_decay(setting.steps, setting.policy, funnel)
     except Infeasible as refusal:
-        raise Infeasible(f"{refusal}. {_in_use(setting)}{_simulated(setting)}") from refusal
+        raise Infeasible(f"{refusal}. {_in_use(setting)}") from refusal
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -182,8 +168,6 @@ def decided(
         raise Infeasible("the funnel's end is not inside the goal")
     proof = proof_of(setting.steps, policy, funnel, proved) | {"goal_multiplier": multiplier}
     claim = {"kind": KIND, "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()}}
-    if proved.pieces.decay is not None:
-        claim["decay"] = dict(zip(("rate", "floor"), proved.pieces.decay, strict=True))
     if setting.hold is not None:
         claim |= setting.hold.claim()
         proof |= setting.rate_proof(funnel, proved.pieces.basis)
@@ -212,9 +196,11 @@ def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
     )
     causes = [f"a hold of {setting.hold.period:g} s"] if setting.hold.period else []
     causes += ["the errors of the measured state"] if setting.hold.error.any() else []
+    often = f"samples should come every {slowest(setting.hold.period):.12g} s or more often"
     return (
         f"with {' and '.join(causes)}, {part:.3g} of the half-widths are left at {funnel.t0:g} s: "
         f"{held}; without, {unheld} were found for this policy, not proved"
+        + (f"; {often}" if setting.hold.period else "")
     )
 
 
@@ -227,15 +213,6 @@ def _in_use(setting: Setting) -> str:
         if len(M)
     ]
     return f"The diagonal of {' and of '.join(rows)}"
-
-
-def _simulated(setting: Setting) -> str:
-    """What simulated solutions say of a claim that was not proved, where they can be computed."""
-    try:
-        with np.errstate(all="ignore"):
-            return f". {try_to_miss(setting)}"
-    except (ArithmeticError, ValueError, RuntimeError):  # the equations may end away from a motion
-        return ""
 
 
 def _with_gains(
@@ -359,10 +336,8 @@ def _found(setting: Setting, progress: Progress) -> _Found:
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
     """
     expansion = setting.expansion
-    if setting.hold is None or expansion is not None or setting.searches_gain:
+    if setting.hold is None or expansion is not None:
         first = _unheld(setting, progress)
-        if setting.searches_gain:
-            first = _with_faster_gain(setting, first, progress)
         if setting.hold is None:
             return first
         setting, free = replace(first[0], expansion=None, needed=first[3]), first[1].rho
@@ -459,7 +434,7 @@ def _held(
 def _free(setting: Setting, progress: Progress) -> FloatArray:
     """ρ (K,) as it is found if nothing is held."""
     steps, policy, P = setting.steps, setting.policy, setting.P
-    caps = np.minimum(validity_caps(steps.field, policy, P), setting.above_guard())
+    caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
     rho, _ = sweep_rho(
         steps, sections(steps, policy, P), margin=setting.margin(rho_final),
@@ -472,34 +447,13 @@ def _unheld(setting: Setting, progress: Progress) -> _Found:
     """The funnel if nothing is held."""
     if setting.expansion is not None:
         return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
-    caps = np.minimum(
-        validity_caps(setting.steps.field, setting.policy, setting.P), setting.above_guard()
-    )
+    caps = validity_caps(setting.steps.field, setting.policy, setting.P)
     cliques = CliqueSteps.of(setting.steps)
     if cliques is not None:
         with suppress(Infeasible, SolverError):  # then with every product
             _, funnel, proved, margin = _swept(replace(setting, steps=cliques), caps, progress)
             return setting, funnel, proved, margin
     return _swept(setting, caps, progress)
-
-
-def _with_faster_gain(setting: Setting, first: _Found, progress: Progress) -> _Found:
-    """What is found with the gains of a gain step from `first`, where that is larger."""
-    found, funnel, *_ = first
-    ends = solve_ends(found.steps, found.policy, funnel)
-    try:
-        K = faster_gain(found.steps, found.policy, funnel, ends)
-    except SolverError:  # then the gains stay what they are
-        return first
-    before = setting.policy.K.control
-    for part in PARTS:
-        gain = PiecewisePolynomial(funnel.t, before + part * (K - before))
-        other = replace(setting, policy=replace(setting.policy, K=gain))
-        with suppress(Infeasible, DataError):
-            second = _unheld(other, progress)
-            if second[1].volume_integral() > funnel.volume_integral():
-                return second
-    return first
 
 
 def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> _Found:
@@ -523,12 +477,11 @@ def _expanded(
     assert setting.expansion is not None
     steps, policy = setting.steps, setting.policy
     found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
-                           rho_final=setting.rho_final, caps=setting.above_guard(),
-                           progress=progress)  # fmt: skip
+                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-                     tightness=steps.tightness, decay=steps.decay)  # fmt: skip
+                     tightness=steps.tightness)  # fmt: skip
     proving.kappa = steps.kappa
     return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 

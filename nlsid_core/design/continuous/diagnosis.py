@@ -15,7 +15,7 @@ from nlsid_core.errors import Infeasible, SolverError
 
 NOISE = 1e-6  # of the linear part: less is rounding
 CLOSE = 1e-4  # of the boundary's size: there differences of rates are linear
-TERMS = ("remainder", "disturbance", "saturation", "hold", "curvature", "motion", "decay")
+TERMS = ("remainder", "disturbance", "saturation", "hold", "curvature", "motion")
 NAMES = {
     "remainder": "what the Taylor cubics leave out",
     "disturbance": "the disturbance w",
@@ -23,7 +23,6 @@ NAMES = {
     "hold": "an input that is held, and computed from a measurement,",
     "curvature": "the curvature of the dynamics",
     "motion": "the motion's own error, f(t, x0, u0) - dx0/dt,",
-    "decay": "the decay that is asked for",
 }
 ADVICE = {
     "remainder": "take more knots, a slower motion, or a smaller goal: it falls with the fourth "
@@ -34,7 +33,6 @@ ADVICE = {
     "hold": "take a shorter hold, smaller measurement errors, or a larger goal",
     "curvature": "take a smaller goal, a slower motion, or other Q and R",
     "motion": "give a motion with more knots, or one that obeys the dynamics more exactly",
-    "decay": "ask for a slower decay, or take feedback that acts faster (a smaller R)",
     "knots": "take more knots, or feedback that acts slower (a larger R)",
     "linear": "the linear closed loop itself lets V grow there: take other Q and R, a policy that "
     "stabilises it, more knots, or a goal that is wider in the states that no input reaches",
@@ -162,7 +160,6 @@ def _terms(
             w[j] = value
             U = section.u - x_bar @ section.K.T
             pushed[:, j] = falls(steps.rate(section, section.x + x_bar, U, w) - whole)
-    parts["decay"] = np.full(len(x_bar), -steps.decay)
     parts["disturbance"] = pushed[:, :own].sum(axis=1)
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning

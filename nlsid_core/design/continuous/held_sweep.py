@@ -41,7 +41,6 @@ class HeldSteps(LSteps):
         super().__init__(
             steps.field, setting.policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
             tolerance=steps.tolerance, widths=table[-1].copy(), tightness=steps.tightness,
-            decay=steps.decay,
         )  # fmt: skip
         self.free, self.table = free, table
 
@@ -83,7 +82,7 @@ def with_widths(setting: Setting, field: VectorField) -> LSteps:
     steps, policy = setting.steps, setting.policy
     return LSteps(
         field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
+        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness,
     )  # fmt: skip
 
 

@@ -107,10 +107,9 @@ class LSteps:
     clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
     nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
-    field's `is_pushed`). decay: 1/s, the rate of V̇ that every margin is above. kappa: (intervals,
-    n_w), if it is bounded; tightness: the same over 1/max|x̄'Pg| (None: 1). local: what the dynamics
-    are on an interval, where a search expands them anew; else they are the field. carries: whether
-    a dual of one section bounds φ at others.
+    field's `is_pushed`). kappa: (intervals, n_w), if it is bounded; tightness: the same over
+    1/max|x̄'Pg| (None: 1). local: what the dynamics are on an interval, where a search expands them
+    anew; else they are the field. carries: whether a dual of one section bounds φ at others.
     """
 
     carries = True
@@ -125,10 +124,9 @@ class LSteps:
         tolerance: float = 1e-5,
         widths: FloatArray | None = None,
         tightness: FloatArray | None = None,
-        decay: float = 0.0,
     ) -> None:
         refuse_degree(field)
-        self.field, self.decay = field, decay
+        self.field = field
         self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
         limited = policy is not None and len(policy.limits) > 0
         taken = field.curved_states if self.pushed else field.nonlinear_states
@@ -204,7 +202,7 @@ class LSteps:
         return vertex, corner, self.modes[mode]
 
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
-        """(cases, N) -Ẇ/ρ - decay at the program's points, in each mode, from the vector field."""
+        """(cases, N) -Ẇ/ρ at the program's points, in each mode, from the vector field."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
         w = np.empty((*u.shape[:2], self.vertices.shape[1]))
@@ -224,7 +222,7 @@ class LSteps:
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
         if self.kappa is not None:
             W_rate += self.from_pushes(section, x_bar).sum(axis=1)
-        return np.asarray(-W_rate / rho - self._from_defect(section, rho) - self.decay)
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
 
     def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
         """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""

@@ -158,8 +158,7 @@ def _pieces(
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
-            Q, scaled = end_proof(program, solution, target, h * rho[b],
-                                  solution.m + steps.decay + growth)  # fmt: skip
+            Q, scaled = end_proof(program, solution, target, h * rho[b], solution.m + growth)
             # From z to y = x̄ in the order in which T is triangular: z = A y.
             A = np.triu(np.linalg.inv(T[b][order]))
             M = substitution(basis, A)
@@ -339,21 +338,24 @@ def proof_of(
 ) -> Json:
     """The witnesses of all pieces as a proof states them; the kernel has not decided them yet."""
     pieces, n = proved.pieces, funnel.n
-    margin = stated_margin(proved.margins) if pieces.decay is None else 0.0
+    margin = stated_margin(proved.margins)
     written: list[Json] = [{}] * len(pieces)
     for chosen in batches(steps.field, funnel, pieces):
         found = documents(steps.field, policy, funnel, pieces.select(chosen), margin)
         for i, document in zip(chosen.tolist(), found, strict=True):
             written[i] = document
-    proof: Json = {"basis": pieces.basis.tolist(), "pieces": written}
-    if pieces.decay is None:
-        used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))
-        for document in written:
-            document["mu"] = {
-                key: [row[i] for i in used.tolist()] for key, row in document["mu"].items()
-            }
-        rows = monomials(n, Pieces.multiplier_degrees(pieces.basis))[used]
-        proof |= {"margin": margin, "multiplier": rows.tolist()}
+    used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))
+    for document in written:
+        document["mu"] = {
+            key: [row[i] for i in used.tolist()] for key, row in document["mu"].items()
+        }
+    rows = monomials(n, Pieces.multiplier_degrees(pieces.basis))[used]
+    proof: Json = {
+        "basis": pieces.basis.tolist(),
+        "pieces": written,
+        "margin": margin,
+        "multiplier": rows.tolist(),
+    }
     if pieces.tau.shape[2]:
         proof["sides"] = affine(n).tolist()
     if pieces.kappa is not None:

@@ -14,7 +14,6 @@ from scipy.linalg import solve_continuous_are
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.expansion import Expansion, NoExpansion
-from nlsid_core.design.continuous.gain import unchanged_gain
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     MAX_DEGREE,
@@ -26,7 +25,7 @@ from nlsid_core.design.continuous.lstep import (
 from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
-from nlsid_core.dynamics import Jump, Nominal, Rates, VectorField
+from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
 from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import DataError, Infeasible, NotPolynomial
@@ -41,7 +40,6 @@ MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread t
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
-GUARD_ROOM = 0.9  # of the guard's height: what the funnel may take of it
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
@@ -66,11 +64,9 @@ class Setting:
 
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not.
-    searches_gain: whether gains are looked for with which the funnel is larger. rates:
-    (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
-    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved. free:
-    (K,) ρ as it was found without the hold, of which nothing may be proved. jump: what the motion
-    ends with.
+    rates: (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n)
+    and R (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved.
+    free: (K,) ρ as it was found without the hold, of which nothing may be proved.
     """
 
     steps: LSteps
@@ -81,31 +77,15 @@ class Setting:
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
-    searches_gain: bool = False
     rates: FloatArray | None = None
     needed: float = 0.0
     free: FloatArray | None = None
-    jump: Jump | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
         t = self.policy.t
         rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
         return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
-
-    def above_guard(self) -> FloatArray:
-        """(K,) ρ with which the funnel is above the guard, by its slope, where it is first watched.
-
-        Infinite at all other knots.
-        """
-        caps = np.full(len(self.P), np.inf)
-        if self.jump is not None:
-            k = int(np.flatnonzero(self.policy.t == self.jump.start)[0])
-            x = self.policy.x.ends()[k]
-            slope, _ = self.jump.slopes(x)
-            away = slope @ np.linalg.solve(self.P[k], slope)
-            caps[k] = (GUARD_ROOM * float(self.jump.height(x[None])[0])) ** 2 / away
-        return caps
 
     def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
         """The members of a proof about how fast the input changes in the funnel.
@@ -144,14 +124,10 @@ def prepare(
     Q: ArrayLike | None,
     R: ArrayLike | None,
     gain: str,
-    search_gain: bool = False,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
-    decay: float | None = None,
-    stability: float = 0.0,
-    jump: Jump | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -162,15 +138,12 @@ def prepare(
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
-    if jump is not None:
-        _refuse_jump(jump, nominal, held)
     wanted = _wanted_goal(goal, nominal, field.n)
     weights = default_weights(field, nominal, wanted)
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
-    given = policy is not None
-    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain, stability)
+    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
@@ -179,37 +152,11 @@ def prepare(
     nonlinear = None
     if expansion is not None and (pushed or not len(field.uncertain)):
         nonlinear = expansion.nonlinear_states()
-    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed, decay=decay or 0.0)
+    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
     if held is not None:
         held.refuse(field, policy)
     rho_final, target = final_level(steps, policy, S, wanted, expansion)
-    why = unchanged_gain(field, policy, given=given) if search_gain else ""
-    if why:
-        raise DataError(f"no other gains are looked for: {why}")
-    return Setting(
-        steps, policy, S, rho_final, target, (Q, R), expansion, held, search_gain, jump=jump
-    )
-
-
-def _refuse_jump(jump: Jump, nominal: Nominal, held: Hold | None) -> None:
-    """Raise DataError unless the motion is above the guard at the knot where it is watched from."""
-    if held is not None and held.period:
-        raise DataError("an input that is held into the next stage is covered by no proof")
-    t, x = nominal.t, nominal.x.ends()
-    if jump.n != x.shape[1]:
-        raise DataError(f"the jump is of {jump.n} states, the motion of {x.shape[1]}")
-    if jump.start not in t[:-1]:
-        nearest = float(t[np.abs(t[:-1] - jump.start).argmin()])
-        raise DataError(
-            f"the guard is watched from {jump.start!r} s on, which is no knot of the motion: take "
-            f"{nearest!r} s"
-        )
-    height = float(jump.height(x[t == jump.start])[0])
-    if height <= 0:
-        raise DataError(
-            f"the motion is not above the guard at {jump.start:g} s, from where it is watched: the "
-            f"guard is {height:.3g} there"
-        )
+    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held)
 
 
 def default_weights(
@@ -348,7 +295,6 @@ def _tracking(
     Q: FloatArray,
     R: FloatArray,
     gain: str,
-    stability: float,
 ) -> Tracking:
     """ContinuousPolicy and P(t): of the LQR, or the given policy with its Lyapunov equation."""
     if goal is not None:
@@ -365,13 +311,13 @@ def _tracking(
                 "and a policy."
             ) from error
     if policy is None:
-        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain, stability=stability)
+        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
     if policy.vector_field != files.digest(field.document()):
         raise DataError("the policy was made for other dynamics")
     same = np.array_equal(policy.x.control, nominal.x.control)
     if not same or not np.array_equal(policy.t, nominal.t):
         raise DataError("the policy is around another nominal")
-    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final, stability=stability))
+    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
 
 
 def _kept(

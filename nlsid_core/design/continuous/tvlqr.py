@@ -52,13 +52,11 @@ def tvlqr(
     R: ArrayLike,
     S_final: ArrayLike,
     gain: str = "constant",
-    stability: float = 0.0,
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
     Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
-    "linear" is continuous. stability: α in 1/s, A + αI/2 for A, so that linear solutions let
-    |x̄|²_S fall at least as exp(-αt) (Anderson and Moore, a prescribed degree of stability).
+    "linear" is continuous.
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
@@ -71,7 +69,6 @@ def tvlqr(
 
     def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        A = A + stability / 2 * np.eye(field.n)
         return np.block([[A, -B @ R_inverse @ B.T], [-Q, -A.T]])
 
     S = _backward(
@@ -101,19 +98,15 @@ def lyapunov(
     *,
     Q: ArrayLike,
     P_final: ArrayLike,
-    stability: float = 0.0,
 ) -> FloatArray:
-    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2).
-
-    stability: α in 1/s, A + αI/2 for A.
-    """
+    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
     Q = definite(Q, field.n, "Q", strict=False)
     P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
 
     def hamiltonian(t: float) -> FloatArray:
         A, B = _linearised(field, nominal, t)
-        closed = A - B @ policy.K(t) + stability / 2 * np.eye(field.n)
+        closed = A - B @ policy.K(t)
         return np.block([[closed, np.zeros_like(closed)], [-Q, -closed.T]])
 
     return _backward(hamiltonian, nominal.t, P_final, "the Lyapunov equation")

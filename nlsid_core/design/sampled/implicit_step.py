@@ -24,7 +24,6 @@ from nlsid_core.kernel.positivity import positive, read_squares
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.sos import Program, SumOfSquares, solve
 from nlsid_core.sos.program import Identity
-from nlsid_core.sos.search import positive_semidefinite
 
 ROOM = 1e-5  # relative; β is raised by so much, so that the proof's matrices are definite
 ATTEMPTS = 4  # each raising β ten times as much
@@ -195,3 +194,13 @@ def _full(gram: Gram, basis: IntArray) -> FloatArray:
     Q = np.zeros((len(basis), len(basis)))
     Q[np.ix_(at, at)] = gram.Q
     return Q
+
+
+def positive_semidefinite(gram: Gram) -> Gram:
+    """With its eigenvalues lifted just above zero; the identity takes the change."""
+    if not len(gram):
+        return gram
+    lowest = float(np.linalg.eigvalsh(gram.Q)[0])
+    size = float(np.abs(gram.Q).max()) or 1.0
+    lift = max(0.0, -lowest) + 1e-13 * size
+    return Gram(gram.basis, gram.Q + lift * np.eye(len(gram)), gram.names)

@@ -1,0 +1,194 @@
+"""A .db3 file, rosbag2's SQLite storage, as blocks of messages.
+
+It is opened by SQLite itself. Where a recorder was killed, the newest messages are in a -wal file
+beside it, or half a transaction is in a -journal: then a copy of both is opened, because SQLite
+merges them when it opens a file, and a bag is never changed by reading it.
+"""
+
+import os
+import shutil
+import sqlite3
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+from urllib.parse import quote
+
+from mcap.records import Channel, Metadata, Schema
+
+from bags.recordings.batch import BATCH_BYTES, Batch, joined
+from bags.recordings.description import TYPE_HASH
+from bags.recordings.mcap_records import ROSBAG2, Block, Contents
+from bags.recordings.quality import KEY
+from nlsid_core.errors import BagError
+
+BESIDE: Final = ("-wal", "-journal")
+SALVAGED_BYTES: Final = 2**16  # of messages that are lost together where a page is damaged
+ROWS: Final = "SELECT id, topic_id, timestamp, length(data) FROM messages"
+OLD_RELEASE: Final = "galactic"  # which, like those before it, names no release in its files
+
+
+class SqliteFile:
+    """A .db3 file open for reading. Close it.
+
+    Raises BagError if it is damaged; with `salvage=True` what cannot be read is listed in
+    `contents.lost`.
+    """
+
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+        self.path = path
+        self.contents = Contents()
+        self._salvage = salvage
+        self._folder: TemporaryDirectory[str] | None = None
+        beside = [Path(f"{path}{end}") for end in BESIDE]
+        beside = [file for file in beside if file.is_file() and file.stat().st_size]
+        address = f"file:{quote(str(path.resolve()))}?immutable=1"
+        missing = _stated_bytes(path) - path.stat().st_size if salvage else 0
+        if beside or missing > 0:
+            self._folder = TemporaryDirectory()
+            for file in (path, *beside):
+                shutil.copy(file, self._folder.name)
+            copy = Path(self._folder.name) / path.name
+            address = f"file:{quote(str(copy))}"
+            if missing > 0:  # SQLite refuses a file that is shorter than it says
+                self.contents.lost.append(f"its last {missing} bytes are not there")
+                os.truncate(copy, path.stat().st_size + missing)
+        self._base = sqlite3.connect(address, uri=True)
+        try:
+            self._look_into(beside)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file, and remove its copy."""
+        self._base.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """The messages of one block, one batch per channel that has any."""
+        if not any(channel in (block.index or {}) for channel in channels):
+            return
+        rows: dict[int, list[tuple[int, bytes]]] = {}
+        query = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
+        )
+        try:
+            for topic, log_ns, data in self._base.execute(query, (block.offset, block.end)):
+                if self._is_message(log_ns, data):
+                    rows.setdefault(topic, []).append((log_ns, data))
+        except sqlite3.Error as error:
+            if not self._salvage:
+                raise
+            self.contents.lost.append(f"messages {block.offset} to {block.end - 1}: {error}")
+        for topic in channels:
+            if found := rows.get(topic):
+                times, parts = zip(*found, strict=True)
+                yield topic, joined(parts, times)
+
+    def _look_into(self, beside: list[Path]) -> None:
+        if beside and self._rows("PRAGMA wal_checkpoint")[0][1] == 0:
+            names = " and ".join(file.name for file in beside)
+            self.contents.lost.append(f"nothing in {names} belongs to this file")
+        tables = self._rows("SELECT name FROM sqlite_master WHERE type = 'table'")
+        if not {("topics",), ("messages",)} <= set(tables):
+            raise BagError("it has no tables of topics and messages")
+        release = OLD_RELEASE
+        if "ros_distro" in self._columns("schema"):
+            release = str(next(iter(self._rows("SELECT ros_distro FROM schema")), ("",))[0])
+        self.contents.metadata.append(Metadata(ROSBAG2, {"ROS_DISTRO": release}))
+        self._add_channels()
+        try:
+            self._add_blocks(self._base.execute(f"{ROWS} ORDER BY id"))
+        except sqlite3.Error as error:
+            if not self._salvage:
+                raise
+            self._add_behind_damage(error)
+
+    def _add_channels(self) -> None:
+        definitions: dict[str, tuple[str, str]] = {}
+        if self._columns("message_definitions"):
+            for name, encoding, text in self._rows(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            ):
+                definitions[str(name)] = str(encoding), str(text)
+        columns = self._columns("topics")
+        for row in self._rows("SELECT * FROM topics ORDER BY id"):
+            topic = {column: str(value) for column, value in zip(columns, row, strict=True)}
+            number, kind = int(topic["id"]), topic["type"]
+            encoding, text = definitions.get(kind, ("", ""))
+            self.contents.schemas[number] = Schema(number, text.encode(), encoding, kind)
+            said = {
+                KEY: topic.get("offered_qos_profiles", ""),
+                TYPE_HASH: topic.get("type_description_hash", ""),
+            }
+            self.contents.channels[number] = Channel(
+                number, topic["name"], topic["serialization_format"], said, number
+            )
+
+    def _add_blocks(self, rows: Iterable[tuple[int, int, int, int]]) -> None:
+        """Runs of messages with about BATCH_BYTES; rows: (id, topic, ns, bytes) of each message."""
+        most = SALVAGED_BYTES if self._salvage else BATCH_BYTES
+        run: list[tuple[int, int, int, int]] = []
+        size = 0
+        try:
+            for row in rows:
+                if size > most:
+                    self._add_block(run)
+                    run, size = [], 0
+                if self._is_message(row[2], b"" if isinstance(row[3], int) else None):
+                    run.append(row)
+                    size += row[3]
+        finally:
+            self._add_block(run)
+
+    def _is_message(self, log_ns: object, data: object) -> bool:
+        """Whether a row has a time and data; BagError if not, unless it is salvaged."""
+        if isinstance(data, bytes) and isinstance(log_ns, int) and log_ns >= 0:
+            return True
+        if not self._salvage:
+            raise BagError(f"a message with log time {log_ns} ns and {type(data).__name__} as data")
+        return False
+
+    def _add_block(self, run: Sequence[tuple[int, int, int, int]]) -> None:
+        counts = Counter(topic for _, topic, _, _ in run)
+        for topic in counts.keys() - self.contents.channels.keys():
+            if not self._salvage:
+                raise BagError(f"messages on topic {topic}, which nothing declares")
+            self.contents.lost.append(f"{counts.pop(topic)} messages of unknown topic {topic}")
+        if counts:
+            first, last = run[0][0], run[-1][0]
+            index = {topic: (0, count) for topic, count in counts.items()}
+            start_ns = min(log_ns for _, _, log_ns, _ in run)
+            block = Block(first, last + 1 - first, start_ns=start_ns, index=index)
+            self.contents.blocks.append(block)
+            self.contents.counts = dict(Counter(self.contents.counts) + counts)
+
+    def _add_behind_damage(self, error: sqlite3.Error) -> None:
+        """The messages behind a damaged page, which are found from the end."""
+        blocks = self.contents.blocks
+        begin = blocks[-1].end if blocks else 0
+        rows: list[tuple[int, int, int, int]] = []
+        with suppress(sqlite3.Error):
+            for row in self._base.execute(f"{ROWS} WHERE id >= {begin} ORDER BY id DESC"):
+                rows.append(row)  # noqa: PERF402 - those before the error count
+        self._add_blocks(reversed(rows))
+        end = f"before {rows[-1][0]}" if rows else "the end"
+        self.contents.lost.append(f"messages from {begin} to {end}: {error}")
+
+    def _columns(self, table: str) -> list[str]:
+        return [row[1] for row in self._rows(f"PRAGMA table_info({table})")]
+
+    def _rows(self, query: str) -> list[Any]:
+        return self._base.execute(query).fetchall()
+
+
+def _stated_bytes(path: Path) -> int:
+    """How long the file says it is, as SQLite's format puts it into its first bytes."""
+    with path.open("rb") as stream:
+        head = stream.read(32)
+    page = int.from_bytes(head[16:18], "big")
+    return (2**16 if page == 1 else page) * int.from_bytes(head[28:32], "big")

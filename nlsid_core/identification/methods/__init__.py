@@ -1,0 +1,1 @@
+"""The methods of `identify`, and the minimisers that they are made of."""

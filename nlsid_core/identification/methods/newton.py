@@ -1,0 +1,407 @@
+"""Newton's method on the robust simulation error, with a barrier where the minimiser needs one.
+
+Damped Newton can come too near the boundary of K ≻ 0 on its way, where J stays finite, and stall at
+a wrong value. J + μ u'K⁻¹u, u a random vector, is as convex and as cheap as J, and infinite on
+nearly all of the boundary: its minimisers for μ → 0 lead to a minimiser of J inside.
+
+A minimiser can also lie on the boundary. Only a few eigenvalues of K vanish there. With U their
+vectors where Newton stalled,
+    J + μ log det(U'K⁻¹U)
+is minimised for μ → 0: (U'K⁻¹U)⁻¹ is a Schur complement of K, concave in K, so the barrier is
+convex, keeps K ≻ 0 and has parameter rank U; the last iterate is within μ·rank U of the minimum.
+Its derivatives are exact and cost a few solves, log det K would need every entry of K⁻¹. If other
+eigenvalues vanish on the way, they join U. Matrix inequalities on θ join as further barriers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import SolverError
+from nlsid_core.identification.methods.banded import Rows
+from nlsid_core.identification.methods.inequalities import MatrixInequality
+
+DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of the minimiser
+PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding
+STALLED = 1e-7  # decrement relative to J at which rounding of J may end the line search
+MAX_NEWTON = 200
+MAX_CENTRING = 20  # with a barrier; more, and some eigenvalue vanishes that it does not hold
+ARMIJO = 1e-4  # the usual sufficient-decrease fraction
+SHORTEST_STEP = 2.0**-30
+BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken to the barrier
+SMALL = 0.1  # eigenvalue of K relative to its size that may vanish at the minimum
+FEWEST, WIDEST, MAX_BASES = 2, 4, 8  # vectors that join U at once, and how often they do
+INVERSE_ITERATIONS = 4  # of a subspace: what matters is orders of magnitude apart
+SHORT_STEP, SHORT_STEPS = 2.0**-2, 2  # so many steps so short, and Newton alone has stalled
+GAP = 1e-7  # μ·(barrier parameter) relative to J at which the barrier path of K ends
+INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
+FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near by itself
+MU_FALL = 0.01
+CENTRED = 0.1  # decrement relative to μ at which a point of the path is close enough
+MU_FALL_K, CENTRED_K = 0.01, 1.0  # the same two on the path of K, whose barrier is of low rank
+
+
+class Root(Protocol):
+    """A matrix L with J = |L⁻¹ε|², by what it solves."""
+
+    def half_solve(self, B: FloatArray, *, overwrite: bool = False) -> FloatArray:
+        """L⁻¹B for B (N,) or (N, m)."""
+        ...
+
+    def half_solve_transposed(self, B: FloatArray) -> FloatArray:
+        """L⁻ᵀB for B (N,) or (N, m)."""
+        ...
+
+    @property
+    def pivots(self) -> FloatArray:
+        """(N,): the pivots of the elimination of LL', or what stands for them."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """J at θ with the best p (n_p,), and the factors its derivatives are made of."""
+
+    theta: FloatArray
+    p: FloatArray
+    J: float
+    residual: FloatArray  # L⁻¹ε
+    x: FloatArray  # L⁻ᵀL⁻¹ε
+    factor: Root
+    projected: FloatArray  # L⁻¹Q
+    normal: tuple[FloatArray, bool]  # Cholesky factor of Q'K⁻¹Q
+
+    def curvature(self, V: FloatArray) -> FloatArray:
+        """2 |(I - Π) L⁻¹V|² for columns V (N, n)."""
+        solved = self.factor.half_solve(V)
+        inner = self.projected.T @ solved
+        square = solved.T @ solved - inner.T @ cho_solve(self.normal, inner, check_finite=False)
+        return np.asarray(2.0 * square)
+
+    def derivatives(self, errors: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of ε'K⁻¹ε from ε_i and K_i x, columns (N, n)."""
+        gradient = 2.0 * errors.T @ self.x - slopes.T @ self.x
+        return gradient, self.curvature(errors - slopes)
+
+
+def project(rows: Rows, unknowns: FloatArray, theta: FloatArray, factor: Root) -> Point:
+    """The point of J = min_p |L⁻¹(errors θ - Q p)|²; LinAlgError if rounding decides it."""
+    both = np.empty((len(rows), 1 + rows.Q.shape[1]), order="F")  # as LAPACK takes it: no copy
+    both[:, 0], both[:, 1:] = rows.errors @ theta, rows.Q
+    return project_columns(both, unknowns, factor)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # an unstable candidate is refused below
+def project_columns(both: FloatArray, unknowns: FloatArray, factor: Root) -> Point:
+    """`project` for columns [errors θ, Q] of any rows; overwrites them."""
+    solved = factor.half_solve(both, overwrite=True)
+    left, projected = solved[:, 0], solved[:, 1:]
+    if not np.isfinite(left @ left):
+        raise LinAlgError("the errors overflow")
+    normal = cho_factor(projected.T @ projected, check_finite=False)
+    p = cho_solve(normal, projected.T @ left, check_finite=False)
+    residual = left - projected @ p
+    J = float(residual @ residual)
+    if not np.isfinite(J):
+        raise LinAlgError("K is positive definite to rounding only")
+    x = factor.half_solve_transposed(residual)
+    return Point(unknowns, p, J, residual, x, factor, projected, normal)
+
+
+class Objective(Protocol):
+    """A function of the left parameters, p projected out."""
+
+    rows: Rows
+
+    def at(self, theta: FloatArray) -> Point:
+        """Value; LinAlgError outside its domain."""
+        ...
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient, and Hessian or a positive semidefinite stand-in."""
+        ...
+
+
+class Convex(Objective, Protocol):
+    """min_p ε'K⁻¹ε with ε and K affine in the left parameters."""
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """(N, n): K_i x, K_i the derivatives of K."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """The point found, the extra unknowns beside θ, and how many Newton steps it took.
+
+    converged: the decrement is small; otherwise no step goes down any more.
+    """
+
+    point: Point
+    extra: FloatArray
+    steps: int
+    converged: bool
+    on_boundary: bool = False
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is a minimiser where no eigenvalue of K vanishes."""
+        pivots = self.point.factor.pivots
+        return self.converged and bool(np.min(pivots) > BOUNDARY_PIVOT * np.median(pivots))
+
+
+def minimise(
+    bound: Convex,
+    start: FloatArray,
+    *,
+    inequalities: Sequence[MatrixInequality] = (),
+    extra: FloatArray | None = None,
+    steps: int | None = None,
+    gap: float = INEQUALITY_GAP,
+) -> Minimum:
+    """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
+
+    extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
+    of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
+    steps: only so many of Newton's method, without a barrier of K and with that of the inequalities
+    at the one μ whose minimiser is within `gap`·J of the minimum.
+    """
+    descent = Descent(bound, inequalities, len(start))
+    z = start if extra is None else np.concatenate([start, extra])
+    if steps is not None:
+        return descent.to_minimum(z, mu=descent.weight(z, gap), limit=steps)
+    found = descent.freely(z)
+    if found.is_inside:
+        return found
+    return _on_boundary(bound, descent, z, found)
+
+
+def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
+    """Minimise where eigenvalues of K vanish; `start` is well inside, Newton ended at `found`."""
+    led = _past_boundary(bound, descent, 0.5 * (start + _unknowns(found)))
+    if led is not None:
+        return led
+    U, best, lowest = np.zeros((len(found.point.x), 0)), found if found.converged else None, found
+    for _ in range(MAX_BASES):
+        U = np.linalg.qr(np.column_stack([U, _vanishing(found.point)]))[0]
+        # K is affine: half way back to the start no eigenvalue is small.
+        found = descent.path(0.5 * (start + _unknowns(found)), barrier=SchurBarrier(bound, U))
+        if found.converged:
+            if best is not None and best.point.J <= found.point.J:
+                found = best
+            return replace(found, steps=descent.steps, on_boundary=True)
+        lowest = min(lowest, found, key=lambda minimum: minimum.point.J)
+    return replace(lowest if best is None else best, steps=descent.steps)
+
+
+def _past_boundary(bound: Convex, descent: "Descent", z: FloatArray) -> Minimum | None:
+    """The minimiser that the path of `Repulsion` from z leads to; None if it does not converge.
+
+    On the boundary that is the end of the path, unless Newton goes lower from there.
+    """
+    here = descent.objective.at(z[: descent.parameters])
+    away = descent.path(z, barrier=Repulsion(bound, here))
+    if not away.converged:
+        return None
+    found = descent.freely(_unknowns(away))
+    if found.is_inside:
+        return replace(found, steps=descent.steps)
+    return replace(found, converged=True, steps=descent.steps, on_boundary=True)
+
+
+def _vanishing(point: Point) -> FloatArray:
+    """(N, r): the vectors of the eigenvalues of K that may vanish."""
+    values, vectors = smallest_eigenvalues(point.factor, len(point.x), WIDEST)
+    small = int((values < SMALL * np.median(point.factor.pivots)).sum())
+    return vectors[:, : max(FEWEST, small)]
+
+
+def smallest_eigenvalues(factor: Root, N: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """(values, (N, count) orthonormal vectors): about the smallest of K = LL', ascending.
+
+    Inverse iteration on a subspace; values are Rayleigh quotients of K⁻¹.
+    """
+    U: FloatArray = np.random.default_rng(0).standard_normal((N, min(N, count)))
+    for _ in range(INVERSE_ITERATIONS):
+        U = np.linalg.qr(factor.half_solve_transposed(factor.half_solve(U)))[0]
+    half = factor.half_solve(U)
+    inverses, rotation = np.linalg.eigh(half.T @ half)
+    return 1.0 / inverses[::-1], U @ rotation[:, ::-1]
+
+
+class Repulsion:
+    """u'K⁻¹u with a random vector u, 1 at the point it is made at."""
+
+    def __init__(self, bound: Convex, at: Point) -> None:
+        u = np.random.default_rng(0).standard_normal((len(at.x), 1))
+        self.bound, self.U = bound, u / np.linalg.norm(at.factor.half_solve(u))
+
+    def value(self, point: Point) -> float:
+        """At a point of J."""
+        return float(np.square(point.factor.half_solve(self.U)).sum())
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient -x'K_i x and Hessian 2 (L⁻¹K_i x)'(L⁻¹K_j x), x = K⁻¹u."""
+        x = point.factor.half_solve_transposed(point.factor.half_solve(self.U))[:, 0]
+        slopes = self.bound.slopes(x)
+        half = point.factor.half_solve(slopes)
+        return -slopes.T @ x, 2.0 * half.T @ half
+
+
+class SchurBarrier:
+    """log det(U'K⁻¹U): keeps a Schur complement of K positive definite. parameter: its rank."""
+
+    def __init__(self, bound: Convex, U: FloatArray) -> None:
+        self.bound, self.U = bound, U
+
+    def value(self, point: Point) -> float:
+        """At a point of J."""
+        R = np.linalg.qr(point.factor.half_solve(self.U), mode="r")
+        return float(2.0 * np.log(abs(np.diag(R))).sum())
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian.
+
+        With M_i = L⁻¹K_iL⁻ᵀ and orthonormal columns Y of L⁻¹U: gradient_i = -tr(Y'M_iY),
+        Hessian_ij = tr(Y'M_iY Y'M_jY) + 2 tr(Y'M_i(I - YY')M_jY).
+        """
+        Y = np.linalg.qr(point.factor.half_solve(self.U))[0]
+        X = point.factor.half_solve_transposed(Y)
+        parts = [point.factor.half_solve(self.bound.slopes(x)) for x in X.T]
+        inner = np.array([Y.T @ part for part in parts])  # (r, r, n): [a, b, i] = y_b'M_iy_a
+        flat = inner.reshape(-1, inner.shape[-1])
+        hessian = flat.T @ flat
+        for a, part in enumerate(parts):
+            outer = part - Y @ inner[a]
+            hessian += 2.0 * outer.T @ outer
+        return -np.einsum("aai->i", inner), hessian
+
+
+def _unknowns(found: Minimum) -> FloatArray:
+    return np.concatenate([found.point.theta, found.extra])
+
+
+def _newton_step(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
+    """-H⁺g in the scale of the diagonal; a parameter with hardly any curvature keeps its scale.
+
+    SolverError if that overflows: on what is not finite LAPACK's lstsq may not return.
+    """
+    diagonal, number = np.diag(hessian), np.finfo(float)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, max(diagonal.max() * number.eps**2, number.tiny)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix, side = scale[:, None] * hessian * scale, gradient * scale
+    if not (np.isfinite(matrix).all() and np.isfinite(side).all()):
+        raise SolverError("Newton's method met derivatives beyond all numbers; try fewer lags")
+    step: FloatArray = -scale * np.linalg.lstsq(matrix, side, rcond=None)[0]
+    return step
+
+
+class Descent:
+    """Damped Newton on J + μ·barriers in z = [θ; extra]; counts its steps."""
+
+    def __init__(
+        self, objective: Objective, inequalities: Sequence[MatrixInequality], parameters: int
+    ) -> None:
+        self.objective, self.inequalities = objective, tuple(inequalities)
+        self.parameters = parameters
+        self.perfect = PERFECT_FIT * objective.rows.unit
+        self.steps = 0
+
+    def weight(self, z: FloatArray, gap: float) -> float:
+        """μ of the inequalities at which the path is within gap·J, J that at z; 0 without any."""
+        size = sum(inequality.order for inequality in self.inequalities)
+        return gap * self.objective.at(z[: self.parameters]).J / size if size else 0.0
+
+    def freely(self, z: FloatArray) -> Minimum:
+        """Without a barrier of K."""
+        return self.path(z) if self.inequalities else self.to_minimum(z)
+
+    def path(self, z: FloatArray, *, barrier: Repulsion | SchurBarrier | None = None) -> Minimum:
+        """Follow the minimisers for μ → 0."""
+        size = sum(inequality.order for inequality in self.inequalities)
+        size += 0 if barrier is None else barrier.U.shape[1]
+        gap = INEQUALITY_GAP if barrier is None else GAP
+        mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
+        while True:
+            found = self.to_minimum(z, mu=mu, barrier=barrier)
+            z = _unknowns(found)
+            small = mu * size <= gap * found.point.J or self.perfect >= found.point.J
+            if small or not found.converged:
+                return found
+            mu *= MU_FALL if barrier is None else MU_FALL_K
+
+    def to_minimum(
+        self,
+        z: FloatArray,
+        *,
+        mu: float = 0.0,
+        barrier: Repulsion | SchurBarrier | None = None,
+        limit: int = MAX_NEWTON,
+    ) -> Minimum:
+        """Newton's method for one μ, of `limit` steps at most."""
+        value, point = self._value(z, mu, barrier)
+        if point is None:
+            raise SolverError("Newton's method was started where J is infinite")
+        short = 0
+        for _ in range(limit if barrier is None else MAX_CENTRING):
+            gradient, hessian = self._derivatives(z, point, mu, barrier)
+            if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
+                raise SolverError(
+                    "the simulation of the model that the search starts from grows beyond all "
+                    "numbers, so its derivatives are not known; try fewer lags or another method"
+                )
+            step = _newton_step(gradient, hessian)
+            decrement = -float(gradient @ step)
+            enough = max(DECREMENT * point.J, (CENTRED if barrier is None else CENTRED_K) * mu)
+            if decrement <= enough or self.perfect >= point.J:
+                return Minimum(point, z[self.parameters :], self.steps, converged=True)
+            self.steps += 1
+            length = 1.0
+            while True:
+                candidate = z + length * step
+                new_value, new_point = self._value(candidate, mu, barrier)
+                if new_point is not None and new_value <= value - ARMIJO * length * decrement:
+                    break
+                length /= 2
+                if length < SHORTEST_STEP:
+                    near = decrement <= max(STALLED * point.J, mu)
+                    return Minimum(point, z[self.parameters :], self.steps, converged=near)
+            z, value, point = candidate, new_value, new_point
+            short += length < SHORT_STEP
+            if short >= SHORT_STEPS and not mu:
+                break
+        return Minimum(point, z[self.parameters :], self.steps, converged=False)
+
+    def _value(
+        self, z: FloatArray, mu: float, barrier: Repulsion | SchurBarrier | None
+    ) -> tuple[float, Point | None]:
+        total = sum(inequality.barrier(z) for inequality in self.inequalities)
+        if not np.isfinite(total):
+            return np.inf, None
+        try:
+            point = self.objective.at(z[: self.parameters])
+        except LinAlgError:
+            return np.inf, None
+        if barrier is not None:
+            total += barrier.value(point)
+        return point.J + mu * total, point
+
+    def _derivatives(
+        self, z: FloatArray, point: Point, mu: float, barrier: Repulsion | SchurBarrier | None
+    ) -> tuple[FloatArray, FloatArray]:
+        gradient, hessian = np.zeros(len(z)), np.zeros((len(z), len(z)))
+        inner = slice(0, self.parameters)
+        gradient[inner], hessian[inner, inner] = self.objective.derivatives(point)
+        if barrier is not None:
+            slope, curvature = barrier.derivatives(point)
+            gradient[inner] += mu * slope
+            hessian[inner, inner] += mu * curvature
+        for inequality in self.inequalities:
+            slope, curvature = inequality.derivatives(z)
+            gradient += mu * slope
+            hessian += mu * curvature
+        return gradient, hessian

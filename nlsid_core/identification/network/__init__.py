@@ -1,0 +1,1 @@
+"""Networks of maps of bounded slope: how each structure is fitted."""

@@ -1,0 +1,1 @@
+"""Polynomial equations: rows of data, searches and their stable sets."""

@@ -1,0 +1,390 @@
+"""Robust identification error through moments: one program, however long the data.
+
+Minimise tr(R M) over the model, V = |x₁ - x₂|²_P and R, such that the model is stable and |Λ|²_R
+dominates the robust identification error; then tr(R M) ≥ the mean squared simulation error. With
+moments from repeated experiments the bias of measurement noise is gone.
+
+Unknowns: P (storage function, n × n), c (equation error ε = c'Λ, that is e = c[:D], f from -c[D:]),
+R, and for D = 3 six numbers τ that say how a monomial is split over Gram entries. With
+Δ = x - x̃, d = v - y, s = v + ṽ or the measured y, the two inequalities are affine in the unknowns:
+    (3.8)  2d(e(v) - e(ṽ) + c_x'Δ) + |Δ|²_P - |[d; SΔ]|²_P - δ|Δ|²      = z₈'G₈z₈ + ½ c₃ d⁴,
+    (3.9)  |Λ|²_R - Δ_1² + |Δ|²_P - |[d; SΔ]|²_P + 2d(e(v) - f(x, w))  = z₉'G₉z₉,
+    z₈ = [Δ, d, sd] (the d⁴ stands alone by sign symmetry), z₉ = [Λ, Δ, d, yd, d²].
+Source: thesis (3.6)-(3.9), Claim 3.6, Section 3.5.2, with V = |x₁ - x₂|²_P, Q = e₁e₁' and Lemmas
+2.10, 2.16.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from nlsid_core import conic
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.conic import Cone, ConeProgram
+from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
+from nlsid_core.models import MonotoneEquation
+from nlsid_core.models.signal import signals_of
+
+DELTA = 1e-3  # δ of (3.8), V ≥ δ|Δ|² more than needed: what leaves the exact proof room
+SPLITS = 6  # τ: of y d, y²d, y³d, d², y² d², y²d²
+POWER_FLOOR = 1e-3  # an estimated mean square of yᵏ below this part of (mean square of y)ᵏ is noise
+
+
+@dataclass(frozen=True, eq=False)
+class MomentFit:
+    """model; proof; bound: tr(R M), an upper bound of the mean squared simulation error (squared
+    unit of y) as far as the moments are right; R of the solution; P in the scale of
+    the model;
+    negative: the most negative eigenvalue of the scaled moments before projection.
+    """
+
+    model: MonotoneEquation
+    proof: StabilityProof
+    bound: float
+    R: FloatArray
+    P: FloatArray
+    negative: float
+    solution: conic.ConeSolution
+
+    def __str__(self) -> str:
+        unit = self.model.y.unit
+        return (
+            f"monotone equation of {len(self.model)} lags, proved stable at rate "
+            f"{self.proof.rate:.4f}; rms simulation error at most {self.bound**0.5:.4g} {unit} on "
+            f"its moments; {self.solution}"
+        )
+
+
+def minimise_moment_rie(
+    moments: Moments,
+    model_class: MonotoneClass,
+    template: Trajectory,
+    offsets: Offsets,
+    *,
+    kappa: float | None = None,
+    slowest: float = 1.0,
+) -> MomentFit:
+    """The stable model with the least bound on these moments, and its exact proof.
+
+    template: names, units and sample time. kappa: bound on |R|_F in the model's units (None: none).
+    slowest: V shrinks by its square or more, a sample.
+    Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
+    exact proof, SolverError if the solver gives up.
+    """
+    problem = Problem.of(moments, model_class.lags, slowest)
+    solution = problem.solve(kappa=kappa)
+    x = problem.columns * solution.x
+    layout = problem.layout
+    scale = float(x[layout.c[0]])  # e'(0): the scale of e and f together means nothing
+    model = equation(x[layout.c] / scale, model_class, template, offsets)
+    P = x[layout.P] / scale
+    proof = prove_stability(model)
+    if proof is None:
+        raise Infeasible(
+            f"no exact proof for the minimiser ({solution}); try fewer lags, or give more data"
+        )
+    return MomentFit(
+        model=model,
+        proof=proof,
+        bound=float(solution.objective * problem.unit**2),
+        R=x[layout.R],
+        P=P,
+        negative=problem.negative,
+        solution=solution,
+    )
+
+
+def moment_bound(model: MonotoneEquation, moments: Moments, *, kappa: float | None = None) -> float:
+    """J(a, M): the least tr(R M) with this model, e and f scaled by a common factor; ≥ 0.
+
+    The moments have to be about the model's offsets. Source: thesis (3.6), J_κ.
+    Raises ShapeError or DataError on moments of another class, Infeasible if no V, R of this class
+    prove the model stable.
+    """
+    if len(model) + len(model.window) != moments.mixed.shape[1]:
+        raise ShapeError(
+            f"moments of {moments.mixed.shape[1]} lags and window entries do not fit a model of "
+            f"{len(model)} and {len(model.window)}"
+        )
+    if model.e[moments.degree :].any():
+        raise DataError("moments for a linear e do not judge a model whose e is cubic")
+    problem = Problem.of(moments, len(model))
+    coefficients = np.concatenate([model.e[: moments.degree], [-model.c], -model.a, -model.b])
+    return float(problem.solve(fixed=coefficients, kappa=kappa).objective * problem.unit**2)
+
+
+def equation(
+    c: FloatArray, model_class: MonotoneClass, template: Trajectory, offsets: Offsets
+) -> MonotoneEquation:
+    """The model ε = c'Λ = 0."""
+    D, n = model_class.degree, model_class.lags
+    return MonotoneEquation(
+        e=np.concatenate([c[:D], np.zeros(3 - D)]),
+        a=-c[D + 1 : D + 1 + n],
+        b=-c[D + 1 + n :],
+        c=-float(c[D]),
+        window=model_class.window(template.u.shape[1]),
+        y_offset=offsets.y,
+        u_offset=offsets.u,
+        period=template.period,
+        y=signals_of(template, "y")[0],
+        u=signals_of(template, "u"),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class AffineMatrix:
+    """svec(G(x)) = slope x + constant for unknowns x, G of this order."""
+
+    order: int
+    slope: sp.csr_matrix
+    constant: FloatArray
+
+    def at(self, x: FloatArray) -> FloatArray:
+        """G(x)."""
+        return conic.smat(self.slope @ x + self.constant)
+
+    def scaled(self, rows: FloatArray, columns: FloatArray) -> "AffineMatrix":
+        """diag(rows) G(columns·x) diag(rows)."""
+        i, j = conic.triangle(self.order)
+        factor = rows[i] * rows[j]
+        slope = sp.diags(factor) @ self.slope @ sp.diags(columns)
+        return AffineMatrix(self.order, sp.csr_matrix(slope), factor * self.constant)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the unknowns are: lags n, window entries m, degree D of e."""
+
+    lags: int
+    window: int
+    degree: int
+
+    @property
+    def monomials(self) -> int:
+        """The length of Λ."""
+        return self.degree + 1 + self.lags + self.window
+
+    @cached_property
+    def P(self) -> IntArray:
+        """(n, n) column of each entry of P."""
+        return _symmetric(0, self.lags)
+
+    @cached_property
+    def c(self) -> IntArray:
+        """(length of Λ,) columns of the equation error's coefficients."""
+        start = self.lags * (self.lags + 1) // 2
+        return start + np.arange(self.monomials)
+
+    @cached_property
+    def R(self) -> IntArray:
+        """(length of Λ, same) column of each entry of R."""
+        return _symmetric(int(self.c[-1]) + 1, self.monomials)
+
+    @property
+    def unknowns(self) -> int:
+        """How many columns there are."""
+        return int(np.max(self.R)) + 1 + (SPLITS if self.degree == 3 else 0)
+
+    @property
+    def past(self) -> IntArray:
+        """Columns of c that multiply y(t-1) … y(t-n)."""
+        return self.c[self.degree + 1 : self.degree + 1 + self.lags]
+
+    def stability(self, delta: float, rate: float = 1.0) -> AffineMatrix:
+        """G₈, with rate² P in the place of the P of Δ."""
+        n, d, sd = self.lags, self.lags, self.lags + 1
+        G = _Entries(n + 1 if self.degree == 1 else n + 2)
+        self._storage(G, 0, d, rate)
+        for k in range(n):
+            G.add(k, k, None, -delta)
+            G.add(k, d, self.past[k], 1.0)
+        G.add(d, d, self.c[0], 2.0)
+        if self.degree == 3:
+            G.add(d, sd, self.c[1], 1.0)
+            G.add(sd, sd, self.c[2], 1.5)
+        return G.matrix(self.unknowns)
+
+    def error_bound(self) -> AffineMatrix:
+        """G₉."""
+        n, L, D = self.lags, self.monomials, self.degree
+        d, yd, dd = L + n, L + n + 1, L + n + 2
+        G = _Entries(L + n + 1 if D == 1 else L + n + 3)
+        for i in range(L):
+            for j in range(i, L):
+                G.add(i, j, self.R[i, j], 1.0)
+            G.add(i, d, self.c[i], 1.0)
+        self._storage(G, L, d)
+        G.add(L, L, None, -1.0)
+        for k in range(n):
+            G.add(L + k, d, self.past[k], 1.0)
+        G.add(d, d, self.c[0], 2.0)
+        if D == 3:
+            second, third = self.c[1], self.c[2]
+            G.add(d, yd, second, 2.0)
+            G.add(d, dd, second, 1.0)
+            G.add(yd, yd, third, 6.0)
+            G.add(yd, dd, third, 3.0)
+            G.add(dd, dd, third, 2.0)
+            y, y2, y3, one = range(4)
+            tau = self.unknowns - SPLITS
+            # The same monomial twice: what one entry gives, the other takes.
+            for k, (plus, minus, weight) in enumerate(
+                (
+                    ((one, yd), (y, d), 1.0),
+                    ((y, yd), (y2, d), 1.0),
+                    ((y2, yd), (y3, d), 1.0),
+                    ((one, dd), (d, d), 2.0),
+                    ((y, dd), (d, yd), 1.0),
+                    ((y2, dd), (yd, yd), 2.0),
+                )
+            ):
+                G.add(*plus, tau + k, 1.0)
+                G.add(*minus, tau + k, -weight)
+        return G.matrix(self.unknowns)
+
+    def _storage(self, G: "_Entries", start: int, d: int, rate: float = 1.0) -> None:
+        """rate²|Δ|²_P - |[d; Δ_1 … Δ_{n-1}]|²_P, Δ from index `start` on."""
+        place = [d, *range(start, start + self.lags - 1)]
+        for k in range(self.lags):
+            for j in range(k, self.lags):
+                G.add(start + k, start + j, self.P[k, j], rate**2)
+                G.add(place[k], place[j], self.P[k, j], -1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Scaled data: unknowns x = columns·x̄, moments of unit diagonal, errors in units of `unit`."""
+
+    layout: Layout
+    M: FloatArray
+    unit: float
+    columns: FloatArray
+    stability: AffineMatrix
+    error_bound: AffineMatrix
+    negative: float
+
+    @classmethod
+    def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "Problem":
+        """The scaled problem for n lags."""
+        raw = moments.matrix()
+        layout = Layout(n, len(raw) - moments.degree - 1 - n, moments.degree)
+        D = _sizes(raw, moments.degree)
+        values, vectors = np.linalg.eigh(raw / np.outer(D, D))
+        M = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        unit = float(D[0])
+        columns = np.ones(layout.unknowns)
+        columns[layout.c] = unit / D
+        columns[layout.R] = unit**2 / np.outer(D, D)
+        # Rows: Λ in units of D, Δ and d of `unit`, yd and d² of its square; all over `unit`.
+        small = np.ones(n + 1)
+        rows8, rows9 = small, np.concatenate([D / unit, small])
+        if moments.degree == 3:
+            rows8 = np.concatenate([small, [unit]])
+            rows9 = np.concatenate([rows9, [unit, unit]])
+            columns[-SPLITS:] = 1.0 / np.tile([1.0, D[0], D[1]], 2)
+        return cls(
+            layout=layout,
+            M=M,
+            unit=unit,
+            columns=columns,
+            stability=layout.stability(DELTA, slowest).scaled(rows8, columns),
+            error_bound=layout.error_bound().scaled(rows9, columns),
+            negative=float(min(values[0], 0.0)),
+        )
+
+    def solve(
+        self, *, fixed: FloatArray | None = None, kappa: float | None = None
+    ) -> conic.ConeSolution:
+        """Minimise tr(R M); `fixed` gives c up to a nonnegative factor, in physical units."""
+        layout = self.layout
+        q = np.zeros(layout.unknowns)
+        np.add.at(q, layout.R.ravel(), self.M.ravel())
+        blocks = [self.stability, self.error_bound]
+        A = [-block.slope for block in blocks]
+        b = [block.constant for block in blocks]
+        cones = [Cone("psd", block.order) for block in blocks]
+        if kappa is not None:
+            upper = layout.R[np.triu_indices(layout.monomials)]
+            double = np.where(np.eye(layout.monomials)[np.triu_indices(layout.monomials)], 1, 2)
+            weights = np.sqrt(double) * self.columns[upper]
+            rows = np.arange(1, len(upper) + 1)
+            shape = (len(upper) + 1, layout.unknowns)
+            A.append(sp.csr_matrix((-weights, (rows, upper)), shape))
+            b.append(np.concatenate([[kappa], np.zeros(len(upper))]))
+            cones.append(Cone("second_order", len(upper) + 1))
+        stacked = sp.vstack(A, format="csc")
+        lift = sp.identity(layout.unknowns, format="csc")
+        if fixed is not None:
+            others = np.setdiff1d(np.arange(layout.unknowns), layout.c)
+            direction = sp.csc_matrix(
+                (fixed / self.columns[layout.c], (layout.c, np.zeros(len(fixed), dtype=int))),
+                (layout.unknowns, 1),
+            )
+            lift = sp.hstack([lift[:, others], direction], format="csc")
+        free = lift.shape[1]
+        program = ConeProgram(
+            P=sp.csc_matrix((free, free)),
+            q=lift.T @ q,
+            A=sp.csc_matrix(stacked @ lift),
+            b=np.concatenate(b),
+            cones=tuple(cones),
+        )
+        return conic.solve(program)
+
+
+def _sizes(M: FloatArray, degree: int) -> FloatArray:
+    """Root mean squares of Λ: positive where an estimate is not, so that M can be scaled.
+
+    Raises DataError if the estimated mean square of y is not positive.
+    """
+    squares = np.diag(M).copy()
+    if not squares[0] > 0:
+        raise DataError(
+            f"the responses have nothing in common: their estimated mean square is {squares[0]:g}; "
+            "are they repeats, and is the noise smaller than the response?"
+        )
+    floors = np.zeros_like(squares)
+    floors[:degree] = POWER_FLOOR * squares[0] ** np.arange(1, degree + 1)
+    sizes = np.sqrt(np.maximum(squares, floors))
+    return np.asarray(np.where(sizes > 0, sizes, 1.0))
+
+
+class _Entries:
+    """Collects G[i, j] += value · x[column] (None: a constant), symmetric."""
+
+    def __init__(self, order: int) -> None:
+        self.order = order
+        self._rows: list[int] = []
+        self._columns: list[int] = []
+        self._values: list[float] = []
+        self._constant = np.zeros(order * (order + 1) // 2)
+
+    def add(self, i: int, j: int, column: int | None, value: float) -> None:
+        low, high = min(i, j), max(i, j)
+        row = high * (high + 1) // 2 + low
+        value = value if i == j else value * conic.SQRT2
+        if column is None:
+            self._constant[row] += value
+        else:
+            self._rows.append(row)
+            self._columns.append(int(column))
+            self._values.append(value)
+
+    def matrix(self, unknowns: int) -> AffineMatrix:
+        shape = (len(self._constant), unknowns)
+        slope = sp.csr_matrix((self._values, (self._rows, self._columns)), shape)
+        return AffineMatrix(self.order, slope, self._constant)
+
+
+def _symmetric(start: int, size: int) -> IntArray:
+    """(size, size) column numbers of a symmetric matrix of unknowns."""
+    table = np.zeros((size, size), dtype=np.int64)
+    upper = np.triu_indices(size)
+    table[upper] = start + np.arange(len(upper[0]))
+    return np.maximum(table, table.T)
