@@ -22,16 +22,12 @@ from scipy.signal import lfilter
 from benchmarks.machine import describe
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification import Polynomial
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.moment_rie import minimise_moment_rie
-from nlsid_core.identification.polynomial.moments import (
-    MonotoneClass,
-    Offsets,
-    plain_moments,
-    repeated_moments,
-)
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.moments import Offsets, plain_moments, repeated_moments
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 
 POLE, SAMPLES = 0.9, 5000
 LEVELS = (0, 5, 10, 15, 20, 30)  # dB
@@ -64,9 +60,9 @@ def trial(level: float, rng: np.random.Generator) -> dict[str, float]:
     ]
     y = runs[0].y[:, 0]
     known = next(robust_simulation_error(_known_gain(y, w), iterations=1)).theta
-    rows = build_state_affine_rows(Dataset((runs[0],)), StateAffineClass(1, delays=(0,))).rows
+    rows = build_state_affine_rows(Dataset((runs[0],)), Polynomial(1, (0,))).rows
     *_, last = robust_simulation_error(rows, iterations=4)
-    model_class = MonotoneClass(1, (0,), 1)
+    model_class = Polynomial(1, (0,), set="3.8")
     plain = plain_moments(runs[:1], model_class, OFFSETS)
     clean = repeated_moments([runs], model_class, OFFSETS)
     identification, unbiased = (

@@ -23,10 +23,11 @@ from scipy.signal import lfilter
 from benchmarks.machine import describe, peers
 from benchmarks.recorded import single
 from nlsid_core.arrays import FloatArray
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.newton import minimise
 from nlsid_core.identification.methods.rse import Bound
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 
 SIZES = (500, 2000, 10_000, 90_000, 300_000, 1_000_000)
 LMI_SIZES = (250, 500, 1000)
@@ -43,7 +44,7 @@ def simulated_rows(N: int, *, lags: int = 5, degree: int = 3, noise: float = 0.0
     y = lfilter([0.2, 0.1], [1.0, -1.2, 0.5], np.tanh(lfilter([0.5, 0.3], [1.0, -0.4], u)))
     y += noise * y.std() * rng.standard_normal(len(y))
     return build_state_affine_rows(
-        single("simulated", u, y, 1.0), StateAffineClass(lags, right_degree=degree)
+        single("simulated", u, y, 1.0), Polynomial(lags, degrees=Degrees(inputs=degree))
     ).rows
 
 
@@ -102,7 +103,7 @@ def boundary_rows(N: int) -> Rows:
     rng = np.random.default_rng(1)
     burst = np.exp(-np.arange(N + 2) / BURST) * rng.standard_normal(N + 2)
     data = single("burst", rng.uniform(-1.0, 1.0, N + 2), burst, 1.0)
-    model_class = StateAffineClass(2, leading_degree=1, lagged_degree=1)
+    model_class = Polynomial(2, degrees=Degrees(leading=1, lagged=1))
     return build_state_affine_rows(data, model_class).rows
 
 

@@ -43,14 +43,7 @@ from nlsid_core.design.levels import followed
 from nlsid_core.design.tube import design_output_tube, energy, innovations, scaled_to
 from nlsid_core.errors import NlsidError
 from nlsid_core.funnels.tube import Tube
-from nlsid_core.identification import (
-    BlockCascadeClass,
-    CertifiedRse,
-    ImplicitClass,
-    LinearClass,
-    StateAffineClass,
-    identify,
-)
+from nlsid_core.identification import Degrees, FilterMapFilter, Network, Polynomial, Rse, identify
 from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -122,7 +115,7 @@ def f1tenth_two_case(data: Path) -> Case:
                 t=0.025 * np.arange(len(y)), y=y, u=u[4:], name=f"{k}", y_names=("yaw", "speed")
             )
         )
-    return thirds(trials, StateAffineClass(6, delays=(1, 2, 3, 4, 5, 6)), 100)
+    return thirds(trials, Polynomial(6, (1, 2, 3, 4, 5, 6)), 100)
 
 
 def in_parts(
@@ -142,11 +135,9 @@ def exchanger_case(data: Path) -> Case:
     """Flow to temperature, state-affine with a quadratic G_0."""
     u, y = heat_exchanger(data / "exchanger")
     trials = in_parts(u, y, 1.0, 250, "exchanger")
-    model_class = StateAffineClass(
-        4, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),), delays=(0, 1, 2)
-    )
+    model_class = Polynomial(4, (0, 1, 2), Degrees(inputs=3, leading=2), input_range=((0.1, 0.7),))
     train, calibration, judged = map(named, (trials[:6], trials[6:11], trials[11:]))
-    return Case(model_class, train, calibration, judged, 240, {"method": CertifiedRse()})
+    return Case(model_class, train, calibration, judged, 240, {"method": Rse(certified=True)})
 
 
 def wh2009_case(data: Path) -> Case:
@@ -157,7 +148,7 @@ def wh2009_case(data: Path) -> Case:
     validation = named(in_parts(u[80000:90000], y[80000:90000], 1 / 51200, 10000, "val"))
     train, calibration, judged = map(named, (whole, later[:10], later[10:]))
     options = {"validation": validation}
-    model_class = BlockCascadeClass(phases=(2,), intervals=(24,), starts=6, begin="rest")
+    model_class = Network(FilterMapFilter(phases=(2,), intervals=(24,), starts=6, begin="rest"))
     return Case(model_class, train, calibration, judged, 1700, options)
 
 
@@ -169,7 +160,7 @@ def schunk_case(data: Path) -> Case:
         u = np.loadtxt(folder / "input.csv", delimiter=",")
         y = np.loadtxt(folder / "trajectory.csv", delimiter=",")[: len(u), 6:]
         trials.append(block_means(u, y, 0.004, 5, str(k)))
-    return thirds(trials, StateAffineClass(2), 155)
+    return thirds(trials, Polynomial(2), 155)
 
 
 def block_means(u: FloatArray, y: FloatArray, period: float, count: int, name: str) -> Trajectory:
@@ -184,7 +175,7 @@ def emps_case(data: Path) -> Case:
     table = loadmat(data / "emps" / "DATA_EMPS.mat")
     u, y = table["qg"].reshape(-1, 1), table["qm"].reshape(-1, 1)
     whole = block_means(u, y, 1e-3, 10, "emps")
-    return thirds(in_parts(whole.u, whole.y, 0.01, 270, "emps"), LinearClass(5), 240)
+    return thirds(in_parts(whole.u, whole.y, 0.01, 270, "emps"), Polynomial(5), 240)
 
 
 def kuka_case(data: Path, joint: int) -> Case:
@@ -196,12 +187,12 @@ def kuka_case(data: Path, joint: int) -> Case:
         u, y = recorded.ref_pos_deg[joint - 1], recorded.act_pos_mot_deg[joint - 1]
         whole = block_means(u[:, None], y[:, None], 4e-3, 2, letter)
         trials += in_parts(whole.u, whole.y, 8e-3, 200, letter)
-    return thirds(trials, LinearClass(4), 125)
+    return thirds(trials, Polynomial(4), 125)
 
 
 SHIPPED: dict[str, Callable[[], Case]] = {
-    "f1tenth_linear": partial(f1tenth_case, LinearClass(4)),
-    "f1tenth_implicit": partial(f1tenth_case, ImplicitClass(4)),
+    "f1tenth_linear": partial(f1tenth_case, Polynomial(4)),
+    "f1tenth_implicit": partial(f1tenth_case, Polynomial(4, degrees=Degrees(left=3), set="2.11")),
 }
 RECORDED: dict[str, Callable[[Path], Case]] = {
     "f1tenth_two": f1tenth_two_case,
@@ -318,7 +309,7 @@ def lasting(samples: int) -> dict[str, float]:
     """One monitor over so many samples: µs of a sample in the first and the last tenth (the least
     over trials), and by how much the process grew between them.
     """
-    case = f1tenth_case(LinearClass(4))
+    case = f1tenth_case(Polynomial(4))
     model = identify(case.train, case.model_class).model
     made = design_output_tube(model, case.train, case.calibration)
     monitor, k = Monitor(model, None, made.funnel), 0

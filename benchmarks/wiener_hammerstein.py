@@ -26,9 +26,9 @@ from benchmarks.recorded import percent, single, wiener_hammerstein
 from benchmarks.wiener_hammerstein_cascade import measure as measure_cascade
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import Degrees, Polynomial, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 PERIOD = 1.0 / 51200.0  # s
@@ -63,7 +63,9 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
     """First and chosen iterate at n lags: errors in % and V on the thesis's test samples."""
     problem = build_state_affine_rows(
         single("estimation", u[train], y[train], PERIOD),
-        StateAffineClass(n, right_degree=3, input_range=((float(np.min(u)), float(np.max(u))),)),
+        Polynomial(
+            n, degrees=Degrees(inputs=3), input_range=((float(np.min(u)), float(np.max(u))),)
+        ),
     )
     started = time.perf_counter()
     iterates: list[tuple[float, StateAffineModel]] = []

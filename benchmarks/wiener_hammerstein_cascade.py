@@ -23,7 +23,7 @@ from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import single, wiener_hammerstein
 from nlsid_core import files
-from nlsid_core.identification import BlockCascadeClass, CascadeFit, identify_block_cascade
+from nlsid_core.identification import CascadeFit, FilterMapFilter, Network, identify_block_cascade
 
 PERIOD = 1 / 51200  # s
 TRAIN, VALIDATION, TEST = slice(5000, 80000), slice(80000, 100000), slice(105200, 184000)
@@ -39,7 +39,7 @@ def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], C
     fit = identify_block_cascade(
         single("train", u[TRAIN], y[TRAIN], PERIOD),
         single("validation", u[VALIDATION], y[VALIDATION], PERIOD),
-        BlockCascadeClass(phases=PHASES, intervals=INTERVALS, seed=seed, begin="rest"),
+        Network(FilterMapFilter(phases=PHASES, intervals=INTERVALS, begin="rest"), seed=seed),
         transient=200,
         progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
     )

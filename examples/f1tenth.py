@@ -3,7 +3,7 @@
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from nlsid_core.design import OutputTube, design
-from nlsid_core.identification import LinearClass, identify, simulation_percent
+from nlsid_core.identification import Polynomial, identify, simulation_percent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 
@@ -16,7 +16,7 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
     dataset = read_dataset(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
     train, test = dataset.without(TEST), dataset.select(TEST)
 
-    fit = identify(train, LinearClass(4))
+    fit = identify(train, Polynomial(4))
     tube = design(OutputTube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)]))
 
     inside = 0

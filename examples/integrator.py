@@ -18,7 +18,7 @@ from bags.signals.expressions import washout
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.identification import Polynomial, identify
 from nlsid_core.identification.prediction import simulate_trial
 
 PERIOD, SPAN = 0.05, 2.0  # s
@@ -65,7 +65,7 @@ def designed(drives: list[Drive], *, velocity: bool = False) -> OutputTubeDesign
     """The proved tube: half of the drives make the model and the observer, the others its level."""
     trials = [one.velocity() if velocity else one.washed_out() for one in drives]
     train, calibration = Dataset(tuple(trials[::2])), Dataset(tuple(trials[1::2]))
-    model = identify(train, LinearClass(LAGS), comparators=()).model
+    model = identify(train, Polynomial(LAGS), comparators=()).model
     return design(OutputTube(model, train, calibration, level="constant"))
 
 

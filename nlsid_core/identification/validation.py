@@ -216,15 +216,11 @@ def residual_tests(
     )
 
 
-def simulation_percent(
-    model: Model, dataset: Dataset, *, transient: int = 0, weights: FloatArray | None = None
-) -> float:
+def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
     of their spread; ŷ is simulated from the model's history, n is that or `transient` if longer.
-
-    weights: (n_y,) of the squares of each output (None: all equal).
     """
-    return _percent(_simulated(model, dataset, max(history(model), transient)), weights)
+    return _percent(_simulated(model, dataset, max(history(model), transient)))
 
 
 def prediction_percent(
@@ -301,14 +297,10 @@ def _clipped_percent(model: Model, dataset: Dataset) -> float:
     return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
-def _percent(
-    pairs: list[tuple[FloatArray, FloatArray]], weights: FloatArray | None = None
-) -> float:
+def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
     spread = np.maximum(centred.std(axis=0), np.finfo(float).tiny)
-    if weights is not None:
-        spread = spread / np.sqrt(weights)
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.linalg.norm((measured - simulated) / spread) / np.linalg.norm(centred / spread)
     return float(100.0 * ratio) if np.isfinite(ratio) else np.inf

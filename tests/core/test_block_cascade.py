@@ -10,12 +10,8 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import prove_stability
-from nlsid_core.identification.network.cascade import (
-    BlockCascadeClass,
-    CascadeFit,
-    identify_block_cascade,
-)
+from nlsid_core.identification import FilterMapFilter, Network, prove_stability
+from nlsid_core.identification.network.cascade import CascadeFit, identify_block_cascade
 from nlsid_core.identification.network.cascade_fit import (
     Parameters,
     Trial,
@@ -35,7 +31,7 @@ def fit() -> CascadeFit:
     return identify_block_cascade(
         Dataset((recording(2500, 0), recording(1500, 1))),
         Dataset((recording(1500, 2),)),
-        BlockCascadeClass(orders=(2, 1), phases=(1,), intervals=(8, 16), starts=4, seed=3),
+        Network(FilterMapFilter((2, 1), phases=(1,), intervals=(8, 16), starts=4), seed=3),
         transient=60,
     )
 
@@ -136,14 +132,14 @@ def test_an_unstable_cascade_has_no_proof() -> None:
 def test_bad_data_and_bad_models_say_what_is_wrong() -> None:
     rng, data = np.random.default_rng(0), Dataset((recording(900, 0),))
     with pytest.raises(DataError, match="transient"):
-        identify_block_cascade(data, data, BlockCascadeClass(), transient=400)
+        identify_block_cascade(data, data, Network(FilterMapFilter()), transient=400)
     t = np.arange(900.0)
     flat = Dataset((Trajectory(t=t, y=np.ones(900), u=rng.standard_normal(900)),))
     with pytest.raises(DataError, match="constant"):
-        identify_block_cascade(flat, flat, BlockCascadeClass())
+        identify_block_cascade(flat, flat, Network(FilterMapFilter()))
     two = Dataset((Trajectory(t=t, y=t, u=rng.standard_normal((900, 2))),))
     with pytest.raises(ShapeError, match="one input"):
-        identify_block_cascade(two, two, BlockCascadeClass())
+        identify_block_cascade(two, two, Network(FilterMapFilter()))
     model = truth()
     with pytest.raises(ShapeError, match="equal phases"):
         BlockCascade(model.a1, model.b1, model.f, model.a2, np.ones((2, 2)), 0.01, model.y, model.u)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.identification.network.cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification import FilterMapFilter, Network
+from nlsid_core.identification.network.cascade import identify_block_cascade
 from nlsid_core.identification.network.cascade_fit import Parameters, Trial, sensitivities, simulate
 from nlsid_core.models import BlockCascade
 from tests.cascades import in_motion, truth, two_phases, wiener
@@ -56,7 +57,9 @@ def test_trials_that_begin_in_motion_are_identified_to_the_noise() -> None:
         found = identify_block_cascade(
             train,
             validation,
-            BlockCascadeClass((2, 1), phases=(1,), intervals=(8,), starts=4, seed=3, begin=begin),
+            Network(
+                FilterMapFilter((2, 1), phases=(1,), intervals=(8,), starts=4, begin=begin), seed=3
+            ),
         )
         rms[begin] = found.chosen.validation_rms
     assert rms["measured"] < 0.004

@@ -8,11 +8,12 @@ import pytest
 from nlsid_core import proofs
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design
-from nlsid_core.errors import DataError, OptionError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import (
-    FeedbackClass,
+    Feedback,
     Fit,
-    LinearClass,
+    Network,
+    Polynomial,
     Sem,
     identify,
     prove_stability,
@@ -31,7 +32,7 @@ from nlsid_core.models import CellNetwork
 from tests.duffing import NOISE, trials
 
 AMPLITUDES = [0.1, 0.2, 0.25, 0.15]
-SMALL = FeedbackClass(stages=2, imitated=20)
+SMALL = Network(Feedback(stages=2, imitated=20))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None
     assert proved.proof is not None
     assert proved.error_percent(fresh) < 5.0
     assert proved.error_percent(louder) < 12.0
-    straight = identify(trials(AMPLITUDES), LinearClass(3), method=Sem(), comparators=())
+    straight = identify(trials(AMPLITUDES), Polynomial(3), method=Sem(), comparators=())
     assert straight.chosen.error_percent(fresh) > 20.0
     proofs.decide(fit.proof.document(fit.model, "m.json"), {"m.json": fit.model.document()})
     assert CellNetwork.from_document(fit.model.document()).document() == fit.model.document()
@@ -167,18 +168,6 @@ def test_a_tube_of_many_maps_is_proved() -> None:
     assert len(found.model.maps) >= 3
     tube = design(OutputTube(found.model, train, trials(AMPLITUDES, seed=3)))
     assert "for ever" in str(tube.verdict)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("lags", 0), ("lags", 9), ("stages", 0), ("stages", 9), ("intervals", 0),
-        ("imitated", -1), ("start_samples", 2), ("seed", -1),
-    ],
-)  # fmt: skip
-def test_options_that_make_no_sense_are_refused(key: str, value: int) -> None:
-    with pytest.raises(OptionError, match=key):
-        FeedbackClass(**{key: value})
 
 
 def test_data_that_cannot_be_used_are_refused() -> None:

@@ -10,6 +10,8 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import Degrees
+from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moment_rie import (
     Layout,
     MomentFit,
@@ -18,7 +20,6 @@ from nlsid_core.identification.polynomial.moment_rie import (
 )
 from nlsid_core.identification.polynomial.moments import (
     Moments,
-    MonotoneClass,
     offsets_of,
     plain_moments,
     repeated_moments,
@@ -185,9 +186,12 @@ def test_responses_without_a_common_signal_are_refused() -> None:
 def test_a_bound_for_another_class_is_refused() -> None:
     trial = run(np.random.default_rng(4).uniform(-2, 2, 100), 0.0, 4)
     with pytest.raises(ShapeError, match="do not fit"):
-        moment_bound(truth(), plain_moments([trial], MonotoneClass(3, (0,)), OFFSETS))
+        moment_bound(
+            truth(),
+            plain_moments([trial], Equation(3, (0,), Degrees(left=3), set="3.8"), OFFSETS),
+        )
     with pytest.raises(DataError, match="cubic"):
-        moment_bound(truth(), plain_moments([trial], MonotoneClass(2, (0,), 1), OFFSETS))
+        moment_bound(truth(), plain_moments([trial], Equation(2, (0,), set="3.8"), OFFSETS))
 
 
 @pytest.mark.slow
@@ -205,7 +209,7 @@ def test_the_error_falls_with_more_data() -> None:
 
 def test_the_bound_is_above_the_simulation_error_without_noise() -> None:
     trial = run(np.random.default_rng(4).uniform(-2, 2, 2000), 0.0, 4)
-    small = MonotoneClass(1, (0,))  # a model that cannot be exact
+    small = Equation(1, (0,), Degrees(left=3), set="3.8")  # a model that cannot be exact
     found = minimise_moment_rie(plain_moments([trial], small, OFFSETS), small, trial, OFFSETS)
     simulated = found.model.simulate(trial.u, trial.y[:1, 0])
     error = float(np.mean((simulated - trial.y[:, 0])[1:] ** 2))
@@ -221,7 +225,7 @@ def test_the_bound_is_zero_where_the_model_is_exact() -> None:
 def test_the_rie_of_a_linear_model_is_not_below_its_lower_bound() -> None:
     """Prop 2.19: ≥ sup over |z| = 1 of the equation error through (zI - A)⁻¹, averaged."""
     rng = np.random.default_rng(8)
-    one = MonotoneClass(2, (0,), 1)
+    one = Equation(2, (0,), set="3.8")
     for poles in ((0.5, -0.3), (0.8, 0.4)):
         a = -np.poly(poles)[1:]
         model = replace(truth(), e=np.array([1.0, 0, 0]), a=a, b=np.ones(1), c=0.0)
@@ -237,7 +241,7 @@ def test_the_rie_of_a_linear_model_is_not_below_its_lower_bound() -> None:
 
 def test_first_order_rie_is_the_bound_of_proposition_3_1() -> None:
     rng = np.random.default_rng(9)
-    one = MonotoneClass(1, (0,), 1)
+    one = Equation(1, (0,), set="3.8")
     for pole in (0.9, -0.6, 0.2):
         model = replace(truth(), e=np.array([1.0, 0, 0]), a=np.array([pole]), b=np.ones(1), c=0.0)
         w, y = rng.standard_normal((2, 500))
@@ -284,7 +288,7 @@ def test_direct_minimisation_reaches_the_noise_and_least_squares_does_not() -> N
 
 
 def test_moments_hold_their_class() -> None:
-    moments = plain_moments(pair(100, 1), MonotoneClass(2, (0,), 1), OFFSETS)
+    moments = plain_moments(pair(100, 1), Equation(2, (0,), set="3.8"), OFFSETS)
     assert isinstance(moments, Moments)
     assert moments.degree == 1
     assert moments.matrix().shape == (5, 5)

@@ -8,9 +8,10 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, apart, percent
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.linear import build_regression, least_squares
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.prediction import predict
 from nlsid_core.identification.validation import validate, without_missing
 from nlsid_core.models import DifferenceEquation, Signal
@@ -63,7 +64,7 @@ def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
     dataset = synthetic_dataset(0.02, trials=1, samples=80)
     trial = dataset.trajectories[0]
     linear = truth()
-    stacked = build_state_affine_rows(dataset, StateAffineClass(2, leading_degree=1))
+    stacked = build_state_affine_rows(dataset, Polynomial(2, degrees=Degrees(leading=1)))
     iterate = next(iter(robust_simulation_error(stacked.rows)))
     for model in (linear, stacked.model(iterate.theta, iterate.p)):
         horizon = 4

@@ -1,19 +1,17 @@
 """`identify_block_cascade`: datasets in, a stable block cascade with its proof out.
 
-Random starts on a part of the data, then all of it; the number of phases, of knots and the
-smoothing are chosen by the simulation error on validation data.
+Random starts on a part of the data, then all of it; the number of phases and of knots are
+chosen by the simulation error on validation data.
 """
 
 import time
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
-from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification.network.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
 from nlsid_core.identification.network.cascade_starts import (
     best_start,
@@ -21,74 +19,33 @@ from nlsid_core.identification.network.cascade_starts import (
     with_intervals,
     with_phases,
 )
+from nlsid_core.identification.network.options import FilterMapFilter, Network
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import BlockCascade
 from nlsid_core.models.signal import signals_of
-from nlsid_core.options import require_one_of, require_whole
 from nlsid_core.progress import Progress, silent
 
 STEPS = 40
 TOLERANCE = 1e-3  # relative gain of a step below which a choice of knots and phases is judged
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
-MAX_PHASES_TRIED = 4
-MOST_STARTS, MOST_SAMPLES = 1000, 2**31
+START_SAMPLES = 10_000  # of each trial, for the starts
+SMOOTHING = 1e-8  # of the spline
 START_COEFFICIENTS = 15  # of f, at the start
-
-Begin = Literal["measured", "rest"]
 
 
 @dataclass(frozen=True)
 class CascadeChoice:
-    """One choice of phases, knot intervals and smoothing; rms simulation errors in y's unit."""
+    """One choice of phases and knot intervals; rms simulation errors in y's unit."""
 
     phases: int
     intervals: int
-    smoothing: float
     train_rms: float
     validation_rms: float
     seconds: float
 
     def __str__(self) -> str:
         phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
-        return f"{phases}, {self.intervals} intervals, smoothing {self.smoothing:.0e}"
-
-
-@dataclass(frozen=True)
-class BlockCascadeClass:
-    """A filter, a static nonlinearity, a filter. Source: `theory-cascades-and-moments.md`.
-
-    orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models.
-    phases: tried, each 1 to 4; several presume an input without power near half the sampling
-    frequency. intervals: of knots, tried, ascending, while that helps. smoothing: of the spline,
-    tried; validation data choose all three. starts: random ones, 1 to 1000. start_samples: of each
-    trial, for the starts. seed: of the starts. begin: how trials begin, "measured" (in motion,
-    `BlockCascade.simulate` from the first measured outputs) or "rest" (from zero states).
-    """
-
-    orders: tuple[int, int] = (3, 3)
-    phases: tuple[int, ...] = (1, 2)
-    intervals: tuple[int, ...] = (24, 48, 96)
-    smoothing: tuple[float, ...] = (1e-8,)
-    starts: int = 12
-    start_samples: int = 10_000
-    seed: int = 0
-    begin: Begin = "measured"
-    kind: ClassVar[type[BlockCascade]] = BlockCascade
-
-    def __post_init__(self) -> None:
-        if len(self.orders) != 2 or min(self.orders) < 0 or not 1 <= max(self.orders) <= MOST_LAGS:
-            allowed = f"two whole numbers from 0 to {MOST_LAGS}, not both zero"
-            raise OptionError("orders", self.orders, allowed)
-        if not self.phases or not all(1 <= M <= MAX_PHASES_TRIED for M in self.phases):
-            raise OptionError("phases", self.phases, f"between 1 and {MAX_PHASES_TRIED} each")
-        if not self.intervals or min(self.intervals) < 1:
-            raise OptionError("intervals", self.intervals, "at least 1 each")
-        if not self.smoothing or not min(self.smoothing) >= 0:
-            raise OptionError("smoothing", self.smoothing, "0 or more each")
-        require_whole(self, "starts", 1, MOST_STARTS)
-        require_whole(self, "start_samples", 1, MOST_SAMPLES)
-        require_whole(self, "seed", 0, MOST_SAMPLES)
-        require_one_of(self, "begin", get_args(Begin))
+        return f"{phases}, {self.intervals} intervals"
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +79,7 @@ class CascadeFit:
 def identify_block_cascade(
     train: Dataset,
     validation: Dataset,
-    model_class: BlockCascadeClass,
+    model_class: Network[FilterMapFilter],
     *,
     whole: Dataset | None = None,
     transient: int = 0,
@@ -138,27 +95,27 @@ def identify_block_cascade(
     Infeasible if the minimum found has no proof.
     """
     started = time.perf_counter()
-    orders, phases, intervals = model_class.orders, model_class.phases, model_class.intervals
-    smoothing, starts = model_class.smoothing, model_class.starts
+    made = model_class.structure
+    orders, phases, intervals, starts = made.orders, made.phases, made.intervals, made.starts
     scales = _scales(train)
     fitted, judged = (_trials(data, scales, transient, model_class) for data in (train, validation))
     needed = 2 * (sum(orders) + 2) + START_COEFFICIENTS
     if sum(len(trial.y) - trial.transient for trial in fitted) < needed:
         raise DataError(f"fewer than {needed} scored samples for orders {orders}; give more data")
     first = best_start(
-        tuple(_shortened(trial, model_class.start_samples) for trial in fitted),
+        tuple(_shortened(trial, START_SAMPLES) for trial in fitted),
         orders,
-        smoothing=smoothing[0],
+        smoothing=SMOOTHING,
         starts=starts,
         rng=np.random.default_rng(model_class.seed),
         radius=slowest,
     )
-    total = len(phases) * len(intervals) * len(smoothing) + 2
+    total = len(phases) * len(intervals) + 2
     progress(f"best of {starts} starts", 1 / total)
     single = minimise(
         fitted,
         with_intervals(first, fitted, intervals[0]),
-        smoothing=smoothing[0],
+        smoothing=SMOOTHING,
         steps=STEPS,
         tolerance=TOLERANCE,
         radius=slowest,
@@ -169,16 +126,15 @@ def identify_block_cascade(
         coarser = float("inf")
         for K in intervals:
             base = with_intervals(base, fitted, K)
-            for weight in smoothing:
-                tried.append(_choice(base, fitted, judged, scales[1], weight, radius=slowest))
-                progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
-            finer = min(tried[-len(smoothing) :], key=_validation_error)
+            finer = _choice(base, fitted, judged, scales[1], radius=slowest)
+            tried.append(finer)
+            progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
             if _validation_error(finer) > coarser:
                 break  # finer knots still would fit noise
             coarser, base = finer[0].validation_rms, finer[1]
     chosen, parameters = min(tried, key=_validation_error)
     polished = _choice(
-        parameters, fitted, judged, scales[1], chosen.smoothing,
+        parameters, fitted, judged, scales[1],
         steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
     )  # fmt: skip
     tried.append(polished)
@@ -189,7 +145,7 @@ def identify_block_cascade(
         all_trials = _trials(whole, scales, transient, model_class)
         refitted, parameters = _choice(
             with_intervals(parameters, all_trials, chosen.intervals), all_trials, all_trials,
-            scales[1], chosen.smoothing,
+            scales[1],
             steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
         )  # fmt: skip
         again = refitted.train_rms
@@ -212,7 +168,6 @@ def _choice(
     fitted: tuple[Trial, ...],
     judged: tuple[Trial, ...],
     unit: float,
-    smoothing: float,
     *,
     radius: float,
     steps: int = STEPS,
@@ -220,12 +175,11 @@ def _choice(
 ) -> tuple[CascadeChoice, Parameters]:
     started = time.perf_counter()
     found = minimise(
-        fitted, start, smoothing=smoothing, steps=steps, tolerance=tolerance, radius=radius
+        fitted, start, smoothing=SMOOTHING, steps=steps, tolerance=tolerance, radius=radius
     )
     choice = CascadeChoice(
         phases=len(start.b1),
         intervals=start.f.intervals,
-        smoothing=smoothing,
         train_rms=unit * found.cost**0.5,
         validation_rms=unit * mean_square(found.parameters, judged) ** 0.5,
         seconds=time.perf_counter() - started,
@@ -252,10 +206,15 @@ def _scales(train: Dataset) -> tuple[float, float]:
 
 
 def _trials(
-    data: Dataset, scales: tuple[float, float], transient: int, model_class: BlockCascadeClass
+    data: Dataset,
+    scales: tuple[float, float],
+    transient: int,
+    model_class: Network[FilterMapFilter],
 ) -> tuple[Trial, ...]:
-    from_rest = model_class.begin == "rest"
-    skipped = transient if from_rest else max(transient, model_class.orders[1])  # given, not made
+    from_rest = model_class.structure.begin == "rest"
+    skipped = (
+        transient if from_rest else max(transient, model_class.structure.orders[1])
+    )  # given, not made
     for trajectory in data:
         if transient < 0 or len(trajectory) <= 3 * skipped:
             raise DataError(

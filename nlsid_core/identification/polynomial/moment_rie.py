@@ -25,7 +25,8 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, Infeasible, ShapeError
-from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.identification.polynomial.moments import Moments, Offsets
+from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.signal import signals_of
@@ -62,7 +63,7 @@ class MomentFit:
 
 def minimise_moment_rie(
     moments: Moments,
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     template: Trajectory,
     offsets: Offsets,
     *,
@@ -119,10 +120,10 @@ def moment_bound(model: MonotoneEquation, moments: Moments, *, kappa: float | No
 
 
 def equation(
-    c: FloatArray, model_class: MonotoneClass, template: Trajectory, offsets: Offsets
+    c: FloatArray, model_class: Polynomial, template: Trajectory, offsets: Offsets
 ) -> MonotoneEquation:
     """The model ε = c'Λ = 0."""
-    D, n = model_class.degree, model_class.lags
+    D, n = model_class.degrees.left, model_class.lags
     return MonotoneEquation(
         e=np.concatenate([c[:D], np.zeros(3 - D)]),
         a=-c[D + 1 : D + 1 + n],
