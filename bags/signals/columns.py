@@ -1,18 +1,18 @@
 """Signals of a bag as columns, topic by topic, in bounded memory.
 
-`stream_columns` gives them part by part, as many messages at once as a chunk holds; `read_columns`
-puts the parts together. Memory: one chunk and its index, and what is returned.
+`TopicReader` turns as many messages at once as a chunk holds; `read_columns` puts the parts
+together. Memory: one chunk and its index, and what is returned.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.cdr import Gatherer, Numbers, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.signal import SignalPath, Step
 from nlsid_core.arrays import FloatArray, IntArray
@@ -32,47 +32,41 @@ class Columns:
 
     log_ns, publish_ns: (N,) ns. back: where log times go back inside a file (`LogOrder`).
     stamp_ns: (N,) ns, the header's stamps; None without a header.
-    values: signal -> (N,), in the message's unit.
+    values: signal -> (N,), in the message's unit, and of its type of number.
     """
 
     topic: str
     log_ns: IntArray
     publish_ns: IntArray
     stamp_ns: IntArray | None
-    values: Mapping[str, FloatArray]
+    values: Mapping[str, Numbers]
     back: Sequence[tuple[int, int, int]] = ()
 
     def __len__(self) -> int:
         return len(self.log_ns)
 
-
-def stream_columns(
-    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress = silent
-) -> Iterator[Columns]:
-    """The signals part by part, in the order of the bag's files.
-
-    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
-    All are checked against the types in the bag before a message is read. Raises BagError where
-    `signals` or the bag are wrong.
-    """
-    for _, columns in _parts(bag, signals, progress):
-        yield columns
+    def select(self, rows: IntArray | slice) -> "Columns":
+        """The messages `rows`."""
+        return replace(
+            self,
+            log_ns=self.log_ns[rows],
+            publish_ns=self.publish_ns[rows],
+            stamp_ns=None if self.stamp_ns is None else self.stamp_ns[rows],
+            values={name: values[rows] for name, values in self.values.items()},
+        )
 
 
-def _parts(
-    bag: Bag, signals: Mapping[str, SignalPath], progress: Progress
-) -> Iterator[tuple[int, Columns]]:
-    """(channel, its next messages), in the order of the bag's files."""
-    topics: dict[str, dict[str, SignalPath]] = {}
-    for name, signal in signals.items():
-        topics.setdefault(signal.topic, {})[name] = signal
-    readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
-    total = sum(c.count for c in bag.channels if c.topic in readers)
-    done = 0
-    for channel, batch in bag.batches(list(readers)):
-        yield channel.key, readers[channel.topic].read(batch)
-        done += len(batch)
-        progress("reading", done / max(total, 1))
+def joined_columns(parts: Sequence[Columns]) -> Columns:
+    """The messages of several parts of one topic, one part behind the other."""
+    first = parts[0]
+    stamps = [part.stamp_ns for part in parts if part.stamp_ns is not None]
+    return replace(
+        first,
+        log_ns=np.concatenate([part.log_ns for part in parts]),
+        publish_ns=np.concatenate([part.publish_ns for part in parts]),
+        stamp_ns=np.concatenate(stamps) if stamps else None,
+        values={name: np.concatenate([p.values[name] for p in parts]) for name in first.values},
+    )
 
 
 def read_columns(
@@ -80,15 +74,22 @@ def read_columns(
 ) -> dict[str, Columns]:
     """Topic -> its signals over the whole bag, by log time; equal log times as recorded.
 
-    As `stream_columns`; a topic without messages gives columns of length 0.
+    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
+    All are checked against the types in the bag before a message is read. A topic without messages
+    gives columns of length 0. Raises BagError where `signals` or the bag are wrong.
     """
-    names: dict[str, list[str]] = {}
+    topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
-        names.setdefault(signal.topic, []).append(name)
-    growing = {topic: _Growing(bag, topic, columns) for topic, columns in names.items()}
-    for channel, part in _parts(bag, signals, progress):
-        growing[part.topic].append(channel, part)
-    return {topic: growing.pop(topic).columns() for topic in names}
+        topics.setdefault(signal.topic, {})[name] = signal
+    readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
+    growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
+    total = sum(c.count for c in bag.channels if c.topic in readers)
+    done = 0
+    for channel, batch in bag.batches(list(readers)):
+        growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
+        done += len(batch)
+        progress("reading", done / max(total, 1))
+    return {topic: growing.pop(topic).columns() for topic in topics}
 
 
 def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
@@ -141,7 +142,8 @@ class TopicReader:
         stamp_ns = None
         if self._stamped:
             stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
-        values = {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
+        values: dict[str, Numbers] = {}
+        values |= {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
         for name, group in self._targets.items():
             values[name] = self._signals[name].combine(numbers[at : at + len(group)])
             at += len(group)
