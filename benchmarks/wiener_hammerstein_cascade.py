@@ -23,7 +23,8 @@ from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import single, wiener_hammerstein
 from nlsid_core import files
-from nlsid_core.identification import CascadeFit, FilterMapFilter, Network, identify_block_cascade
+from nlsid_core.identification import FilterMapFilter, History, Network
+from nlsid_core.identification.network.cascade import identify_block_cascade
 
 PERIOD = 1 / 51200  # s
 TRAIN, VALIDATION, TEST = slice(5000, 80000), slice(80000, 100000), slice(105200, 184000)
@@ -32,11 +33,11 @@ PHASES, INTERVALS = (2, 3), (24, 48)
 SEED = 1
 
 
-def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], CascadeFit]:
-    """The promised keys, and the fit."""
+def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], History]:
+    """The promised keys, and what was tried."""
     u, y = wiener_hammerstein(data)
     started, busy = time.perf_counter(), time.process_time()
-    fit = identify_block_cascade(
+    model, proof, steps = identify_block_cascade(
         single("train", u[TRAIN], y[TRAIN], PERIOD),
         single("validation", u[VALIDATION], y[VALIDATION], PERIOD),
         Network(FilterMapFilter(phases=PHASES, intervals=INTERVALS, begin="rest"), seed=seed),
@@ -44,20 +45,20 @@ def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], C
         progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
     )
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
-    error = (fit.model.simulate(u[TEST]) - y[TEST])[SKIPPED:]
+    error = (model.simulate(u[TEST]) - y[TEST])[SKIPPED:]
     with tempfile.TemporaryDirectory() as folder:
-        files.write_document(Path(folder) / "model.json", fit.model.document())
+        files.write_document(Path(folder) / "model.json", model.document())
         path = Path(folder) / "model.proof.json"
-        files.write_document(path, fit.proof.document(fit.model, "model.json"))
+        files.write_document(path, proof.document(model, "model.json"))
         proved = is_proved(path)
     keys: dict[str, float | bool] = {
         "cascade_mv": 1e3 * float(np.sqrt(np.mean(error**2))),
         "cascade_proved": proved,
         "cascade_seconds": seconds,
         "cascade_cpu_seconds": busy,
-        "cascade_rate": fit.proof.rate,
+        "cascade_rate": proof.rate,
     }
-    return keys, fit
+    return keys, History("validation error, rms [V]", steps)
 
 
 def main() -> None:
@@ -67,8 +68,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED, help="of the random starts")
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     arguments = parser.parse_args()
-    keys, fit = measure(arguments.data, seed=arguments.seed)
-    print(f"Wiener-Hammerstein 2009, block cascade, {describe()}\n\n{fit}\n")
+    keys, history = measure(arguments.data, seed=arguments.seed)
+    print(f"Wiener-Hammerstein 2009, block cascade, {describe()}\n\n{history}\n")
     print(f"{'':44s}{'ours':>10s}{'published':>12s}")
     for label, key, published in (
         ("test error [mV]", "cascade_mv", "0.241"),

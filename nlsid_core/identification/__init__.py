@@ -24,7 +24,6 @@ from nlsid_core.identification.validation import (
     Validation,
     simulation_percent,
     validate,
-    without_missing,
 )
 
 __all__ = [
@@ -67,5 +66,4 @@ __all__ = [
     "simulation_percent",
     "stated_rate",
     "validate",
-    "without_missing",
 ]

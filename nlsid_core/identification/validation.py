@@ -15,7 +15,7 @@ from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import (
     Model,
@@ -250,29 +250,6 @@ def hold_out(train: Dataset) -> tuple[Dataset, Dataset]:
         Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if not out)),
         Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if out)),
     )
-
-
-def without_missing(trial: Trajectory, missing: FloatArray, *, shortest: int) -> tuple[
-    tuple[Trajectory, ...], int
-]:  # fmt: skip
-    """The stretches of `trial` where `missing` (N,) is false, and how many samples were skipped.
-
-    Stretches of fewer than `shortest` samples are skipped too. Raises DataError if none is left.
-    """
-    flags = np.asarray(missing, dtype=bool)
-    if flags.shape != trial.t.shape:
-        raise DataError(f"{trial.name}: {flags.shape} flags for {len(trial)} samples")
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], flags, [True]])))
-    stretches = [
-        (begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)
-        if end - begin >= shortest
-    ]  # fmt: skip
-    if not stretches:
-        raise DataError(f"{trial.name}: no stretch of {shortest} samples without gaps")
-    kept = tuple(
-        trial.rows(slice(*ends), f"{trial.name} part {i}") for i, ends in enumerate(stretches, 1)
-    )
-    return kept, len(trial) - sum(map(len, kept))
 
 
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:

@@ -82,7 +82,7 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
     ("section", "reason"),
     [
         ({"model": "wiener", "lags": 2},
-         "identification: there is no such model; there are: linear, state_affine, block_cascade"),
+         "identification: there is no such model; there are: linear, state_affine, monotone"),
         ({"lags": 2, "orders": [1, 2]},
          r"identification.orders: there is no such key; there are: model, .*\(found \[1, 2\]"),
         ({"lags": 2, "method": "magic"},

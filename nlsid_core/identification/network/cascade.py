@@ -4,7 +4,6 @@ Random starts on a part of the data, then all of it; the number of phases and of
 chosen by the simulation error on validation data.
 """
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.identification.fit import Step
 from nlsid_core.identification.network.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
 from nlsid_core.identification.network.cascade_starts import (
     best_start,
@@ -33,47 +33,18 @@ SMOOTHING = 1e-8  # of the spline
 START_COEFFICIENTS = 15  # of f, at the start
 
 
-@dataclass(frozen=True)
-class CascadeChoice:
-    """One choice of phases and knot intervals; rms simulation errors in y's unit."""
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What was fitted with a number of phases and of knots, and its rms errors in y's unit."""
 
-    phases: int
-    intervals: int
+    parameters: Parameters
     train_rms: float
     validation_rms: float
-    seconds: float
 
     def __str__(self) -> str:
-        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
-        return f"{phases}, {self.intervals} intervals"
-
-
-@dataclass(frozen=True, eq=False)
-class CascadeFit:
-    """The model, its proof, the choice that made it, and all choices that were tried.
-
-    again: rms error on all that the choice was fitted to again, in y's unit (None: it was not).
-    """
-
-    model: BlockCascade
-    proof: StabilityProof
-    chosen: CascadeChoice
-    choices: tuple[CascadeChoice, ...]
-    seconds: float
-    again: float | None = None
-
-    def __str__(self) -> str:
-        unit = self.model.y.unit
-        rows = [
-            f"  {c}: train "
-            f"{c.train_rms:.4g} {unit}, validation {c.validation_rms:.4g} {unit}, {c.seconds:.1f} s"
-            for c in self.choices
-        ]
-        head = (
-            f"block cascade of orders {len(self.model.a1)} and {len(self.model.a2)}, proved "
-            f"stable at rate {self.proof.rate:.4f}, {self.seconds:.1f} s"
-        )
-        return "\n".join([head, *rows])
+        M = len(self.parameters.b1)
+        phases = "1 phase" if M == 1 else f"{M} phases"
+        return f"{phases}, {self.parameters.f.intervals} intervals"
 
 
 def identify_block_cascade(
@@ -85,8 +56,8 @@ def identify_block_cascade(
     transient: int = 0,
     slowest: float = MAX_RADIUS,
     progress: Progress = silent,
-) -> CascadeFit:
-    """Identify a `BlockCascade` by simulation error, proved incrementally stable.
+) -> tuple[BlockCascade, StabilityProof, tuple[Step, ...]]:
+    """A `BlockCascade` by simulation error, proved stable, and the rms errors of the choices.
 
     whole: trials to which what was chosen is fitted again (None: it stays fitted to `train`).
     transient: samples at the start of each trajectory that are simulated and not scored. slowest:
@@ -94,7 +65,6 @@ def identify_block_cascade(
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
     Infeasible if the minimum found has no proof.
     """
-    started = time.perf_counter()
     made = model_class.structure
     orders, phases, intervals, starts = made.orders, made.phases, made.intervals, made.starts
     scales = _scales(train)
@@ -120,7 +90,7 @@ def identify_block_cascade(
         tolerance=TOLERANCE,
         radius=slowest,
     ).parameters
-    tried: list[tuple[CascadeChoice, Parameters]] = []
+    tried: list[Choice] = []
     for M in phases:
         base = single if M == 1 else with_phases(single, fitted, M)
         coarser = float("inf")
@@ -129,26 +99,27 @@ def identify_block_cascade(
             finer = _choice(base, fitted, judged, scales[1], radius=slowest)
             tried.append(finer)
             progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
-            if _validation_error(finer) > coarser:
+            if finer.validation_rms > coarser:
                 break  # finer knots still would fit noise
-            coarser, base = finer[0].validation_rms, finer[1]
-    chosen, parameters = min(tried, key=_validation_error)
+            coarser, base = finer.validation_rms, finer.parameters
+    history = [Step(str(choice), choice.validation_rms) for choice in tried]
+    best = min(tried, key=lambda choice: choice.validation_rms)
     polished = _choice(
-        parameters, fitted, judged, scales[1],
+        best.parameters, fitted, judged, scales[1],
         steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
     )  # fmt: skip
-    tried.append(polished)
-    chosen, parameters = min(tried, key=_validation_error)
-    again = None
+    history.append(Step(f"{polished}, minimised further", polished.validation_rms))
+    parameters = min(best, polished, key=lambda choice: choice.validation_rms).parameters
     if whole is not None:
         progress("fitted to all trials", 1.0 - 1.0 / total)
         all_trials = _trials(whole, scales, transient, model_class)
-        refitted, parameters = _choice(
-            with_intervals(parameters, all_trials, chosen.intervals), all_trials, all_trials,
+        refitted = _choice(
+            with_intervals(parameters, all_trials, parameters.f.intervals), all_trials, all_trials,
             scales[1],
             steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
         )  # fmt: skip
-        again = refitted.train_rms
+        parameters = refitted.parameters
+        history.append(Step("fitted to all trials, training error", refitted.train_rms))
     progress("minimised further", 1.0)
     model = _model(parameters, scales, train)
     proof = prove_stability(model)
@@ -158,9 +129,7 @@ def identify_block_cascade(
             f"no proof for the minimum found (slowest pole {radius:.6f}); try lower orders, "
             "more starts or more data"
         )
-    return CascadeFit(
-        model, proof, chosen, tuple(c for c, _ in tried), time.perf_counter() - started, again
-    )
+    return model, proof, tuple(history)
 
 
 def _choice(
@@ -172,23 +141,12 @@ def _choice(
     radius: float,
     steps: int = STEPS,
     tolerance: float = TOLERANCE,
-) -> tuple[CascadeChoice, Parameters]:
-    started = time.perf_counter()
+) -> Choice:
     found = minimise(
         fitted, start, smoothing=SMOOTHING, steps=steps, tolerance=tolerance, radius=radius
     )
-    choice = CascadeChoice(
-        phases=len(start.b1),
-        intervals=start.f.intervals,
-        train_rms=unit * found.cost**0.5,
-        validation_rms=unit * mean_square(found.parameters, judged) ** 0.5,
-        seconds=time.perf_counter() - started,
-    )
-    return choice, found.parameters
-
-
-def _validation_error(entry: tuple[CascadeChoice, Parameters]) -> float:
-    return entry[0].validation_rms
+    validation = mean_square(found.parameters, judged)
+    return Choice(found.parameters, unit * found.cost**0.5, unit * validation**0.5)
 
 
 def _scales(train: Dataset) -> tuple[float, float]:

@@ -55,7 +55,7 @@ def _certified(train: Dataset, model_class: Network[Any], task: Task, method: Se
 
 def _filter_map_filter(train: Dataset, model_class: Network[FilterMapFilter], task: Task) -> Found:
     fitted, judged = (train, task.validation) if task.validation else hold_out(train)
-    found = identify_block_cascade(
+    model, proof, steps = identify_block_cascade(
         fitted,
         judged,
         model_class,
@@ -64,9 +64,4 @@ def _filter_map_filter(train: Dataset, model_class: Network[FilterMapFilter], ta
         slowest=min(MAX_RADIUS, task.searched_rate),
         progress=task.progress,
     )
-    *choices, last = found.choices
-    steps = [Step(str(choice), choice.validation_rms) for choice in choices]
-    steps.append(Step(f"{last}, minimised further", last.validation_rms))
-    if found.again is not None:
-        steps.append(Step("fitted to all trials, training error", found.again))
-    return replace(found.model, bags=train.bags), found.proof, tuple(steps)
+    return replace(model, bags=train.bags), proof, steps

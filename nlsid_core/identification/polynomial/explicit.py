@@ -126,8 +126,12 @@ def _minima(problem: StateAffineRows, starts: list[FloatArray], method: Sem) -> 
         found = minimise_simulation_error(problem, theta, stable=stable)
         return start if stable and prove_stability(found) is None else found
 
-    found: list[Model | None] = [tried(theta.copy, reached) for theta in thetas]
-    return least_error([model for model in found if model is not None], problem.dataset)
+    found: list[Model] = []
+    for theta in thetas:
+        model = tried(theta.copy, reached)
+        if model is not None:
+            found.append(model)
+    return least_error(found, problem.dataset)
 
 
 def _certified(problem: StateAffineRows, trail: Trail[Model], method: Rse | Sem) -> Model:

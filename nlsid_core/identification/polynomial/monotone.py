@@ -42,7 +42,6 @@ def identify_from_repeats(
     data: Dataset,
     model_class: Polynomial,
     *,
-    kappa: float | None = None,
     transient: int = 0,
     accept_untested_repeats: bool = False,
     slowest: float = 1.0,
@@ -67,9 +66,7 @@ def identify_from_repeats(
         refuse_false_repeats(data, transient=transient)
     offsets = offsets_of([trial for group in groups for trial in group])
     moments = repeated_moments(groups, model_class, offsets, executor=executor)
-    return minimise_moment_rie(
-        moments, model_class, groups[0][0], offsets, kappa=kappa, slowest=slowest
-    )
+    return minimise_moment_rie(moments, model_class, groups[0][0], offsets, slowest=slowest)
 
 
 def least_squares_equation(
