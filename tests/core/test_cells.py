@@ -55,7 +55,7 @@ def test_two_tanks_that_flow_over_are_found_to_the_noise_and_proved(fit: Fit[Cel
 
 @pytest.mark.slow
 def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
-    straight = identify(tanks(1), replace(SMALL, limit="none"))
+    straight = identify(tanks(1), Network(CellRow(limit="none")))
     assert len(straight.model.maps) == 3
     assert rms(straight, tanks(1)) > 3.0 * rms(fit, tanks(1))
 
@@ -67,7 +67,7 @@ def test_select_takes_the_cells_where_the_data_are_of_cells() -> None:
         Polynomial(2, degrees=Degrees(inputs=2, leading=1)),
         SMALL,
     ]
-    chosen: Selection[Any] = select(tanks(1), tanks(2, h=(6.0, 3.0)), classes, method=None)
+    chosen: Selection = select(tanks(1), tanks(2, h=(6.0, 3.0)), classes, method=None)
     assert chosen.best is SMALL
     assert chosen.errors[2] < 0.3 * min(chosen.errors[:2])
 

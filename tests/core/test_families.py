@@ -22,6 +22,8 @@ from nlsid_core.identification import (
     Network,
     Polynomial,
     Rie,
+    Rse,
+    Sem,
     describe,
     identify,
     methods_of,
@@ -64,14 +66,14 @@ def recordings(name: str) -> Dataset:
             y[t] = 0.7 * y[t - 1] + 0.3 * np.tanh(u[t - 1]) * np.array([1.0, -2.0])
         y += 0.01 * rng.standard_normal(y.shape)
         several = name in ("two outputs", "measured states")
-        t = PERIOD * np.arange(len(u))
-        trials.append(Trajectory(t=t, y=y if several else y[:, 0], u=u, name=f"run {k}"))
+        stamps = PERIOD * np.arange(len(u))
+        trials.append(Trajectory(t=stamps, y=y if several else y[:, 0], u=u, name=f"run {k}"))
     return Dataset(tuple(trials))
 
 
 @cache
 def fitted(name: str, method: Method) -> Fit[Any]:
-    if hasattr(method, "iterations"):
+    if isinstance(method, Rse | Sem):
         method = replace(method, iterations=STEPS)
     return identify(
         recordings(name), FAMILIES[name], method=method, comparators=(), transient=START,

@@ -58,7 +58,7 @@ FREE = {  # true or false, or options of their own
     (Rie, "accept_untested_repeats"), (Polynomial, "continuous"), (Polynomial, "degrees"),
     (Network, "structure"), (Rse, "certified"), (Sem, "certified"),
 }  # fmt: skip
-OTHER_COMBINATIONS = (
+OTHER_COMBINATIONS: tuple[tuple[Degrees, dict[str, Any], str], ...] = (
     (Degrees(left=3, past=2), {}, "needs ranges in set 2.11"),
     (Degrees(left=3, past=3), {"set": "2.10", "lags": 2}, "needs the degree left 5, or"),
     (Degrees(left=1, past=2), {"set": "2.10"}, "needs the degree left 3"),
@@ -99,7 +99,7 @@ def test_what_no_model_can_satisfy_is_refused(
     degrees: Degrees, options: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(DataError, match=reason):
-        Polynomial(**{"lags": 1, "degrees": degrees} | options)
+        Polynomial(degrees=degrees, **options)
 
 
 def test_options_cannot_be_changed_after_they_were_checked() -> None:

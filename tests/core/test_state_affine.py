@@ -137,8 +137,8 @@ def test_more_parameters_than_equations_are_refused() -> None:
 
 
 def test_certified_iterates_refuse_degrees_they_have_no_set_for() -> None:
-    for degrees in ((3, 0), (0, 2), (2, 1)):
-        model_class = Polynomial(1, (0,), STARRED=degrees)
+    for leading, lagged in ((3, 0), (0, 2), (2, 1)):
+        model_class = Polynomial(1, (0,), Degrees(leading=leading, lagged=lagged))
         stacked = build_state_affine_rows(Dataset((recording(),)), model_class)
         with pytest.raises(ShapeError, match="at most"):
             next(certified_simulation_error(stacked))

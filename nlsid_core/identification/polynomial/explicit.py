@@ -6,6 +6,7 @@ Source: thesis Chapter 4 and Section 1.1.1.
 import logging
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,13 +28,13 @@ from nlsid_core.identification.polynomial.rows import StateAffineRows, build_sta
 from nlsid_core.identification.proofs.stability import prove_stability
 from nlsid_core.identification.starts import SLOWEST_POLE, poles_of, reflected, stable_starts
 from nlsid_core.identification.trail import Task, Trail, least_error, tried
-from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.models import StateAffineModel
 
 BOUND = "bound on the simulation error"
 MOST_ENTRIES = 1_500_000  # of the equation errors; above it, searches that are not asked for wait
 POLE_ROUNDING = 1e-9  # of a pole that was put on the radius
 
-Model = DifferenceEquation | StateAffineModel
+Model = Any  # a DifferenceEquation or a StateAffineModel
 log = logging.getLogger(__name__)
 
 

@@ -130,8 +130,9 @@ class Polynomial:
     @property
     def comparators(self) -> tuple[Method, ...]:
         """Those that run beside what is asked for, because they are quick."""
-        quick = [LeastSquares(), Rie()] if self.form else [LeastSquares(), Rie(), Rse()]
-        return tuple(method for method in quick if method in self.methods)
+        if self.is_linear:
+            return (LeastSquares(), Rse(), Sem())
+        return (LeastSquares(), Rie()) if self.form else (LeastSquares(), Rie(), Rse())
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""

@@ -4,6 +4,7 @@ Source: thesis (4.1)-(4.3).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,10 +90,11 @@ class StateAffineRows:
             block[0] = constant  # the monomials begin with 1
         return np.concatenate([block.ravel() for block in blocks])
 
-    def model(self, theta: FloatArray, p: FloatArray) -> DifferenceEquation | StateAffineModel:
+    def model(self, theta: FloatArray, p: FloatArray) -> Any:
         """The model of left parameters θ and right parameters p of orthonormal columns.
 
-        With one input and no options a `DifferenceEquation`, which takes every input as it is.
+        A `StateAffineModel`; with one input and output and no options a `DifferenceEquation`, which
+        takes every input as it is.
         """
         n_y = len(self.y_scale[0])
         right = -np.linalg.solve(self.R, p.reshape(-1, n_y))
@@ -156,7 +158,7 @@ def build_state_affine_rows(
     row = np.concatenate([np.arange(len(trial) - n) for trial in dataset])
     w = np.stack([U[:, d, i] for i, d in model_class.window(U.shape[2])], axis=1)
     left, right = bases(model_class, w.shape[1])
-    parameters = sum(map(len, left)) * n_y**2 + len(right) * n_y
+    parameters = (sum(map(len, left)) - 1) * n_y**2 + len(right) * n_y
     needed = parameters * (MIN_ROWS_PER_PARAMETER if model_class.is_linear else 1)
     if len(Y) * n_y < needed:
         raise DataError(
