@@ -14,6 +14,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.cdr import Gatherer, Numbers, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
+from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath, Step
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
@@ -32,7 +33,8 @@ class Columns:
 
     log_ns, publish_ns: (N,) ns. back: where log times go back inside a file (`LogOrder`).
     stamp_ns: (N,) ns, the header's stamps; None without a header.
-    values: signal -> (N,), in the message's unit, and of its type of number.
+    values: signal -> (N,), in the message's unit, and of its type of number. sequence: (N,) as the
+    recorder counted them.
     """
 
     topic: str
@@ -40,10 +42,25 @@ class Columns:
     publish_ns: IntArray
     stamp_ns: IntArray | None
     values: Mapping[str, Numbers]
+    sequence: IntArray
     back: Sequence[tuple[int, int, int]] = ()
 
     def __len__(self) -> int:
         return len(self.log_ns)
+
+    def doubt(self, name: str, *, responds: bool) -> str:
+        """Say why the messages that have a signal are of several publishers; else empty.
+
+        A message of other transforms has it not. responds: whether the signal is measured; a
+        command may jump as it likes.
+        """
+        if len(self.back):
+            return ""  # a clock was set, and what is here is not in the order in which it came
+        values = np.asarray(self.values[name], dtype=np.float64)
+        has = np.isfinite(values)
+        stamps = self.log_ns if self.stamp_ns is None else self.stamp_ns
+        said = counted_in_turn(self.sequence[has])
+        return said or (two_curves(stamps[has], values[has]) if responds else "")
 
     def select(self, rows: IntArray | slice) -> "Columns":
         """The messages `rows`."""
@@ -53,6 +70,7 @@ class Columns:
             publish_ns=self.publish_ns[rows],
             stamp_ns=None if self.stamp_ns is None else self.stamp_ns[rows],
             values={name: values[rows] for name, values in self.values.items()},
+            sequence=self.sequence[rows],
         )
 
 
@@ -66,6 +84,7 @@ def joined_columns(parts: Sequence[Columns]) -> Columns:
         publish_ns=np.concatenate([part.publish_ns for part in parts]),
         stamp_ns=np.concatenate(stamps) if stamps else None,
         values={name: np.concatenate([p.values[name] for p in parts]) for name in first.values},
+        sequence=np.concatenate([part.sequence for part in parts]),
     )
 
 
@@ -147,7 +166,9 @@ class TopicReader:
         for name, group in self._targets.items():
             values[name] = self._signals[name].combine(numbers[at : at + len(group)])
             at += len(group)
-        return Columns(self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values)
+        return Columns(
+            self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values, batch.sequence
+        )
 
     def _framed(self, batch: Batch, signal: SignalPath) -> FloatArray:
         """Read by decoding: which message of an array is meant differs from message to message."""
@@ -175,7 +196,7 @@ class _Growing:
         self._topic = topic
         self._names = names
         self._stamped = is_stamped(*bag.types_on(topic))
-        self._times = np.empty((3 if self._stamped else 2, capacity), dtype=np.int64)
+        self._times = np.empty((4 if self._stamped else 3, capacity), dtype=np.int64)
         self._values = np.empty((len(names), capacity))
         self._length = 0
         self._order = LogOrder()
@@ -190,8 +211,9 @@ class _Growing:
         here = slice(start, self._length)
         self._times[0, here] = part.log_ns
         self._times[1, here] = part.publish_ns
+        self._times[2, here] = part.sequence
         if part.stamp_ns is not None:
-            self._times[2, here] = part.stamp_ns
+            self._times[3, here] = part.stamp_ns
         for row, name in enumerate(self._names):
             self._values[row, here] = part.values[name]
 
@@ -205,7 +227,8 @@ class _Growing:
             self._topic,
             times[0],
             times[1],
-            times[2] if self._stamped else None,
+            times[3] if self._stamped else None,
             dict(zip(self._names, values, strict=True)),
+            times[2],
             self._order.back,
         )

@@ -18,6 +18,7 @@ from bags.signals.reader import (
     HEADER_STAMP,
     LOG_TIME,
     Samples,
+    SamplesError,
     bag_origin,
     read_signals,
     stamp_text,
@@ -378,6 +379,9 @@ def _read_trials(
             gaps_in=texts["responses"] if options["split_gaps"] else (),
         )
         _refuse_other_clocks(path, read, wanted)
+        for text, samples in read.items():
+            if doubt := samples.doubt(responds=text in texts["responses"]):
+                raise SamplesError(f"{path}: {doubt}; record it again with one of them")
         origin = bag_origin(bag)
     responses = [read[text] for text in texts["responses"]]
     trials = to_trajectories(

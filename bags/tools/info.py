@@ -103,7 +103,9 @@ class BagInfo:
     def lost(self, topic: TopicInfo) -> int | None:
         """Messages lost, by the recorder's count or sequence numbers; None if neither counts."""
         said = self.custom.get(topic.topic + LOST, "")
-        counts = [int(said)] if said.isdecimal() else []
+        if said and not said.isdecimal():
+            return None  # of several publishers
+        counts = [int(said)] if said else []
         counts += [] if topic.missing is None else [topic.missing]
         return max(counts, default=None)
 
