@@ -213,7 +213,7 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
     one, three, hundred = chosen.selection.errors
     assert three < one
     assert hundred == np.inf
-    assert "rows for 202 parameters" in chosen.selection.tried[2].refusal
+    assert "equations for 202 parameters" in chosen.selection.tried[2].refusal
     section = {"model": "state_affine", "lags": 1, "iterations": 3}
     affine = load_config(write_config(tmp_path / "a.yaml", section))
     both = select_bags(

@@ -62,5 +62,5 @@ def test_unusable_repeats_say_what_is_wrong() -> None:
         repeated_moments([short], CLASS, OFFSETS)
     with pytest.raises(ShapeError, match="one output"):
         offsets_of([replace(first, y=np.zeros((400, 2)), y_names=(), y_units=(), y_paths=())])
-    with pytest.raises(DataError, match="degree is 2"):
+    with pytest.raises(DataError, match="left is 2"):
         Polynomial(1, (0,), Degrees(left=2), set="3.8")
