@@ -17,6 +17,7 @@ from nlsid_core.errors import BagError
 METADATA: Final = "metadata.yaml"
 ROS1: Final = ".bag"
 DATA_FILES: Final = (".mcap", ".db3", ROS1)
+ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MOST_LOOKED_AT: Final = 50  # folders, for bags that lie deeper than what was given
@@ -60,7 +61,7 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
         inside = sorted(
             p
             for p in path.iterdir()
-            if (p.is_dir() and _is_bag(p)) or (p.is_file() and p.suffix in DATA_FILES)
+            if (p.is_dir() and _is_bag(p)) or (p.is_file() and _is_data(p))
         )
         if not inside:
             raise BagError(
@@ -122,9 +123,17 @@ def bag_files(path: Path) -> BagFiles:
 
 def data_files(folder: Path) -> tuple[Path, ...]:
     """The data files in a folder; part 2 before part 10."""
-    suffixes = (*DATA_FILES, COMPRESSED)
-    there = [p for p in folder.iterdir() if p.suffix in suffixes and p.is_file()]
+    there = [p for p in folder.iterdir() if _is_data(p) and p.is_file()]
     return tuple(sorted(there, key=_by_number))
+
+
+def _data_name(path: Path) -> Path:
+    """The name before it was compressed, or with which its recorder was killed."""
+    return Path(path.name.removesuffix(COMPRESSED).removesuffix(ACTIVE))
+
+
+def _is_data(path: Path) -> bool:
+    return _data_name(path).suffix in DATA_FILES
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
@@ -217,7 +226,7 @@ def _bad(file: Path, what: str) -> BagError:
 def _is_bag(folder: Path) -> bool:
     if (folder / METADATA).is_file():
         return True
-    stems = sorted(p.stem for p in folder.iterdir() if p.suffix in DATA_FILES)
+    stems = sorted(_data_name(p).stem for p in folder.iterdir() if _is_data(p))
     if len(stems) > 1 and any(p.suffix == ROS1 for p in folder.iterdir()):
         return False  # each is whole, also where one recording was split
     if len(stems) < 2:
