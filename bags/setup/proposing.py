@@ -139,9 +139,9 @@ def propose(
         proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
-    ranges = _ranges(trials.train)
-    if all(_is_constant(*ends) for ends in ranges):
-        _refuse_constant(excitations, ranges, "drives", "the training trials")
+    in_training = _ranges(trials.train)
+    if all(_is_constant(*ends) for ends in in_training):
+        _refuse_constant(excitations, in_training, "drives", "the training trials")
     say_direction(proposal, found, trials.every)
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
