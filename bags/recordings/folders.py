@@ -3,7 +3,7 @@
 import os
 import re
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +21,7 @@ ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MOST_LOOKED_AT: Final = 50  # folders, for bags that lie deeper than what was given
+MOST_PARTS: Final = 10_000  # of one recording; a greater number is a date
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 
 # The C loader where PyYAML has it: ten thousand topics are seconds in Python.
@@ -118,7 +119,17 @@ def bag_files(path: Path) -> BagFiles:
         return _described(path, _metadata(path / METADATA))
     if not (there := data_files(path)):
         raise BagError(f"{path} is not a bag: it holds no {' or '.join(DATA_FILES)} file")
-    return BagFiles(there, finished=False)
+    return BagFiles(there, finished=False, notes=_missing_parts(there))
+
+
+def _missing_parts(files: Sequence[Path]) -> tuple[str, ...]:
+    """Which parts are not there of a recording whose parts are numbered from 0."""
+    numbered = [re.search(r"_(\d+)\.", file.name) for file in files]
+    numbers = {int(match[1]) for match in numbered if match}
+    if 0 not in numbers or max(numbers) > MOST_PARTS:
+        return ()
+    missing = set(range(max(numbers))) - numbers
+    return tuple(f"part {number} of the recording is not there" for number in sorted(missing))
 
 
 def data_files(folder: Path) -> tuple[Path, ...]:

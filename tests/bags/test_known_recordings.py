@@ -589,6 +589,10 @@ def test_parts_are_read_in_the_order_of_time(tmp_path: Path, suffix: str, listed
             f"  relative_file_paths:\n{names}"
         )
     assert exported(folder, tmp_path / "out", "x", "data") == ramp(36)
+    (folder / f"run_5{suffix}").unlink()
+    status, said = run("recover", folder, "--out", tmp_path / "whole")
+    assert (status, "nothing was lost" in said) == (1, False)
+    assert ("run_5" if listed else "part 5 of the recording is not there") in said
 
 
 def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) -> None:
