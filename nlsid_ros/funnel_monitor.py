@@ -2,7 +2,8 @@
 
 Subscribes to the funnel, its model and its policy, and to the topics of its signals, of which there
 may be several, by the model's own field paths, on message stamps. Publishes ~/margin
-(sensor_msgs/JointState: stamped, named numbers) for every sample, ~/forecast if asked for (the same
+(sensor_msgs/JointState: stamped, named numbers; frame_id says of which funnel and run) for every
+sample, ~/forecast if asked for (the same
 type: `low` and `high` of each output `ahead` s after the newest sample, at that stamp, while the
 command is held), ~/events when the state changes, and /diagnostics at once when it does, otherwise
 once a second. Leaving the funnel calls
@@ -29,7 +30,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
-from bags.monitoring.announcement import Run
+from bags.monitoring.announcement import UNANNOUNCED, Run
+from bags.monitoring.announcement import WAITING as RUN_WAITING
 from bags.monitoring.watch import WAITING, Stamped, Watch
 from bags.signals.grid import seconds
 from bags.signals.sampling import said_filled
@@ -206,19 +208,29 @@ class FunnelMonitor(ManagedNode):
             self._diagnostics.publish(self._status_message())
 
     def _on_run(self, message: String) -> None:
-        """A controller announced the stamp of its sample 0."""
+        """A controller announced the stamp of its sample 0, or the end of that run."""
+        before = self._run
         try:
             self._run = Run.from_document(files.parse_document(message.data, source="run"))
         except NlsidError as error:
             self.get_logger().error(f"announcement not used: {error}")
             return
+        if self._run.ended:
+            self._end(before)
+            return
         if self._latched is not None:  # what happened before has not been looked at
             self._call_for_help()
         self._begin()
 
+    def _end(self, before: Run | None) -> None:
+        """Judge no more: the announced run, `before` it ended, is over."""
+        assert self._run is not None
+        if self._watch is not None and before is not None and before.name == self._run.name:
+            self._watch.stop(self._run.last_ns, self._run.ended)
+
     def _begin(self) -> None:
-        """Begin the announced run if it is of the funnel at hand."""
-        if self._watch is None or self._run is None:
+        """Begin the announced run if it is of the funnel at hand, and on."""
+        if self._watch is None or self._run is None or self._run.ended:
             return
         if self._run.funnel != self._digest:
             self._tell("the controller tracks another funnel than the one in use here")
@@ -358,12 +370,23 @@ class FunnelMonitor(ManagedNode):
             self._say(reading, state)
             self._publish_margin(stamp_ns, reading)
 
+    @property
+    def _judging(self) -> str:
+        """Of which funnel and run the verdicts are."""
+        assert self._watch is not None
+        if not self._controller or self._watch.monitor.goes_on:
+            return f"{self._digest} {UNANNOUNCED}"
+        if self._run is None or self._run.funnel != self._digest:
+            return f"{self._digest} {RUN_WAITING}"
+        return self._run.name
+
     def _publish_margin(self, stamp_ns: int, reading: Reading) -> None:
         latency_ns = self.get_clock().now().nanoseconds - stamp_ns
         self._slowest_ns = max(self._slowest_ns, latency_ns)
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        message.header.frame_id = self._judging
         numbers = reading.numbers | self._widths.of(reading)
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))

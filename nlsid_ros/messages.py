@@ -1,20 +1,23 @@
 """The numbers of signals into a stamped message of their topic's type."""
 
-import json
 import math
 import re
 import time
 from copy import deepcopy
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from rclpy.clock import Clock
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.validate_topic_name import validate_topic_name
 
 from bags.recordings.message_types import is_stamped
 from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
+from nlsid_core import files
 from nlsid_core.arrays import ArrayLike
-from nlsid_core.errors import BagError
+from nlsid_core.errors import BagError, DocumentError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.running import ManagedNode
@@ -27,6 +30,15 @@ PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
 BASE_PATIENCE: Final = 0.5  # s without a command after which a base stops by itself
 OTHERS_PATIENCE: Final = 1.0  # s without a message on that topic
 SAID: Final = 6  # fields that are named
+_PYTHON: Final[dict[str, tuple[type, ...]]] = {  # what JSON has for ROS's types
+    "double": (int, float),
+    "float": (int, float),
+    "boolean": (bool,),
+    "int": (int,),
+    "uint": (int,),
+    "string": (str,),
+    "wstring": (str,),
+}
 
 
 class SignalMessage:
@@ -50,26 +62,14 @@ class SignalMessage:
             for name, *_ in numeric_paths(msgtype, types)
             if _plain(name) not in mine and "[" not in name and not name.startswith("header.")
         ]
-        self._base: Any = None
-        self._topic, self._heard = "", -math.inf
-        if others == REFUSED:
-            if self.rest:
-                raise BagError(
-                    f"{msgtype} has fields that are not the signal ({self.rest_said}); say what "
-                    f"they are: others {OTHERS}"
-                )
-        elif others.startswith("{"):
-            self._base = self.kind()
-            try:
-                _fill(self._base, json.loads(others))
-            except (ValueError, TypeError, AttributeError, AssertionError) as error:
-                raise BagError(f"others, fields of {msgtype}: {error}") from error
-        elif others.startswith("/"):
-            if others == path.topic:
-                raise BagError(f"others is {others}, which the commands themselves are sent to")
-            self._topic = others
-        elif others != ZERO:
-            raise BagError(f"others is '{others}'; it should be {OTHERS}")
+        self._base = other_fields(msgtype, others)
+        self._topic = others if others.startswith("/") else ""
+        self._heard, self._unfit = -math.inf, ""
+        if others == REFUSED and self.rest:
+            raise BagError(
+                f"{msgtype} has fields that are not the signal ({self.rest_said}); say what "
+                f"they are: others {OTHERS}"
+            )
         self.is_zero = others == ZERO and bool(self.rest)
 
     @property
@@ -82,6 +82,8 @@ class SignalMessage:
         """Take the other fields from the topic that was named, or say that they are zero."""
         if self._topic:
             topic = node.signal_topic(self._topic)
+            if topic == node.signal_topic(self.path.topic):
+                raise BagError(f"others is {topic}, which the commands themselves are sent to")
             node.create_subscription(self.kind, topic, self._on_other, qos.SENSOR)
         elif self.is_zero:
             node.get_logger().warning(
@@ -90,10 +92,18 @@ class SignalMessage:
             )
 
     def _on_other(self, message: Any) -> None:
+        """Take the fields of a message, if all that are numbers are finite."""
+        numbers = {name: SignalPath.parse(f"/others:{name}").value(message) for name in self.rest}
+        unfit = [
+            f"{name} is {value}" for name, value in numbers.items() if not math.isfinite(value)
+        ]
+        self._unfit = f"on {self._topic}, {', '.join(unfit)}" if unfit else ""
         self._base, self._heard = message, time.monotonic()
 
     def lacking(self) -> str:
         """Why the other fields are not known, empty if they are."""
+        if self._unfit:
+            return self._unfit
         if not self._topic or time.monotonic() - self._heard <= OTHERS_PATIENCE:
             return ""
         return f"nothing on {self._topic} for {OTHERS_PATIENCE:g} s, which has the other fields"
@@ -115,17 +125,63 @@ def _plain(path: SignalPath | str) -> str:
     return re.sub(r"\[[^]]*\]", "", str(path).rpartition(":")[2])
 
 
-def _fill(message: Any, content: dict[str, Any]) -> None:
-    """Take fields of a JSON object; ValueError, TypeError or AssertionError if one does not fit."""
-    known = message.get_fields_and_field_types()
+def other_fields(msgtype: str, others: str) -> Any:
+    """A message of `msgtype` with the constant fields of `others`; None if it states none.
+
+    Raises BagError if it is not OTHERS, or a field is not of its type, or not finite.
+    """
+    if others.startswith("/"):
+        try:
+            validate_topic_name(others)
+        except InvalidTopicNameException as error:
+            raise BagError(f"others is no topic: {str(error).splitlines()[0]}") from error
+    elif others.startswith("{"):
+        source = f"others, fields of {msgtype}"
+        try:
+            content = files.parse_document(others, source=source)
+        except DocumentError as error:
+            raise BagError(str(error)) from error
+        return _filled(message_class(msgtype), content, source)
+    elif others not in (ZERO, REFUSED):
+        raise BagError(f"others is '{others}'; it should be {OTHERS}")
+    return None
+
+
+def _filled(kind: Any, content: Any, source: str) -> Any:
+    """A message of these fields."""
+    if not isinstance(content, dict):
+        raise BagError(f"{source}: {content!r} should be an object of its fields")
+    known, empty, fields = kind.get_fields_and_field_types(), kind(), {}
     for name, value in content.items():
         if name not in known:
-            raise ValueError(f"there is no '{name}'; there are: {', '.join(known)}")
-        part = getattr(message, name)
-        if isinstance(value, dict):
-            _fill(part, value)
-        else:
-            setattr(message, name, float(value) if isinstance(part, float) else value)
+            raise BagError(f"{source}: there is no '{name}'; there are: {', '.join(known)}")
+        part = getattr(empty, name)
+        nested = hasattr(part, "get_fields_and_field_types")
+        read: Any = partial(_filled, type(part)) if nested else partial(_fitting, known[name])
+        fields[name] = read(value, f"{source}: {name}")
+    try:
+        kind(check_fields=True, **fields)  # lengths, and ranges of numbers
+    except (AssertionError, TypeError, ValueError, OverflowError) as error:
+        reason = str(error).partition(" and each ")[0]
+        raise BagError(f"{source}: {reason}") from error
+    return kind(**fields)
+
+
+def _fitting(kind: str, value: Any, source: str) -> Any:
+    """A value, or a list of them, for a field of this type: `double`, `sequence<double>`, ..."""
+    element = re.sub(r"^sequence<|[>\[,].*$", "", kind)
+    listed = element != kind
+    wanted = next((python for name, python in _PYTHON.items() if element.startswith(name)), ())
+    values = value if listed and isinstance(value, list) else [value]
+    fits = listed == isinstance(value, list) and all(
+        isinstance(each, wanted) and isinstance(each, bool) == (element == "boolean")
+        for each in values
+    )
+    if not fits:
+        raise BagError(f"{source} is {value!r}; it should be {kind}")
+    if float in wanted:
+        values = list(map(float, values))
+    return values if listed else values[0]
 
 
 def _make_room(path: SignalPath, message: Any) -> None:

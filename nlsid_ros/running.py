@@ -19,7 +19,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
@@ -67,7 +67,10 @@ class ManagedNode(LifecycleNode):
     """
 
     def __init__(self, name: str, arguments: Arguments = None) -> None:
-        super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
+        try:
+            super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
+        except (RuntimeError, NameValidationException) as error:
+            raise _unreadable(error) from error
         self.declared: list[Declared] = []
         self._is_configured = False
         self.add_on_set_parameters_callback(self._on_parameters)
@@ -209,7 +212,10 @@ class ManagedNode(LifecycleNode):
 
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
-            work()
+            try:
+                work()
+            except NameValidationException as error:
+                raise _unreadable(error) from error
         except (NlsidError, OSError) as error:
             self.failure = error
             self.get_logger().error(str(error))
@@ -274,7 +280,10 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
     the node could send a last command. Raises what made the node fail to start.
     """
     woken = _wake_on_signals()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise _unreadable(error) from error
     nodes: list[ManagedNode] = []
     try:
         for make in makes:
@@ -289,6 +298,13 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
             ending.callback(try_shutdown)
             for node in reversed(nodes):
                 ending.callback(node.destroy_node)
+
+
+def _unreadable(error: Exception) -> DataError:
+    """What ROS cannot use of arguments or names, without where its code says so."""
+    said = str(error).partition(". Error:")[0].partition(", at /")[0]
+    hint = "; a namespace begins with a slash: /robot1" if "__ns" in said else ""
+    return DataError(f"ROS refuses: {' '.join(said.split())}{hint}")
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:

@@ -4,9 +4,10 @@ Of a difference equation sample k's input is known one period ahead; it is publi
 into force, stamped a quarter of a period before its sample is due, so that a sample off the grid by
 that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
 `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
-digest. Stale or impossible state, `~/stop`, a required monitor that no longer judges, and the end
-of the plan ramp the input to `stop_at`. With `commissioning` it runs a policy from files of which
-nothing is proved, and says so in every status; `stop_service` then has to be there.
+digest, and then that it has ended. Stale or impossible state, `~/stop`, a required monitor that
+does not judge this run against this funnel, and the end of the plan ramp the input to `stop_at`.
+With `commissioning` it runs a policy from files of which nothing is proved, and says so in every
+status; `stop_service` then has to be there.
 """
 
 import math
@@ -29,7 +30,7 @@ from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
 from bags.designs.documents import load_unproved
-from bags.monitoring.announcement import Run
+from bags.monitoring.announcement import UNANNOUNCED, Run
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
@@ -53,6 +54,7 @@ from nlsid_ros.messages import (
     base_stopped,
     frame_of,
     off_clock,
+    other_fields,
     patience,
     stamp_ns_of,
 )
@@ -103,6 +105,7 @@ class TrackingController(ManagedNode):
         limit("stop_rate", 1.0, what, between=(1e-6, BIG))
         what = f"fields of the commands that are not the input: {OTHERS}"
         self._others = declare_text(self, "others", ZERO, what)
+        other_fields(self._command_type, self._others)
         what = "s until a robot that is stopped is at rest, faster than stop_rate if need be"
         number("stop_within", 5.0, what, between=(0.01, 60.0))
         what = (
@@ -152,6 +155,9 @@ class TrackingController(ManagedNode):
         self._command: SignalMessage | None = None
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
+        self._run: Run | None = None  # as it was announced
+        self._last_ns = 0  # the stamp of the last response under the policy's own input
+        self._stamped_ns = 0  # the newest stamp of a response or command
         self._sent = -math.inf  # when the last command went out, s of the wall's time
         self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
         self._ramp = self._limits
@@ -244,10 +250,12 @@ class TrackingController(ManagedNode):
         except NlsidError as error:
             self._tell(f"idle; not started: {error}")
             return str(error)
-        if self._watched and not self.count_publishers(self._margin.topic_name):
+        if self._watched and (count := self.count_publishers(self._margin.topic_name)) != 1:
             self._controller = None
-            return f"require_monitor is set and nobody publishes {self._margin.topic_name}"
-        self._first_ns, self._stage = None, 1
+            judging = f"{count} nodes publish" if count else "nobody publishes"
+            return f"require_monitor is set and {judging} {self._margin.topic_name}"
+        self._first_ns, self._run, self._stage = None, None, 1
+        self._stamped_ns, self._accompanied = 0, not self._watched
         self._tell("waiting for the response")
         return ""
 
@@ -258,11 +266,14 @@ class TrackingController(ManagedNode):
             return
         stamp_ns = stamp_ns_of(message)
         self._heard = time.monotonic()
-        if self._first_ns is None:  # its input is not ours; the next sample's is
-            self._frame_heard = self._frame or frame_of(message)
-            if reason := self._distrust(stamp_ns, message):
-                self._halt(reason)
-                return
+        if self._first_ns is None:
+            self._frame_heard, self._judged = self._frame or frame_of(message), self._heard
+        if reason := self._distrust(stamp_ns, message):
+            self._halt(reason)
+            return
+        self._stamped_ns = max(self._stamped_ns, stamp_ns)
+        if self._first_ns is None or not self._accompanied:
+            # Its input is not ours. The next sample's is, once the required monitor is heard.
             self._first_ns, self._sent = stamp_ns, self._heard
         else:
             waiting = controller.k < 1
@@ -272,18 +283,23 @@ class TrackingController(ManagedNode):
                 self._halt(str(error))
                 return
             controller.update(seconds(stamp_ns, self._first_ns), value)
-            if ended := controller.ended or self._distrust(stamp_ns, message):
-                self._halt(ended)
+            if controller.lead or not controller.ended:
+                self._last_ns = stamp_ns
+            if controller.ended:
+                self._halt(controller.ended)
                 return
             if waiting and controller.k >= 1:
-                self._judged, self._announced_ns = self._heard, stamp_ns
-                announced = Run(stamp_ns, self._digest).document()
-                self._announce.publish(String(data=files.encode(announced).decode()))
+                self._judged = self._heard
+                self._say_run(Run(stamp_ns, self._digest))
                 self._tell(self._tracking(controller))
             elif controller.stage != self._stage:
                 self._tell(self._tracking(controller))
         self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
         self._on_due()
+
+    def _say_run(self, run: Run) -> None:
+        self._run = run
+        self._announce.publish(String(data=files.encode(run.document()).decode()))
 
     def _tracking(self, controller: Controller) -> str:
         """What is being done, and of a composition in which stage."""
@@ -316,12 +332,28 @@ class TrackingController(ManagedNode):
             self._send(stamp_ns)
 
     def _on_margin(self, message: JointState) -> None:
-        """The required monitor has judged a sample; one not of this run and of now is none."""
+        """The required monitor has judged a sample; one not of this run and of now is none.
+
+        One of another funnel, or of no run, ends this one.
+        """
         stamp_ns = stamp_ns_of(message)
-        tracking = self._controller is not None and self._controller.k >= 1
-        if not tracking or stamp_ns < self._announced_ns:
+        if self._controller is None or self._first_ns is None:
             return
-        if off_clock(stamp_ns, self.get_clock(), self._monitor_patience):
+        start_ns = 0 if self._run is None else self._run.start_ns
+        if stamp_ns < start_ns or off_clock(stamp_ns, self.get_clock(), self._monitor_patience):
+            return
+        funnel, _, of_run = message.header.frame_id.partition(" ")
+        if funnel != self._digest:
+            judged = f"the funnel {funnel}" if funnel else "a funnel that it does not name"
+            self._halt(f"{self._monitor} judges {judged}, not {self._digest}, which is tracked")
+            return
+        if of_run == UNANNOUNCED:
+            self._halt(f"{self._monitor} judges no run: set its controller and nominal:=profile")
+            return
+        if self._run is None:  # it watches, and waits for the announcement
+            self._accompanied, self._judged = True, time.monotonic()
+            return
+        if message.header.frame_id != self._run.name:
             return
         numbers = dict(zip(message.name, message.position, strict=False))
         margin, assumption = (numbers.get(key, math.nan) for key in ("margin", "assumption"))
@@ -346,12 +378,10 @@ class TrackingController(ManagedNode):
             self._halt(f"no command has gone out for {unsent:g} s")
         elif lacking := self._command.lacking():
             self._halt(lacking)
-        elif self._is_unwatched(now):
+        elif self._watched and now - self._judged > self._monitor_patience:
             self._halt(f"{self._monitor} has judged nothing for {self._monitor_patience:g} s")
-
-    def _is_unwatched(self, now: float) -> bool:
-        tracking = self._controller is not None and self._controller.k >= 1
-        return self._watched and tracking and now - self._judged > self._monitor_patience
+        elif self._watched and (count := self.count_publishers(self._margin.topic_name)) > 1:
+            self._halt(f"{count} nodes publish {self._margin.topic_name}; stop all but one")
 
     def _on_step(self) -> None:
         """One step towards rest; the last says so. A base that has stopped by itself, because no
@@ -363,7 +393,8 @@ class TrackingController(ManagedNode):
             if base_stopped(self._sent, self._design.period)
             else self._ramp.towards_stop(self._input, self._design.period)
         )
-        self._send(self.get_clock().now().nanoseconds)
+        # Later than the last response, which is not to be judged under it, in simulated time too.
+        self._send(max(self.get_clock().now().nanoseconds, self._stamped_ns + 1))
         if self._limits.at_rest(self._input):
             self._step.cancel()
             self._tell(f"idle; stopped: {self._stopping}")
@@ -371,7 +402,7 @@ class TrackingController(ManagedNode):
 
     def _send(self, stamp_ns: int) -> None:
         assert self._command is not None
-        self._sent = time.monotonic()
+        self._sent, self._stamped_ns = time.monotonic(), max(self._stamped_ns, stamp_ns)
         self._commands.publish(self._command.make(stamp_ns, self._input))
 
     def _halt(self, reason: str) -> None:
@@ -383,6 +414,9 @@ class TrackingController(ManagedNode):
         self._next.cancel()
         self._due.clear()
         self._stopping = reason
+        if self._run is not None:
+            self._say_run(replace(self._run, ended=reason, last_ns=self._last_ns))
+            self._run = None
         if self._commissioning and reason not in ENDED:
             self._brake.call_async(Trigger.Request())
         away = np.abs(np.subtract(self._input, self._limits.stop_at))

@@ -140,7 +140,8 @@ def _command(node: Element, values: Mapping[str, str]) -> list[str]:
     def filled(element: Element, attribute: str) -> str:
         return _filled(element.attrib[attribute], values)
 
-    renamed = [("__node", filled(node, "name")), ("__ns", filled(node, "namespace"))]
+    namespace = "/" + filled(node, "namespace").lstrip("/")  # as ROS launch takes `robot1`
+    renamed = [("__node", filled(node, "name")), ("__ns", namespace)]
     renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
     settings = [part for old, new in renamed for part in ("-r", f"{old}:={new}")]
     for each in node.iter("param"):

@@ -1,4 +1,8 @@
-"""`Run`: a controller's word on which funnel it tracks and since when, so that nobody guesses."""
+"""`Run`: a controller's word on which funnel it tracks and since when, so that nobody guesses.
+
+A monitor says beside every verdict what it is one of: the digest of its funnel and a word, which is
+the run's `start_ns`, WAITING while none is announced, or UNANNOUNCED if it follows none.
+"""
 
 from dataclasses import dataclass
 
@@ -6,29 +10,49 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 
 FORMAT = "nlsid/run"
+WAITING = "waiting"
+UNANNOUNCED = "unannounced"
 
 
 @dataclass(frozen=True)
 class Run:
-    """Sample 0 of the policy's plan is the response stamped `start_ns`; funnel: its digest."""
+    """Sample 0 of the policy's plan is the response stamped `start_ns`; funnel: its digest.
+
+    ended: why the run is over, empty while it is on. last_ns: then the stamp of the last response
+    under the policy's own input.
+    """
 
     start_ns: int
     funnel: str
+    ended: str = ""
+    last_ns: int = 0
+
+    @property
+    def name(self) -> str:
+        """How a verdict names it."""
+        return f"{self.funnel} {self.start_ns}"
 
     def document(self) -> Json:
         """The JSON form."""
+        over = {"ended": self.ended, "last_ns": self.last_ns} if self.ended else {}
         return {
             "format": FORMAT,
             "version": files.VERSION,
             "start_ns": self.start_ns,
             "funnel": self.funnel,
+            **over,
         }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "run") -> "Run":
         """Raises DocumentError if the document is not a run."""
         files.header(document, FORMAT, source=source)
-        return cls(
+        run = cls(
             start_ns=files.member(document, "start_ns", int, source=source),
             funnel=files.member(document, "funnel", str, source=source),
         )
+        if "ended" not in document:
+            return run
+        ended = files.member(document, "ended", str, source=source)
+        last_ns = files.member(document, "last_ns", int, source=source)
+        return cls(run.start_ns, run.funnel, ended, last_ns)

@@ -411,7 +411,7 @@ def announced_runs(
         messages = source.messages(_run_topics(source))
         found = [_run(message, source) for message in messages]
     digest = design.digest
-    return [run for run in found if run.funnel == digest]
+    return [run for run in found if run.funnel == digest and not run.ended]
 
 
 class _Clock:
@@ -455,7 +455,9 @@ def _fed(
         for message in source.messages([*run_topics, *topics], as_recorded=set_back):
             if message.topic in run_topics:
                 run = _run(message, source)
-                if run.funnel == digest:
+                if run.funnel == digest and run.ended:
+                    watch.stop(run.last_ns, run.ended)
+                elif run.funnel == digest:
                     yield watch.begin(run.start_ns)
                 continue
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)

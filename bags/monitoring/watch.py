@@ -100,6 +100,7 @@ class Watch:
         self._newest: dict[str, tuple[int, tuple[float, ...]]] = {}  # of each response topic
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
         self._start_ns: int | None = None
+        self._over: tuple[float, str] = (math.inf, "")  # the run's last stamp (ns), and why
         self._running = not self._announced
         self._ahead: Ahead | None = None
         self._held: tuple[int, Any] | None = None
@@ -122,6 +123,14 @@ class Watch:
         if self.origin_ns is None:
             self.origin_ns = start_ns
         return self._judge([sample for sample in recent if sample.stamp_ns >= start_ns])
+
+    def stop(self, last_ns: int, reason: str) -> None:
+        """The run at hand has ended with the response stamped `last_ns`: none after it is judged.
+
+        Tubes around a simulation go on, whoever sends the commands.
+        """
+        if not self.monitor.goes_on:
+            self._over = last_ns, reason
 
     def message(self, topic: str, stamp_ns: int, message: Any) -> list[Stamped]:
         """Feed a decoded message of a checked topic; the readings that can be given now, in order.
@@ -206,6 +215,7 @@ class Watch:
                 self.origin_ns = sample.stamp_ns
             if self._start_ns is not None and sample.stamp_ns >= self._start_ns:
                 self.origin_ns, self._start_ns = self._start_ns, None
+                self._over = math.inf, ""
                 self._alarm.restart()
                 self._give_lags()
             t = seconds(sample.stamp_ns, self.origin_ns)
@@ -213,6 +223,8 @@ class Watch:
             y, u = self._values(sample)
             if not self._running:
                 reading = self.monitor.waiting(t, y, WAITING)
+            elif sample.stamp_ns > self._over[0]:
+                reading = self.monitor.waiting(t, y, f"the run has ended: {self._over[1]}")
             elif (
                 sample.missing
                 and not self.monitor.goes_on

@@ -36,6 +36,7 @@ from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, S
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
+from nlsid_core.running.tubes import refuse_far
 
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
@@ -151,6 +152,8 @@ def design_output_tube(
             spent = [energy(part[:, design.at], tube)[:, None] for part in e]
             tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
+    beside = TubeFunnel(tuple(tubes), settling, files.digest(model.document()), y_box, u_box)
+    refuse_far(model, beside, trials.calibration)
     if profile is not None:  # what is assumed around a plan is what is held there
         return proved([replace(tube, peak=None) for tube in tubes], found)
     errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]

@@ -33,6 +33,16 @@ def refuse_unmonitorable(funnel: Factored) -> None:
     _ = funnel.rounding
 
 
+def refuse_coarse(hidden: FloatArray, half_widths: FloatArray, what: str) -> None:
+    """DataError where rounding can hide too much of the half-widths, as it can far from 0."""
+    part = float(np.max(hidden / half_widths))
+    if not part <= MOST_ROUNDING:
+        raise DataError(
+            f"{what} cannot be monitored in float64: rounding can hide {part:.2g} half-widths "
+            f"there, at most {MOST_ROUNDING:g} is allowed; measure from a place nearby, not from 0"
+        )
+
+
 def factor_of(P: FloatArray) -> FloatArray:
     """F (n, n) upper triangular with F'F = P, every entry within 4 roundings of the true factor's.
 

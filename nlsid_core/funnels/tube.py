@@ -14,7 +14,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.funnels.factor import factor_of, rounding_of
+from nlsid_core.funnels.factor import STEPS, UNIT, factor_of, rounding_of
 from nlsid_core.funnels.level import CommandLevel
 from nlsid_core.models.signal import Signal
 
@@ -97,6 +97,16 @@ class Tube:
         if self.inlet > 0.0:
             return size / math.sqrt(self.inlet) * (1.0 + self.rounding)
         return math.inf if size != 0.0 else 0.0
+
+    def hidden(self, largest: FloatArray, y: FloatArray) -> FloatArray:
+        """(p,) what rounding of the model's simulation can hide, where |x| <= largest (n,).
+
+        y: (p,) its outputs. A step's rounding, |F| |x| UNIT so many times at most, fades by √rho.
+        """
+        steps = 1.0 / (1.0 - math.sqrt(self.rho)) if self.samples is None else self.samples
+        roundings = 4.0 * (len(self.P) + STEPS) * UNIT * steps
+        carried = roundings * np.linalg.norm(np.abs(self.factor) @ largest) / np.sqrt(self.tau)
+        return np.asarray(carried + STEPS * UNIT * np.abs(y))
 
     def energy_unit(self, y: Sequence[Signal]) -> str:
         """The unit of E and the level, after a space; empty unless it is the one output's squared.

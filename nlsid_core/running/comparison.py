@@ -15,7 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, apart
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.factor import UNIT, refuse_unmonitorable
+from nlsid_core.funnels.factor import UNIT, refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
@@ -114,6 +114,10 @@ class PlanComparison:
         self.model, self._funnels = model, tuple(funnels)
         self.period, self.lags = model.period, len(model)
         self._plans = [policy.plan(model) for policy in policies]
+        for plan, funnel in zip(self._plans, funnels, strict=True):
+            for tube in funnel.tubes:
+                hidden = tube.hidden(np.abs(plan.x).max(axis=0), np.abs(plan.y).max(keepdims=True))
+                refuse_coarse(hidden, tube.half_widths, "the plan")
         self.last = [
             min(plan.last, funnel.last) for plan, funnel in zip(self._plans, funnels, strict=True)
         ]
@@ -222,6 +226,7 @@ class SampledComparison:
     def __init__(self, model: MeasuredState, policy: SampledPolicy, funnel: SampledFunnel) -> None:
         self.model, self._policy, self._funnel = model, policy, funnel
         refuse_unmonitorable(funnel)
+        refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
         self.period, self.last = model.period, [funnel.last]
         a = funnel.assumption
         self.assuming = [f"the disturbance's {a.form} ≤ {a.bound:.4g}"]
@@ -401,8 +406,7 @@ class ContinuousComparison:
         self._proved = self._proved or (size <= 1.0 and (starts or not hold))
         if not self._proved:
             broken = "the run did not start in the funnel: nothing is proved of it"
-        if hold and not age <= hold * (1.0 + COMMAND_TOLERANCE):
-            broken = f"the input was held for {age:.6g} s at t = {t:g} s; proved for {hold:g} s"
+        broken = held.overdue(age, t) or broken
         return Compared(
             [size],
             [age / hold if self._measures else np.nan],

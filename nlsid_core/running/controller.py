@@ -89,14 +89,15 @@ class Controller:
 
     Before sample 0 the plan's first input is held until the state is where the funnel may start, at
     most for `settling` s. `k` is the number of the next sample, negative before. `ended` says why
-    it is over, empty while it runs: the sample is missing, not finite or off the grid of the start,
-    the input would not be finite or not one that the proof covers, or the proof ends. Stopping is
-    the caller's then. `lead`: s from a sample to the stamp of its input, not quite a period where
-    the input is that of the next sample, so that a sample off the grid still finds it in force.
+    it is over, empty while it runs: the sample is missing, not finite, off the grid of the start or
+    later than an input may be held, the input would not be finite or not one that the proof covers,
+    or the proof ends. Stopping is the caller's then. `lead`: s from a sample to the stamp of its
+    input, not quite a period where the input is that of the next sample, so that a sample off the
+    grid still finds it in force.
 
     model, policy, funnel, period, held: as for `Monitor`. Raises CertificateMismatch if the parts
-    do not belong together, DataError if the limits cut off an input of the plan, or if the period
-    is longer than the hold that is proved.
+    do not belong together, DataError if the limits cut off an input of the plan, or if the hold
+    that is proved is too short for the period.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class Controller:
         ]
         model, policy, funnel = stages[0]
         self._stages, self.limits, self._settling = stages, limits, settling
-        self._continuous = isinstance(model, VectorField)
+        self._continuous, self._held = isinstance(model, VectorField), Held()
         if self._continuous:
             if period is None or not period > 0.0:
                 raise DataError(
@@ -183,7 +184,7 @@ class Controller:
             self.u = float(self.u)
         self._grid = Grid(self.period)
         self._recent: deque[tuple[Any, Any]] = deque(maxlen=max(1, self._observer.lags))
-        self._first_t = math.nan
+        self._first_t = self._answered = math.nan  # s, of the first sample and the newest
 
     def update(self, t: float, y: Any) -> Any:
         """Take the sample y at t (s); the input in force from the next sample on, or from this one.
@@ -192,7 +193,7 @@ class Controller:
         """
         if self.ended:
             return self.u
-        self.ended = self._fault(t, y) or self._grid.take(t)
+        self.ended = self._fault(t, y) or self._grid.take(t) or self._overdue(t)
         if self.ended:
             return self.u
         if self.k <= 0:  # sample 0 is not behind: it is where the grid starts
@@ -273,6 +274,11 @@ class Controller:
             return ""
         name = getattr(getattr(self._stages[0][0], "y", None), "name", "the state")
         return f"{name} is {y} at t = {t:g} s"
+
+    def _overdue(self, t: float) -> str:
+        """Whether the input before this sample was held for longer than is proved."""
+        age, self._answered = t - self._answered, t
+        return self._held.overdue(age, t) if self.k >= 1 else ""
 
     def _refuse_cut(self, planned: FloatArray) -> None:
         cut = planned[self.limits.clip(planned) != planned]

@@ -7,8 +7,10 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DataError
+from nlsid_core.running.grid import TOLERANCE
 
 ROUNDING = 1e-12  # relative, of a few hundred rounded operations
+ON_TIME = 1.0 + 1e-9  # of the hold: rounding of stamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +41,20 @@ class Held:
         return held
 
     def refuse(self, period: float) -> None:
-        """DataError if samples so many s apart are not covered though a hold is proved."""
-        if self.hold and period > self.hold:
+        """DataError if the hold does not cover samples so many s apart, some of them late."""
+        needed = (1.0 + TOLERANCE) * period
+        if self.hold and needed > self.hold * ON_TIME:
             raise DataError(
                 f"samples come every {period:g} s, and the funnel is proved for inputs of at most "
-                f"{self.hold:g} s: sample faster, or design it with hold={period:g}"
+                f"{self.hold:g} s, which leaves no {TOLERANCE:g} periods for one that is late: "
+                f"sample every {slowest(self.hold):.12g} s, or design it with hold={needed:.12g}"
             )
+
+    def overdue(self, age: float, t: float) -> str:
+        """How an input that is `age` s old at t (s) is older than is proved; empty if it is not."""
+        if not self.hold or age <= self.hold * ON_TIME:
+            return ""
+        return f"the input was held for {age:.6g} s at t = {t:g} s; proved for {self.hold:g} s"
 
     def assuming(self, period: float) -> str:
         """What is assumed of an input that is held for a period, in words."""
@@ -60,3 +70,8 @@ class Held:
         if not len(self.error):
             return 0.0
         return float(np.sqrt(self.error @ np.abs(P) @ self.error)) * (1.0 + ROUNDING)
+
+
+def slowest(hold: float) -> float:
+    """The longest period (s) of samples, some of them late, that a hold (s) covers."""
+    return hold / (1.0 + TOLERANCE)

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.funnels.factor import UNIT
+from nlsid_core.funnels.factor import MOST_ROUNDING, STEPS, UNIT, refuse_coarse
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.kernel.signals import name_label
@@ -36,6 +37,9 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
+PACE = 0.01  # of a stamp's drift by which the mean follows: over some 100 samples
+OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
+COARSE = "float64 cannot tell where the simulation is"
 WATCHED = BESIDE.replace("this", "the tube's")  # in the words of `check`
 
 
@@ -109,6 +113,7 @@ class TubeRun:
     def restart(self) -> None:
         """A new run."""
         self._due = self._last = math.nan
+        self._pace = 0.0  # by what part samples come more slowly than they should, on average
         self._begin()
 
     def _begin(self, why: str = "") -> None:
@@ -118,6 +123,7 @@ class TubeRun:
         self._x: FloatArray | None = None
         self._fading = 0 if self._moving is None else self._moving.samples
         self._spent = np.zeros(len(self._tubes))
+        self._largest, self._hidden = np.zeros(self._stepper.order), np.zeros_like(self._widths)
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
         self._g: dict[int, list[float]] = {}
@@ -184,6 +190,12 @@ class TubeRun:
             return f"{off}; a new run starts"
         self._last = t
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
+        self._pace += PACE * (FOLLOW * (late - lost) - self._pace)
+        if abs(self._pace) > OTHER_PACE:
+            mean = (1.0 + self._pace) * self.period
+            paced = f"samples come every {mean:.5g} s on average, not every {self.period:g} s"
+            self._begin(paced)
+            return f"{paced}, at t = {t:g} s"
         if lost:
             missing = "1 sample is" if lost == 1 else f"{lost} samples are"
             self._begin(f"{missing} missing before t = {t:g} s")
@@ -286,7 +298,8 @@ class TubeRun:
                 used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
                 after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
             self._spent = self._rho * self._spent + used
-            sizes = np.abs(deviation) / widths
+            hidden = self._hides(simulated)
+            sizes = (np.abs(deviation) + hidden) / widths
             spent = (self._spent / level).tolist()
             peaks = (used / self._peak if g is self._unmoved else
                      used / (self._peak * np.maximum(g, 1.0))).tolist()  # fmt: skip
@@ -305,10 +318,26 @@ class TubeRun:
                 )  # fmt: skip
                 return [away] * len(self._funnels)
             return self._unknown(t, y, reason)
+        if not (hidden <= MOST_ROUNDING * widths).all():
+            most = f"rounding can hide {float(hidden.max()):.2g}"
+            least = f"{float(widths.min()):.2g}"
+            return self._unknown(
+                t, y, f"{COARSE}: {most} beside a half-width of {least}, at t = {t:g} s"
+            )
         measured = tuple(y.tolist())
         away, innovations = deviation.tolist(), e.tolist()
         judged = _Judged(t, sizes.tolist(), spent, peaks, level, widths, nominal, measured, away)
         return [self._reading(i, judged, innovations[rows[0]]) for i, rows in enumerate(self._rows)]
+
+    def _hides(self, simulated: FloatArray) -> FloatArray:
+        """(tubes, p) what rounding can hide of the outputs' distance from these simulated (p,)."""
+        assert self._x is not None
+        reached = np.abs(self._x[-1])
+        if (reached > self._largest).any():
+            self._largest = np.maximum(self._largest, 2.0 * reached)  # so that this is seldom
+            none = np.zeros_like(simulated)
+            self._hidden = np.array([tube.hidden(self._largest, none) for tube in self._tubes])
+        return self._hidden + STEPS * UNIT * np.abs(simulated)
 
     def _followed(self, g: dict[int, list[float]]) -> tuple[FloatArray, FloatArray]:
         """By what levels are multiplied (tubes,), and half-widths (tubes, p), where g is this."""
@@ -470,6 +499,7 @@ class Ahead:
         beside = np.sqrt(left[lasting, None] * run._reached(self.steps)[lasting])
         centres = np.vstack([outputs[lasting], np.tile(outputs[-1], (len(lasting), 1))])
         room = np.vstack([beside, widths[lasting]]) * (1.0 + OUTWARD)
+        room += np.tile(run._hides(outputs[-1])[lasting], (2, 1))
         return (centres - room).max(axis=0), (centres + room).min(axis=0)
 
 
@@ -488,6 +518,18 @@ class _Judged(NamedTuple):
     nominal: tuple[float, ...]
     measured: tuple[float, ...]
     away: list[float]
+
+
+def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
+    """DataError if a run on such trials (y, u) could not be judged in float64."""
+    for trial in trials:
+        most = np.spacing(np.abs(trial.y).max(axis=0))
+        refuse_coarse(most, funnel.half_widths, trial.name)
+        run = TubeRun(model, [funnel])
+        for k in range(min(len(trial), run.lags + 1)):
+            [reading] = run.readings(k * model.period, trial.y[k], trial.u[k])
+        if reading.reason.startswith(COARSE):
+            raise DataError(f"{trial.name}: {reading.reason}; measure from a place nearby")
 
 
 def assuming(tubes: Sequence[Tube]) -> str:

@@ -131,6 +131,13 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
         topics = {topic: source.types_on(topic)[0] for topic in signals.topics}
     faulty = out / f"{bag.name}, {FAULT}"
     write_faulty_copy(bag, faulty, str(signals.responses[0].path), FAULTS[FAULT])
+    bad = replay_bag(proved, faulty, centre=Centre.COMMAND)
+    if bad.first_bad is None:
+        raise NlsidError(
+            f"{bag.name} with its sensor {FAULT} is not flagged: {bad.reason or bad.verdict}. The "
+            "demonstration needs a funnel that such a fault leaves"
+        )
+    bad_stamp = bad.stamps_ns[bad.readings.index(bad.first_bad)]
     recording = out / f"{bag.name}, recorded"
     with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
         with _node("funnel_monitor", {"allow_old_stamps": True}) as monitor:
@@ -158,12 +165,6 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
         if reading.status is not Status.UNKNOWN
     }
     live = {stamp: margin for stamp, margin in margins.items() if stamp in expected}
-    bad = replay_bag(proved, faulty, centre=Centre.COMMAND)
-    bad_stamp = next(
-        stamp
-        for stamp, reading in zip(bad.stamps_ns, bad.readings, strict=True)
-        if reading is bad.first_bad
-    )
     heard = observer.arrivals.get((signals.responses[0].path.topic, bad_stamp), float("nan"))
     sent, recorded = _contents(bag, list(topics)), _contents(recording, list(topics))
     return LiveResult(

@@ -1,6 +1,7 @@
 """Continuous funnels at run time: held inputs, stages, the end; the same Monitor and Controller."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,14 +92,34 @@ def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
     for t in (0.0, 0.8 * HELD, 2.2 * HELD):  # on the grid, and the last 0.028 s apart
         reading = monitor.update(t, [t], policy(t, np.array([t])))
     assert reading.status is Status.ASSUMPTION_VIOLATED
-    assert "held for 0.028 s at t = 0.044 s; proved for 0.025 s" in reading.reason
-    for run in (
-        lambda: Monitor(field, policy, funnel, period=0.03, held=held),
-        lambda: Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=0.03,
-                           held=held),
-    ):  # fmt: skip
-        with pytest.raises(DataError, match=r"every 0.03 s.*inputs of at most 0.025 s"):
-            run()
+    said = "held for 0.028 s at t = 0.044 s; proved for 0.025 s"
+    assert said in reading.reason
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=held
+    )
+    for t in (0.0, 0.8 * HELD, 2.2 * HELD):
+        assert controller.ended == ""
+        controller.update(t, np.array([t]))
+    assert said in controller.ended
+
+
+@pytest.mark.parametrize("period", [0.03, 0.025, 0.0201])
+def test_a_hold_without_room_for_a_late_sample_is_refused_and_what_is_advised_is_not(
+    period: float,
+) -> None:
+    field, policy, funnel = stage()
+
+    def run(period: float, hold: float) -> None:
+        held = Held(hold)
+        Monitor(field, policy, funnel, period=period, held=held)
+        Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=period, held=held)
+
+    with pytest.raises(DataError, match=rf"every {period} s.*inputs of at most 0.025 s") as refusal:
+        run(period, 0.025)
+    advised = re.search(r"sample every (\S+) s, or design it with hold=(\S+)$", str(refusal.value))
+    assert advised
+    run(float(advised[1]), 0.025)
+    run(period, float(advised[2]))
 
 
 def test_a_state_that_may_be_wrong_is_inside_only_if_all_that_it_may_be_is() -> None:

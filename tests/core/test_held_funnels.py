@@ -18,7 +18,7 @@ from nlsid_core.design import (
 )
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
-from nlsid_core.running.held import Held
+from nlsid_core.running.held import Held, slowest
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from tests.falling_pendulum import tracking
@@ -60,6 +60,7 @@ def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> 
     proved = widths[0] / unheld[0]  # what was found without is a little more than is proved
     assert 0.97 * proved < float(part[1]) <= proved
     assert f"at 0 s: x0 {widths[0]:.3g}, x1 {widths[1]:.3g}; without, x0 " in said
+    assert "samples should come every 0.008 s or more often" in said
     assert "left" not in str(free)
 
 
@@ -81,12 +82,13 @@ def test_a_hold_is_only_proved_of_what_starts_inside(held: FunnelDesign) -> None
     """An input that remembers a state from outside drives a solution out that has come in."""
     assert "every solution that starts in it at a time from 0 to 1 s" in str(held.verdict)
     assert "not before the solution's start" in str(held.verdict)
-    monitor = Monitor(held.model, held.policy, held.funnel, period=HOLD, held=Held(HOLD))
+    period = slowest(HOLD)
+    monitor = Monitor(held.model, held.policy, held.funnel, period=period, held=Held(HOLD))
     outside = held.funnel.nominal(0.0) + np.array([2.0, 0.0])
     said = [monitor.update(0.0, outside, held.policy(0.0, outside))]
-    for k in range(1, 5):
-        x = held.funnel.nominal(k * HOLD)
-        said.append(monitor.update(k * HOLD, x, held.policy(k * HOLD, x)))
+    for t in period * np.arange(1, 5):
+        x = held.funnel.nominal(t)
+        said.append(monitor.update(t, x, held.policy(t, x)))
     assert Status.INSIDE not in {reading.status for reading in said}
     assert all("did not start in the funnel" in reading.reason for reading in said)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design_output_tube
@@ -18,7 +19,7 @@ from nlsid_core.design.tube_program import finsler
 from nlsid_core.errors import CertificateMismatch, DataError, OptionError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification.prediction import history, simulate_trial
-from nlsid_core.models import BlockCascade
+from nlsid_core.models import BlockCascade, DifferenceEquation
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stepping import Stepper
@@ -272,6 +273,11 @@ def test_a_drifting_clock_stays_on_the_grid_and_a_shifted_one_starts_a_new_run()
     trial = trial_of("linear", 2000)
     drifting = replace(trial, t=trial.t * 1.001)
     assert sum(r.status is Status.UNKNOWN for r in run(monitor_of("linear"), drifting)) == 3
+    for slower in (1.024, 0.985):  # every stamp is within the tolerance of the one expected
+        readings = run(monitor_of("linear"), replace(trial, t=trial.t * slower))
+        assert readings[20].status is Status.INSIDE
+        assert {r.status for r in readings[500:]} == {Status.UNKNOWN}
+        assert f"samples come every {slower * 0.025:.3g}" in readings[-1].reason
     monitor = monitor_of("linear")
     shifted = [float(t) + (0.4 * 0.025 if k >= 100 else 0.0) for k, t in enumerate(trial.t)]
     readings = [monitor.update(t, y, u) for t, y, u in zip(shifted, trial.y, trial.u, strict=True)]
@@ -280,6 +286,25 @@ def test_a_drifting_clock_stays_on_the_grid_and_a_shifted_one_starts_a_new_run()
     again = monitor.update(shifted[-1], trial.y[-1], trial.u[-1])
     assert again.status is Status.UNKNOWN
     assert "second time" in again.reason
+
+
+def test_where_float64_has_no_digits_for_a_tube_nothing_is_judged_and_none_is_designed() -> None:
+    """y ≈ 1.4e12, where numbers are 2.4e-4 apart, with a half-width of a few of these."""
+    model = MODELS["linear"]()
+    assert isinstance(model, DifferenceEquation)
+    far = replace(model, c=model.c + 1.4e12 * (1.0 - float(model.a.sum())))
+    noise = 1.4e12 + 2e-3 * np.sin(np.arange(200.0))[:, None]
+    trials = dataset(model, 0, 6, 200)
+    quiet = [replace(trial, y=simulate_trial(model, trial) + noise) for trial in trials]
+    with pytest.raises(DataError, match="cannot be monitored in float64: rounding can hide"):
+        design_output_tube(far, Dataset(tuple(quiet)))
+    made = design("linear")
+    tubes = [replace(tube, half_widths=1e-3 * tube.half_widths) for tube in made.funnel.tubes]
+    elsewhere = replace(made.funnel, model=files.digest(far.document()), tubes=tuple(tubes))
+    for trial in quiet[:2]:
+        readings = run(Monitor(far, None, elsewhere), trial)
+        assert {reading.status for reading in readings} == {Status.UNKNOWN}
+        assert "float64 cannot tell where the simulation is" in readings[-1].reason
 
 
 def test_an_input_that_the_model_refuses_or_a_box_that_is_left_is_not_judged() -> None:

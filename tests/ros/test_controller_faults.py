@@ -15,9 +15,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.designs.documents import MODEL, load_model
+from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
+from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.ros.processes import call, node_here, process, ros_test
@@ -38,13 +41,18 @@ class Driven(Robot):
         self.controller = stack.enter_context(process(CONTROLLER, **given))
         super().__init__(node, spin_until, funnel.parent)
         self.commands: dict[int, float] = {}
+        self.run = f"{self.bundle.digest} {WAITING}"  # as a monitor's verdict names it
         node.create_subscription(TwistStamped, "/cmd_vel", self._command, qos.STREAM)
+        node.create_subscription(String, f"/{NAME}/run", self._begun, qos.DOCUMENT)
         spin_until(lambda: self.has_said("idle", NAME))
         spin_until(lambda: self.odom.get_subscription_count() >= 1)
         spin_until(lambda: node.count_publishers("/cmd_vel") >= 2)
 
     def _command(self, message: TwistStamped) -> None:
         self.commands[stamp_ns_of(message)] = message.twist.linear.x
+
+    def _begun(self, message: String) -> None:
+        self.run = Run.from_document(files.parse_document(message.data)).name
 
     def call(self, service: str) -> Trigger.Response:
         """The answer of a service of the controller."""
@@ -57,11 +65,13 @@ class Driven(Robot):
         self.spin_until(lambda: self.call("start").success)
 
     def feed(
-        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None
-    ) -> list[int]:
+        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None,
+        judging: str = "",
+    ) -> list[int]:  # fmt: skip
         """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
 
-        margin_at: a monitor's verdict comes with each, stamped so many s from it.
+        margin_at: a monitor's verdict comes with each, stamped so many s from it. judging: of which
+        funnel and run it says to be; empty: of the controller's.
         """
         first = time.time_ns() + round(ahead * 1e9)
         began = time.monotonic()
@@ -75,6 +85,7 @@ class Driven(Robot):
                 said = JointState(name=["margin", "assumption"], position=[0.5, math.nan])
                 of_ns = stamp_ns + round(margin_at * 1e9)
                 said.header.stamp.sec, said.header.stamp.nanosec = divmod(of_ns, 10**9)
+                said.header.frame_id = judging or self.run
                 self.margin.publish(said)
             due = began + (k + 1) * PERIOD_NS * 1e-9
             self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
@@ -190,6 +201,44 @@ def test_a_verdict_that_is_not_of_this_run_and_of_now_is_none(
     robot.watch()
     robot.feed(80, margin_at=margin_at)
     robot.expect_stop("funnel_monitor has judged nothing for 1 s")
+
+
+OTHER = "sha256:" + 64 * "0"
+
+
+@pytest.mark.parametrize(
+    ("judging", "because"),
+    [
+        (" ", "funnel_monitor judges a funnel that it does not name, not sha256:"),
+        ("odom", "funnel_monitor judges the funnel odom, not sha256:"),
+        (f"{OTHER} {WAITING}", f"funnel_monitor judges the funnel {OTHER}, not sha256:"),
+        (f"{{digest}} {UNANNOUNCED}", "funnel_monitor judges no run: set its controller"),
+    ],
+)
+def test_verdicts_of_another_funnel_or_of_no_run_end_it_before_it_moves(
+    stack: ExitStack, funnel: Path, judging: str, because: str
+) -> None:
+    robot = Driven(stack, funnel, require_monitor=True)
+    robot.watch()
+    robot.feed(40, margin_at=0.0, judging=judging.format(digest=robot.bundle.digest))
+    robot.expect_stop(because)
+    assert set(robot.commands.values()) <= {0.0}
+
+
+def test_verdicts_of_another_run_are_none(stack: ExitStack, funnel: Path) -> None:
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE, stop_within=0.1)
+    robot.watch()
+    robot.feed(80, margin_at=0.0, judging=f"{robot.bundle.digest} 7")
+    robot.expect_stop("funnel_monitor has judged nothing for 1 s")
+
+
+def test_a_second_node_that_publishes_verdicts_ends_it(stack: ExitStack, funnel: Path) -> None:
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
+    robot.watch()
+    robot.node.create_publisher(JointState, "/funnel_monitor/margin", qos.STREAM)
+    robot.feed(40, margin_at=0.0)
+    robot.expect_stop("2 nodes publish /funnel_monitor/margin")
+    assert "2 nodes publish /funnel_monitor/margin" in robot.call("start").message
 
 
 def test_with_fresh_verdicts_it_tracks_to_the_end_of_the_plan(

@@ -14,7 +14,7 @@ from bags.signals.vector import SignalVector
 from nlsid_core.errors import BagError
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage
-from tests.ros.processes import call, node_here, process, ros_test
+from tests.ros.processes import call, node_here, process, refusal, ros_test
 
 pytestmark = ros_test
 
@@ -41,15 +41,46 @@ def test_the_other_fields_are_as_the_template_says() -> None:
     [
         ("refused", "fields that are not the signal (twist.linear.y, twist.linear.z, twist.ang"),
         ('{"twist": {"turn": 1}}', "there is no 'turn'; there are: linear, angular"),
-        ('{"twist": {"angular": {"z": "fast"}}}', "could not convert string to float"),
+        ('{"twist": {"angular": {"z": "fast"}}}', "twist: angular: z is 'fast'; it should be dou"),
+        ('{"twist": {"angular": {"z": true}}}', "twist: angular: z is True; it should be double"),
+        ('{"twist": {"angular": {"z": [1]}}}', "z is [1]; it should be double"),
+        ('{"twist": {"angular": {"z": NaN}}}', "NaN is not a number a document may hold"),
+        ('{"twist": {"angular": {"z": -Infinity}}}', "-Infinity is not a number a document may h"),
+        ('{"twist": {"angular": {"z": 1e400}}}', "1e400 does not fit a float64"),
+        ('{"twist": {"angular": 1}}', "twist: angular: 1 should be an object of its fields"),
+        ('{"twist": [0, 1]}', "twist: [0, 1] should be an object of its fields"),
+        ('{"header": {"frame_id": {"a": 1}}}', "frame_id is {'a': 1}; it should be string"),
+        ('{"header": {"stamp": {"sec": 3000000000}}}', "'sec' field must be an integer in [-2147"),
         ("{", "others, fields of geometry_msgs/msg/TwistStamped: "),
-        ("/cmd_vel", "which the commands themselves are sent to"),
+        ("/tele op", "others is no topic: Invalid topic name"),
         ("none", "others is 'none'; it should be zero, refused"),
     ],
-)  # fmt: skip
+)
 def test_others_that_do_not_fit_are_refused_by_name(others: str, said: str) -> None:
     with pytest.raises(BagError, match=re.escape(said)):
         SignalMessage(SPEED, TWIST, others)
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        ('{"velocity": [1, true]}', "velocity is [1, True]; it should be sequence<double>"),
+        ('{"name": "wheel"}', "name is 'wheel'; it should be sequence<string>"),
+        ('{"position": [1e400]}', "1e400 does not fit a float64"),
+    ],
+)
+def test_others_in_lists_are_held_to_their_type_too(others: str, said: str) -> None:
+    wheel, kind = SignalPath.parse("/wheels:effort[0]"), "sensor_msgs/msg/JointState"
+    with pytest.raises(BagError, match=re.escape(said)):
+        SignalMessage(wheel, kind, others)
+    made = SignalMessage(wheel, kind, '{"name": ["a"], "velocity": [1, 2.5]}').make(0, 0.5)
+    assert (made.name, list(made.velocity), list(made.effort)) == (["a"], [1.0, 2.5], [0.5])
+
+
+@pytest.mark.parametrize("module", ["excitation", "tracking_controller"])
+def test_a_node_refuses_others_that_do_not_fit_when_it_is_configured(module: str) -> None:
+    said = refusal(f"nlsid_ros.{module}", highest=0.4, slew=1.0, others='{"twist": {"angular": 1}}')
+    assert "twist: angular: 1 should be an object of its fields" in said
 
 
 def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:

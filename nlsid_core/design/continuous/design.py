@@ -48,6 +48,7 @@ from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
+from nlsid_core.running.held import slowest
 
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
@@ -195,9 +196,11 @@ def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
     )
     causes = [f"a hold of {setting.hold.period:g} s"] if setting.hold.period else []
     causes += ["the errors of the measured state"] if setting.hold.error.any() else []
+    often = f"samples should come every {slowest(setting.hold.period):.12g} s or more often"
     return (
         f"with {' and '.join(causes)}, {part:.3g} of the half-widths are left at {funnel.t0:g} s: "
         f"{held}; without, {unheld} were found for this policy, not proved"
+        + (f"; {often}" if setting.hold.period else "")
     )
 
 

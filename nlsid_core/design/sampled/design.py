@@ -18,7 +18,7 @@ from nlsid_core.design.sampled.implicit import ImplicitFunnelStep
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
-from nlsid_core.funnels.factor import refuse_unmonitorable
+from nlsid_core.funnels.factor import refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.trapezoidal import TrapezoidalModel
@@ -106,6 +106,7 @@ def design_state_funnel(
         roots=roots if implicit else None,
     )
     refuse_unmonitorable(funnel)
+    refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
     entries = [
         step.stated() | {"tube": step.proof(a), "inlet": step.proof(b)}
         for step, a, b in zip(steps, along, to_goal, strict=True)
