@@ -28,7 +28,7 @@ from benchmarks.thesis.relaxation import sample_funnel  # noqa: E402
 from examples import satellite  # noqa: E402
 from examples.satellite_funnel import goal_matrix, problem  # noqa: E402
 from nlsid_core.arrays import FloatArray  # noqa: E402
-from nlsid_core.design import design_funnel  # noqa: E402
+from nlsid_core.design import ContinuousTracking, design_funnel  # noqa: E402
 from nlsid_core.design.continuous.shape import STOP  # noqa: E402
 
 BALL = np.pi**3 / 6  # volume of the unit ball in 6 dimensions
@@ -178,7 +178,7 @@ def run(limit: float) -> dict[str, Any]:
     field, nominal, weights = problem()
     goal = goal_matrix()
     searches: dict[str, Callable[[], Any]] = {
-        "proved": lambda: design_funnel(field, nominal, goal=goal, **weights),
+        "proved": lambda: design_funnel(ContinuousTracking(field, nominal, goal=goal, **weights)),
         "sampled": lambda: sample_funnel(field, nominal, goal=goal, samples=SAMPLES, **weights),
     }
     timed = {}

@@ -196,6 +196,23 @@ def drake_solver() -> Callable[[Polynomial], float] | None:
     return solve
 
 
+def drake_seconds() -> float | None:
+    """Processor seconds of one L-step in Drake, the median over the samples; None without Drake."""
+    solve = drake_solver()
+    if solve is None:
+        return None
+    steps = satellite.l_steps(satellite.nominal())
+    found = []
+    for k in np.linspace(0, len(steps) - 1, SAMPLES).round().astype(int).tolist():
+        g, times = steps[k].polynomial(), []
+        for _ in range(2):
+            before = time.process_time()
+            solve(g)
+            times.append(time.process_time() - before)
+        found.append(min(times))
+    return statistics.median(found)
+
+
 def scaling() -> list[dict[str, float]]:
     """n, Gram order, our and Clarabel's ms and our peak memory; each size in a fresh process."""
     rows = []

@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.lstep import drake_seconds
 from benchmarks.machine import describe
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.soundness import simulate_boundary, smallest_escape
 from examples.satellite import FINAL_TIME
 from examples.satellite_funnel import goal_matrix, problem
-from nlsid_core.design import FunnelDesign, design_funnel
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.proofs import check
 
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     field, nominal, weights = problem()
     goal = goal_matrix(lqr_order=arguments.lqr_order)
     started, busy = time.perf_counter(), time.process_time()
-    design = design_funnel(field, nominal, goal=goal, **weights)
+    design = design_funnel(ContinuousTracking(field, nominal, goal=goal, **weights))
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
     *_, proof = design.save(folder)
     result: dict[str, Any] = {
@@ -66,6 +67,10 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     result["alternation_ratio"] = alternated.volumes[-1] / result["rho_volume"]
     if not arguments.no_p:
         result |= _shape(field, nominal, goal, weights, arguments.starts // 5)
+    step = drake_seconds()
+    for kind in ("rho", "p") if step is not None else ():
+        if f"{kind}_processor_seconds" in result:
+            result[f"{kind}_over_drake_lstep"] = result[f"{kind}_processor_seconds"] / step
     return result
 
 
@@ -85,7 +90,7 @@ def _attacks(design: FunnelDesign, goal: Any, starts: int) -> dict[str, Any]:
 
 def _shape(field: Any, nominal: Any, goal: Any, weights: Any, starts: int) -> dict[str, Any]:
     started, busy = time.perf_counter(), time.process_time()
-    design = design_funnel(field, nominal, goal=goal, shape="P", **weights)
+    design = design_funnel(ContinuousTracking(field, nominal, goal=goal, shape="P", **weights))
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
     rng = np.random.default_rng(8)
     run = simulate_boundary(design.model, design.policy, design.funnel, starts=starts, rng=rng)

@@ -7,7 +7,7 @@ import numpy as np
 
 from examples.satellite import FINAL_TIME, GOAL, KNOTS, dynamics, nominal_input
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.proofs import check
 
@@ -31,7 +31,7 @@ def problem(knots: int = KNOTS) -> tuple[VectorField, Nominal, dict[str, Any]]:
 def designed() -> FunnelDesign:
     """The funnel into the published goal."""
     field, nominal, weights = problem()
-    return design_funnel(field, nominal, goal=goal_matrix(), **weights)
+    return design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
 
 
 def main() -> tuple[float, float]:

@@ -207,7 +207,6 @@ def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesi
     ("options", "reason"),
     [
         ({"shape": "Q"}, "shape is 'Q'; it should be one of rho, P"),
-        ({"objective": "width"}, "objective is 'width'; it should be one of volume, reference"),
         ({"gain": "square"}, "gain is 'square'; it should be one of constant, linear, cubic"),
     ],
 )
