@@ -194,7 +194,7 @@ def parts(bag: Path, seconds: float) -> list[Path]:
     """The bag cut every so many seconds, once."""
     name = f"{bag.stem}_of_{PARTS}"
     made = sorted(bag.parent.glob(f"{name}_[0-9][0-9]"))
-    return made or split(bag, bag.parent / name, every=seconds)
+    return made or list(split(bag, bag.parent / name, every=seconds).parts)
 
 
 ROBOTS = (

@@ -9,10 +9,12 @@ takes the solution to the kernel.
 
 import importlib
 import time
+import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from threading import Lock
+from typing import Any, Final, Literal, TypeAlias
 
 import clarabel
 import numpy as np
@@ -20,6 +22,7 @@ import scipy.sparse as sp
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
+from nlsid_core.native import NativeStderr
 
 ConeKind: TypeAlias = Literal["zero", "nonnegative", "second_order", "psd"]
 
@@ -31,6 +34,8 @@ MAX_ITERATIONS = 200
 # SCS is a first-order method: asked for more digits it does not return in useful time.
 SCS_TOLERANCE = 1e-7
 SQRT2 = float(np.sqrt(2.0))
+_STDERR: Final = NativeStderr()
+_WARNING: Final = Lock()  # Python's filters of warnings are one for all threads
 
 
 @dataclass(frozen=True)
@@ -217,7 +222,8 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
         sp.triu(program.P, format="csc"), program.q, program.A, program.b, cones, settings
     )
     try:
-        solution = solver.solve()
+        with _STDERR.without_panics():
+            solution = solver.solve()
     except BaseException as panic:  # of the Rust library: neither an Exception nor exported
         if type(panic).__name__ != "PanicException":
             raise
@@ -352,7 +358,9 @@ def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     options = {"eps_abs": SCS_TOLERANCE, "eps_rel": SCS_TOLERANCE, "max_iters": 100_000}
     problem = cp.Problem(cp.Minimize(objective), constraints)
     try:
-        problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
+        with _WARNING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is inaccurate: the residual judges that
+            problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
     except (cp.SolverError, ValueError) as error:  # SCS raises the second where it cannot begin
         return _Outcome(f"failed ({error})")
     if x.value is None:

@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
 from bags.designs.design import AnyDesign, Wiring
 from nlsid_core.errors import DataError, NlsidError
-from nlsid_ros import qos
+from nlsid_ros import graph, qos
 from nlsid_ros.running import declare_number, declare_text
 
 LOOK = 0.2  # s between looks at who publishes, and at a check that is on
@@ -132,10 +132,20 @@ class DesignSubscription:
             self._subscribe(self._source)
         return self._crowded
 
+    def _unheard(self) -> str:
+        """Who publishes designs here so that this node cannot hear them; empty if nobody does."""
+        topic = self._subscription.topic_name
+        for publisher in self._node.get_publishers_info_by_topic(topic):
+            if why := graph.mismatch(publisher.qos_profile, qos.DOCUMENT):
+                return f"{graph.names([publisher])} cannot be heard on {topic}: {why}"
+        return ""
+
     def _look(self) -> None:
         """Take what the kernel has decided, and have the next one decided."""
         if self._is_crowded():
             self.close()
+        if (unheard := self._unheard()) and not self.refusal.endswith(unheard):
+            self._refuse(unheard)
         if self._check is not None and (answer := self._check.poll()) is not None:
             text = self._check.text
             self.close()

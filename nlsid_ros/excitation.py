@@ -32,7 +32,7 @@ from bags.signals.signal import SignalPath
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError, NlsidError
-from nlsid_ros import qos
+from nlsid_ros import graph, qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.messages import (
     OTHERS,
@@ -349,8 +349,11 @@ class Excitation(ManagedNode):
             "repeat": str(min(self._repeat + 1, self._repeats)),
         }
         level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
+        text = self._state
+        if named := graph.rivals(self, self._publisher):
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {named}"
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, self._state, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def main(args: list[str] | None = None) -> None:

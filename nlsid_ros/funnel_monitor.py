@@ -25,6 +25,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -33,6 +34,7 @@ from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import UNANNOUNCED, Run
 from bags.monitoring.announcement import WAITING as RUN_WAITING
 from bags.monitoring.watch import WAITING, Stamped, Watch
+from bags.signals.arrivals import Sequence
 from bags.signals.grid import seconds
 from bags.signals.sampling import said_filled
 from bags.viewing.drawn import HalfWidths, signal_names
@@ -41,17 +43,21 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
-from nlsid_ros import qos
+from nlsid_ros import graph, qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.subscribing import Informed, Silence
 
 NAME = "funnel_monitor"
 LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signals' types
 RETRY = 0.5  # s until a service that has not answered is called again
 THROTTLE = 5.0  # s between log lines about a service that does not answer
+LATEST_COMMAND = (
+    1.0  # s from a command's stamp to this node's clock; one is stamped when it is sent
+)
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
 LOOK_AHEAD = 0.1  # s between forecasts
 MOST_STEPS = 100  # samples ahead: each takes about as long as judging one
@@ -67,6 +73,8 @@ ALARM = [field.name for field in fields(AlarmOptions)]
 
 class FunnelMonitor(ManagedNode):
     """Reads stamped signals, asks the core's Monitor, publishes what it says."""
+
+    is_watched = True
 
     def __init__(self, arguments: Arguments = None) -> None:
         super().__init__(NAME, arguments)
@@ -129,6 +137,11 @@ class FunnelMonitor(ManagedNode):
         self._signals: dict[str, Subscription] = {}  # by topic
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
+        self._doubts: dict[str, str] = {}  # topic -> who publishes on it, if several do
+        self._unheard: dict[str, str] = {}  # response topic -> who publishes on it in vain
+        self._silences: dict[str, Silence] = {}
+        self._numbers: dict[str, Sequence] = {}  # topic -> its publisher's count
+        self._unfit_commands: dict[str, str] = {}  # topic -> what is wrong with the newest command
         self._unfit = ""
         self._watch = None
         self._names = ""
@@ -191,6 +204,9 @@ class FunnelMonitor(ManagedNode):
         self._watch, self._digest = watch, digest
         self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
         self._kinds, self._unfit = {}, ""
+        for known in (self._doubts, self._numbers, self._unfit_commands, self._unheard):
+            known.clear()
+        self._silences.clear()
         self._frames.clear()
         self._heard_ns.clear()
         self._deadlines.clear()
@@ -259,27 +275,72 @@ class FunnelMonitor(ManagedNode):
         if self._watch is None:
             return
         for topic in self._watch.pairing.topics:
-            name = self.signal_topic(topic)
-            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(name))
-            kinds = list(dict.fromkeys(publisher.topic_type for publisher in publishers))
-            if not kinds or self._kinds.get(topic) in kinds:
-                continue
-            try:
-                kind = self._fitting(topic, kinds)
-            except BagError as error:
-                if str(error) != self._unfit:
-                    self._unfit = str(error)
-                    self.get_logger().error(str(error))
-                    self._tell(str(error))
-                continue
-            self._kinds[topic], self._unfit = kind, ""
-            callback = partial(self._on_signal, topic)
-            profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            if topic in self._signals:
-                self.destroy_subscription(self._signals[topic])
-            self._signals[topic] = self.create_subscription(
-                message_class(kind), name, callback, profile
-            )
+            name = self.resolve_topic_name(self.signal_topic(topic))
+            publishers = self.get_publishers_info_by_topic(name)
+            if kind := self._kind(topic, [publisher.topic_type for publisher in publishers]):
+                heard = [each for each in publishers if each.topic_type == kind]
+                self._subscribe(topic, name, kind, heard)
+                self._doubt(topic, graph.several(name, heard))
+                self._unheard[topic] = graph.unheard(name, heard) if self._is_silent(topic) else ""
+
+    def _kind(self, topic: str, kinds: list[str]) -> str:
+        """The type to subscribe with: the one in use, or the first that fits; empty if none."""
+        kind = self._kinds.get(topic, "")
+        if not kinds or kind in kinds:
+            return kind
+        try:
+            kind = self._fitting(topic, list(dict.fromkeys(kinds)))
+        except BagError as error:
+            if str(error) != self._unfit:
+                self._unfit = str(error)
+                self.get_logger().error(str(error))
+                self._tell(str(error))
+            return ""
+        self._unfit = ""
+        return kind
+
+    def _subscribe(
+        self, topic: str, name: str, kind: str, publishers: list[TopicEndpointInfo]
+    ) -> None:
+        """Subscribe as the publishers offer, and anew where that or their type has changed."""
+        now = self._signals.get(topic)
+        offered = [publisher.qos_profile.reliability for publisher in publishers]
+        profile = qos.subscription_to(offered)
+        if not publishers:
+            return
+        self._silences.setdefault(topic, Silence())
+        if now is not None:
+            if self._kinds[topic] == kind and now.qos_profile == profile:
+                return
+            said = f"{name} is subscribed to anew, as {graph.names(publishers)} offers it"
+            self.get_logger().warning(said)
+            self.destroy_subscription(now)
+        self._kinds[topic] = kind
+        callback = Informed(partial(self._on_signal, topic))
+        self._signals[topic] = self.create_subscription(
+            message_class(kind), name, callback, profile
+        )
+
+    def _is_silent(self, topic: str) -> bool:
+        """Whether a response should be heard and is not; commands may rest."""
+        assert self._watch is not None
+        return topic in self._watch.pairing.response_topics and self._silences[topic].is_odd
+
+    def _doubt(self, topic: str, reason: str) -> None:
+        """Remember why nobody knows whose messages are on a topic; a response is unknown then.
+
+        Transforms have one topic for whoever knows one. Of several publishers of commands all but
+        one may be silent, and the robot hears the same as this node: they are named.
+        """
+        assert self._watch is not None
+        if topic in self._watch.pairing.shared_topics:
+            return
+        news = reason and not self._doubts.get(topic)
+        self._doubts[topic] = reason
+        if news:
+            self.get_logger().warning(reason)
+            if topic in self._watch.pairing.response_topics:
+                self._publish(self._watch.missing(reason))
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
         """The first of the types that carries the signals; BagError about the last if none does."""
@@ -293,7 +354,7 @@ class FunnelMonitor(ManagedNode):
             return kind
         raise unfit
 
-    def _on_signal(self, topic: str, message: Any) -> None:
+    def _on_signal(self, topic: str, message: Any, info: dict[str, int]) -> None:
         """Decode stamp and values, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
@@ -301,7 +362,12 @@ class FunnelMonitor(ManagedNode):
         logged = watch.pairing.clock == "log"
         stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
         responds = topic in watch.pairing.response_topics
-        if responds and not logged and (reason := self._distrust(topic, stamp_ns, message)):
+        self._silences[topic].end(1)
+        if watch.pairing.measures(topic, message):
+            self._numbers.setdefault(topic, Sequence()).update(info["publication_sequence_number"])
+        if not responds:
+            self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
+        elif reason := self._distrust(topic, stamp_ns, message, logged=logged):
             self._publish(watch.refuse(stamp_ns, reason))
             return
         try:
@@ -323,15 +389,30 @@ class FunnelMonitor(ManagedNode):
             if self._release.is_canceled():
                 self._release_in(due - heard_ns)
 
-    def _distrust(self, topic: str, stamp_ns: int, message: Any) -> str:
+    def _distrust(self, topic: str, stamp_ns: int, message: Any, *, logged: bool) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
+        if doubt := self._doubts.get(topic, ""):
+            return doubt
+        for each, numbers in self._numbers.items():
+            if numbers.alternates:
+                return f"messages of several publishers come in turn on {each}"
+        if logged:
+            return ""
         frame = frame_of(message)
         wanted = self._frames.setdefault(topic, self._frame or frame)
         if frame != wanted:
             return f"the response is in frame '{frame}', not in '{wanted}'"
+        off = ""
+        if not self._allow_old_stamps:
+            off = off_clock(stamp_ns, self.get_clock(), self._patient_for)
+        return off or next(filter(None, self._unfit_commands.values()), "")
+
+    def _off_clock(self, topic: str, stamp_ns: int) -> str:
+        """Why the stamp of a command is none; empty if it is one, or a recording is played."""
         if self._allow_old_stamps:
             return ""
-        return off_clock(stamp_ns, self.get_clock(), self._patient_for)
+        most = max(self._patient_for, LATEST_COMMAND)
+        return off_clock(stamp_ns, self.get_clock(), most, f"a command on {topic}")
 
     def _release_in(self, ahead_ns: int) -> None:
         self._release.timer_period_ns = ahead_ns
@@ -513,6 +594,9 @@ class FunnelMonitor(ManagedNode):
         if reading.alarm:  # no verdict: it warns, and latches nothing
             level = max(level, DiagnosticStatus.WARN)
             text += f"; {reading.alarm}"
+        named = [*self._doubts.values(), *self._unheard.values(), graph.namesakes(self)]
+        if named := [each for each in named if each and each not in text]:
+            level, text = max(level, DiagnosticStatus.WARN), "; ".join([text, *named])
         if self._latched is not None:
             level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
             text += "".join(f"; {name}: {why}" for name, why in self._failures.items())
@@ -532,6 +616,7 @@ class FunnelMonitor(ManagedNode):
             self._unanswered.clear()
             self._failures.clear()
             self._frames.clear()
+            self._numbers.clear()
             self._deadlines.clear()
             self._tell("restarted")
         return answer

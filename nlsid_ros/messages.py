@@ -214,13 +214,15 @@ def base_stopped(sent: float, period: float) -> bool:
     return time.monotonic() - sent > max(BASE_PATIENCE, PATIENT_PERIODS * period)
 
 
-def off_clock(stamp_ns: int, clock: Clock, most: float) -> str:
-    """Why a stamp is not of now, give or take `most` s; empty if it is."""
+def off_clock(stamp_ns: int, clock: Clock, most: float, what: str = "a response") -> str:
+    """Why the stamp of `what` is not of now, give or take `most` s; empty if it is."""
     age = (clock.now().nanoseconds - stamp_ns) * 1e-9
     if abs(age) <= most:
         return ""
+    if stamp_ns == 0:
+        return f"{what} is stamped 0: its publisher does not fill in the time"
     way = "before" if age > 0 else "after"
-    return f"a response is stamped {abs(age):.3g} s {way} this node's clock; {most:g} s are allowed"
+    return f"{what} is stamped {abs(age):.3g} s {way} this node's clock; {most:g} s are allowed"
 
 
 def stamp_ns_of(message: Any) -> int:

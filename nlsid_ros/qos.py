@@ -67,6 +67,17 @@ def subscription_to(offered: list[ReliabilityPolicy]) -> QoSProfile:
     )
 
 
+def following(asked: QoSProfile, offered: list[QoSProfile]) -> QoSProfile:
+    """Return what to ask for in place of `asked` so that it matches every publisher.
+
+    Reliable again where all are. What was latched stays so only while all are.
+    """
+    wanted = recording_of(offered)
+    if asked.durability != DurabilityPolicy.TRANSIENT_LOCAL:
+        wanted.durability = asked.durability  # or what is there already would come once more
+    return wanted
+
+
 def playing_of(recorded: tuple[Profile, ...]) -> QoSProfile:
     """STREAM, and latched if every publisher was when the bag was recorded.
 
@@ -86,7 +97,9 @@ def recording_of(offered: list[QoSProfile]) -> QoSProfile:
     the recording began is in it.
     """
     profile = subscription_to([publisher.reliability for publisher in offered])
-    latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offered)
+    latched = bool(offered) and all(
+        o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offered
+    )
     return QoSProfile(
         history=profile.history,
         depth=profile.depth,

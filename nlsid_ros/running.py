@@ -1,14 +1,17 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
 import gc
+import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import traceback
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, ClassVar, NamedTuple
 
 import rclpy
 from lifecycle_msgs.msg import Transition
@@ -19,11 +22,14 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -31,6 +37,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
+from nlsid_ros import shared_memory, watchdog
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -63,8 +70,11 @@ class ManagedNode(LifecycleNode):
 
     Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
-    those instead of the process's.
+    those instead of the process's. is_watched: it ends if its executor stands still
+    (`nlsid_ros.watchdog`); so it must not sleep for long.
     """
+
+    is_watched: ClassVar[bool] = False
 
     def __init__(self, name: str, arguments: Arguments = None) -> None:
         try:
@@ -226,6 +236,27 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
+    def create_subscription(  # type: ignore[override]
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[..., None],
+        qos_profile: QoSProfile | int,
+        *,
+        callback_group: CallbackGroup | None = None,
+        raw: bool = False,
+    ) -> Subscription:
+        """As rclpy does it, without the middleware's events: to take one can wait for ever."""
+        return super().create_subscription(
+            msg_type,
+            topic,
+            callback,
+            qos_profile,
+            callback_group=callback_group,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=raw,
+        )
+
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """As rclpy does it; what had arrived is let go (see `_let_go`)."""
         subscription.callback = _let_go
@@ -280,6 +311,7 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
     the node could send a last command. Raises what made the node fail to start.
     """
     woken = _wake_on_signals()
+    shared_memory.avoid_what_is_stale()
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
@@ -292,12 +324,28 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
                 nodes[-1].start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        _spin_until_signalled(nodes, woken)
+        with _watched(nodes):
+            _spin_until_signalled(nodes, woken)
     finally:
         with ExitStack() as ending:  # each is stopped, also if another cannot be
             ending.callback(try_shutdown)
             for node in reversed(nodes):
                 ending.callback(node.destroy_node)
+
+
+@contextmanager
+def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
+    """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
+    if not all(node.is_watched for node in nodes):
+        yield
+        return
+    names = ", ".join(node.get_name() for node in nodes)
+    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
+        try:
+            yield
+        finally:
+            watching.kill()
 
 
 def _unreadable(error: Exception) -> DataError:

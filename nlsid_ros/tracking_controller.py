@@ -24,6 +24,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -37,7 +38,7 @@ from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
-from nlsid_ros import qos
+from nlsid_ros import graph, qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import (
     CHECKING,
@@ -158,6 +159,7 @@ class TrackingController(ManagedNode):
         self._run: Run | None = None  # as it was announced
         self._last_ns = 0  # the stamp of the last response under the policy's own input
         self._stamped_ns = 0  # the newest stamp of a response or command
+        self._began = math.inf  # when a run did, s of the wall's time
         self._sent = -math.inf  # when the last command went out, s of the wall's time
         self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
         self._ramp = self._limits
@@ -219,7 +221,7 @@ class TrackingController(ManagedNode):
             self._commands = self.create_publisher(
                 message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
-            self.create_subscription(
+            self._responses = self.create_subscription(
                 message_class(self._response_type),
                 self.signal_topic(response.topic),
                 partial(self._on_response, response),
@@ -241,7 +243,7 @@ class TrackingController(ManagedNode):
         if self._controller is not None or self._stopping:
             return "a run is on"
         assert self._command is not None
-        if lacking := self._command.lacking():
+        if lacking := self._command.lacking() or self._doubt():
             return lacking
         if self._commissioning and not self._brake.service_is_ready():
             return f"{self._stop_service} is not there: nothing unproved runs without it"
@@ -256,6 +258,7 @@ class TrackingController(ManagedNode):
             return f"require_monitor is set and {judging} {self._margin.topic_name}"
         self._first_ns, self._run, self._stage = None, None, 1
         self._stamped_ns, self._accompanied = 0, not self._watched
+        self._began = time.monotonic()
         self._tell("waiting for the response")
         return ""
 
@@ -296,6 +299,15 @@ class TrackingController(ManagedNode):
                 self._tell(self._tracking(controller))
         self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
         self._on_due()
+
+    def _doubt(self) -> str:
+        """Why nobody knows whose responses come; empty if it is known."""
+        return graph.several(self._responses.topic_name, self._responders())
+
+    def _responders(self) -> list[TopicEndpointInfo]:
+        """Who publishes responses."""
+        publishers = self.get_publishers_info_by_topic(self._responses.topic_name)
+        return [each for each in publishers if each.topic_type == self._response_type]
 
     def _say_run(self, run: Run) -> None:
         self._run = run
@@ -376,7 +388,7 @@ class TrackingController(ManagedNode):
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")
-        elif lacking := self._command.lacking():
+        elif lacking := self._command.lacking() or self._doubt():
             self._halt(lacking)
         elif self._watched and now - self._judged > self._monitor_patience:
             self._halt(f"{self._monitor} has judged nothing for {self._monitor_patience:g} s")
@@ -451,6 +463,8 @@ class TrackingController(ManagedNode):
             text = "; ".join(part for part in (self._text, self._funnel.state) if part)
         if self._funnel.refusal:
             level = DiagnosticStatus.ERROR
+        if named := self._others_here():
+            level, text = max(level, DiagnosticStatus.WARN), f"{text}; {named}"
         if self._commissioning:
             level, text = max(level, DiagnosticStatus.WARN), f"COMMISSIONING, not proved: {text}"
         values = {
@@ -461,6 +475,16 @@ class TrackingController(ManagedNode):
         }
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, name_of(self), level, text, values))
+
+    def _others_here(self) -> str:
+        """Who else commands the robot or has this node's name, and who cannot hear it."""
+        said = [graph.namesakes(self)]
+        if self._design is not None:
+            said.append(graph.rivals(self, self._commands))
+        waiting = time.monotonic() - self._began if self._controller is not None else 0.0
+        if self._first_ns is None and waiting > graph.SILENT:
+            said.append(graph.unheard(self._responses.topic_name, self._responders()))
+        return "; ".join(filter(None, said))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -52,6 +52,8 @@ EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said
 class TrajectoryRecorder(ManagedNode):
     """Records topics into one new bag after another."""
 
+    is_watched = True
+
     def __init__(self, arguments: Arguments = None) -> None:
         super().__init__(NAME, arguments)
         self._bags = 0
@@ -325,8 +327,8 @@ class TrajectoryRecorder(ManagedNode):
         if recording is not None:
             values = {"bag": str(recording.bag.path)} | recording.counts()
             text = "paused" if recording.paused else "recording"
-            unheard = [f"{t}: {what}" for t, what in self._topics.warnings.items()]
-            if warnings := recording.warnings() + unheard:
+            self._topics.follow()
+            if warnings := [*recording.warnings(), *self._topics.warnings.values()]:
                 level, text = DiagnosticStatus.WARN, "; ".join(warnings)
         if problems := self._topics.problems:
             level = DiagnosticStatus.ERROR

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bags.chain.config import Config, signal_texts
+from bags.chain.steps import USES, absent_from, with_parts
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
@@ -29,10 +30,9 @@ def misfits(config: Config, bags: Sequence[Path]) -> list[str]:
             found.setdefault(what, []).append(path.name)
     names = set(map(trial_name, bags))
     lines = [f"{_some(where)}: {what}" for what, where in found.items()]
-    for use in ("test", "validation", "calibration"):
+    lines += absent_from(with_parts(sorted(names), config), config)
+    for use in USES:
         wanted = getattr(config.split, use)
-        if absent := [name for name in wanted if name not in names]:
-            lines.append(f"split.{use}: none of the bags is called {', '.join(absent)}")
         if wanted and set(wanted) >= names:
             lines.append(f"split.{use}: names every bag; leave some to train on")
     if not config.split.test and config.split.share is None:

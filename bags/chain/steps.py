@@ -17,8 +17,8 @@ from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
-from bags.recordings.names import listed
-from bags.signals.grid import filled_samples, read_dataset, skipped_samples
+from bags.recordings.names import did_you_mean, listed
+from bags.signals.grid import filled_samples, read_dataset, said_restarts, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials, check_apart
@@ -33,6 +33,7 @@ from nlsid_core.progress import Progress, part, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
+USES: Final = ("test", "validation", "calibration")  # that the split names bags for
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
 LARGER: Final = 20.0  # times the largest value of most trials: hardly the same unit
 
@@ -41,8 +42,7 @@ LARGER: Final = 20.0  # times the largest value of most trials: hardly the same 
 class Trials:
     """The bags' trials by what they are for.
 
-    skipped: samples that were left out in gaps; filled: those nobody measured. absent: names
-    in the configuration's split that none of the bags has.
+    skipped: samples that were left out in gaps; filled: those nobody measured.
     """
 
     train: Dataset
@@ -51,7 +51,6 @@ class Trials:
     calibration: Dataset | None = None
     skipped: int = 0
     filled: int = 0
-    absent: tuple[str, ...] = ()
 
     @property
     def every(self) -> Dataset:
@@ -209,8 +208,13 @@ def _ranges(
     return list(zip(signals_of(trials.trajectories[0], letter), lows.T, highs.T, strict=True))
 
 
-def by_use(labelled: Dataset, config: Config) -> Trials:
-    """The trials by what the configuration's split has them for."""
+def by_use(labelled: Dataset, config: Config, *, left_out: Sequence[str] = ()) -> Trials:
+    """The trials by what the configuration's split has them for.
+
+    left_out: names of bags that were given and have no trial here. Raises DataError for a name in
+    the split that is neither of a trial nor of these.
+    """
+    refuse_absent([*labelled.names, *with_parts(left_out, config)], config)
     if config.split.share is not None:
         trials = cut(
             labelled,
@@ -228,10 +232,8 @@ def by_use(labelled: Dataset, config: Config) -> Trials:
     if trials.calibration is not None:
         fitted = (*trials.train, *(trials.validation or ()))
         check_apart(fitted, trials.calibration)
-    named = (*config.split.test, *config.split.validation, *config.split.calibration)
-    absent = tuple(name for name in named if not _of_bags(labelled.names, [name]))
     skipped, filled = skipped_samples(labelled), filled_samples(labelled)
-    return replace(trials, skipped=skipped, filled=filled, absent=absent)
+    return replace(trials, skipped=skipped, filled=filled)
 
 
 def _labelled(
@@ -301,9 +303,34 @@ def check_split(names: Sequence[str], config: Config) -> None:
     named = {"validation": split.validation, "calibration": split.calibration}
     if split.share is None:
         named = {"test": split.test, **named}
-    wanted = {name for part in named.values() for name in part}
-    parts = sorted(name for name in wanted if name.rpartition(".")[0] in names)
-    _held_out([*names, *parts], named)
+    possible = with_parts(names, config)
+    _held_out(possible, named)
+    refuse_absent(possible, config)
+
+
+def absent_from(names: Sequence[str], config: Config) -> list[str]:
+    """Each name or pattern in the split that none of the trials called `names` has, as a reason."""
+    return [
+        f"split.{use} names {name}, and no bag is called so{did_you_mean(name, names)}"
+        for use in USES
+        for name in getattr(config.split, use)
+        if not _of_bags(names, [name])
+    ]
+
+
+def refuse_absent(names: Sequence[str], config: Config) -> None:
+    """Raise DataError for the first name in the split that none of the trials has.
+
+    Its trial would be trained on without a word.
+    """
+    if absent := absent_from(names, config):
+        raise DataError(f"{absent[0]}; the bags are {listed(names)}")
+
+
+def with_parts(names: Sequence[str], config: Config) -> list[str]:
+    """The bags' names, and those in the split of parts that a bag with gaps may have."""
+    wanted = {name for use in USES for name in getattr(config.split, use)}
+    return [*names, *sorted(name for name in wanted if name.rpartition(".")[0] in names)]
 
 
 def _held_out(trials: Sequence[str], named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -413,6 +440,14 @@ def what_a_funnel_catches(
     )
 
 
+def what_a_monitor_would_not_judge(
+    model_path: Path, config: Config, design: OutputTubeDesign
+) -> list[str]:
+    """The test trials beside a model that a monitor of it would not judge as one run, and why."""
+    _, test = _trials_beside(model_path, config, design.model)
+    return [] if test is None else said_restarts(test)
+
+
 def _trials_beside(
     model_path: Path, config: Config, model: StableModel
 ) -> tuple[CalibrationTrials, Dataset | None]:
@@ -429,7 +464,29 @@ def _trials_beside(
             f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
             "calibration trials; run `nlsid identify` with this configuration"
         )
+    _refuse_another_split(model_path, held_back, config)
     assert config.funnel is not None
     least = least_window(model, train, config.funnel.horizon)
     trials = calibration_trials(train, held_back.get("calibration"), least=least)
     return trials, held_back.get("test")
+
+
+def _refuse_another_split(
+    model_path: Path, held_back: Mapping[str, Dataset], config: Config
+) -> None:
+    """Raise DataError if the trials beside a model are not those that the configuration names.
+
+    Of many bags some may have been left out when the model was identified.
+    """
+    were_left_out = model_path.with_name(documents.FLEET).exists()
+    for use in ("test", "calibration") if config.split.share is None else ("calibration",):
+        if use not in held_back:
+            continue
+        named, kept = getattr(config.split, use), held_back[use].names
+        absent = [name for name in named if not _of_bags(kept, [name])]
+        others = set(kept) - set(_of_bags(kept, named))
+        if others or (absent and not were_left_out):
+            raise DataError(
+                f"split.{use} names {listed(absent or named)}, and the {use} trials beside the "
+                f"model are {listed(kept)}: run `nlsid identify` with this configuration"
+            )

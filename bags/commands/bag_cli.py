@@ -3,7 +3,6 @@
 A command imports what it runs when it is called.
 """
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +14,8 @@ from bags.commands.progress import progress_bar
 from nlsid_core.errors import BagError, DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
@@ -25,7 +26,7 @@ bag_app = typer.Typer(
     help="Look into recordings, check, repair, convert and cut them.",
     no_args_is_help=True,
 )
-out = Console() if sys.stdout.isatty() else Console(width=WIDTH_IN_FILES)
+out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
 err = Console(stderr=True)
 
 
@@ -207,9 +208,16 @@ def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
     for what in found.lost:
         out.print(f"lost: {what}", soft_wrap=True, markup=False)
+    if found.lost:
+        verdict = f"{len(found.lost)} losses, as said above"
+    elif found.statements:
+        verdict = f"nothing was lost of what {' and '.join(found.statements)} state"
+    else:
+        verdict = (
+            "whether messages are missing is not known: the bag does not state how many it had"
+        )
     out.print(
-        f"wrote {found.out}, {found.messages} messages, read back and compared; "
-        + ("nothing was lost" if not found.lost else f"{len(found.lost)} places were lost"),
+        f"wrote {found.out}, {found.messages} messages, read back and compared; {verdict}",
         soft_wrap=True,
         markup=False,
     )
@@ -259,6 +267,7 @@ def export_command(
             out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
         for what in rows.left_out:
             out.print(f"left out: {what}", soft_wrap=True, markup=False)
+        _say_notes(rows.notes)
         return
     if not signals:
         raise BagError("a common grid needs to know which signals: --signal")
@@ -294,7 +303,7 @@ def cut(
     from bags.tools import edit
 
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        count = edit.cut(
+        copied = edit.cut(
             bag,
             bag_out,
             start=start,
@@ -304,7 +313,8 @@ def cut(
             definitions=_definitions(definitions),
             progress=progress,
         )
-    out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
+    out.print(f"wrote {bag_out}, {copied.messages} messages", soft_wrap=True, markup=False)
+    _say_notes(copied.notes)
 
 
 @bag_app.command()
@@ -314,8 +324,9 @@ def merge(bags: BagsArgument, bag_out: OutOption) -> None:
     from bags.tools import edit
 
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        count = edit.merge(expand_bags(bags), bag_out, progress=progress)
-    out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
+        copied = edit.merge(expand_bags(bags), bag_out, progress=progress)
+    out.print(f"wrote {bag_out}, {copied.messages} messages", soft_wrap=True, markup=False)
+    _say_notes(copied.notes)
 
 
 @bag_app.command()
@@ -333,9 +344,10 @@ def split(
     from bags.tools import edit
 
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        parts = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
-    for part in parts:
+        copied = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
+    for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
+    _say_notes(copied.notes)
 
 
 @bag_app.command("import")
@@ -385,6 +397,11 @@ def import_command(
             "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
             soft_wrap=True, markup=False,
         )  # fmt: skip
+
+
+def _say_notes(notes: "Sequence[str]") -> None:
+    for note in notes:
+        out.print(f"not as stated: {note}", soft_wrap=True, markup=False)
 
 
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":

@@ -36,6 +36,8 @@ def show_info(console: Console, info: BagInfo) -> None:
     )
     if info.ending is not None:
         _say(console, f"unfinished: {info.ending}; `nlsid bag recover` makes a whole bag of it")
+    for note in info.notes:
+        _say(console, f"not as stated: {note}")
     table = Table(box=None, pad_edge=False)
     for name in ("topic", "type"):
         table.add_column(name, overflow="fold")
@@ -92,6 +94,7 @@ def info_json(info: BagInfo) -> str:
             "files": info.files,
             "size": info.size,
             "unfinished": info.ending,
+            "not_as_stated": list(info.notes),
             "custom": dict(info.custom),
             "topics": [
                 {

@@ -3,9 +3,11 @@
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
+import io
 import os
 import sys
-from typing import Annotated
+import warnings
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -69,11 +71,45 @@ def nlsid(
     """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
 
 
+class _Written(io.FileIO):
+    """A standard stream whose reader may leave early (`nlsid ... | head`): the rest is dropped.
+
+    What a command finds, and the status that says it, is the same whoever reads along.
+    """
+
+    def write(self, content: Any, /) -> int:
+        """Write the content, or count it as written where nobody reads it."""
+        try:
+            return super().write(content)
+        except BrokenPipeError:
+            return memoryview(content).nbytes
+
+
+def _prepare_streams() -> None:
+    """Let readers leave early, and keep the warnings of libraries from people.
+
+    Warnings are for who writes programs: `python -W` brings them back.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of the processes that share the work
+
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper):  # not where it is closed
+            written = io.BufferedWriter(_Written(stream.fileno(), "wb", closefd=False))
+            patient = io.TextIOWrapper(
+                written, stream.encoding, stream.errors, line_buffering=stream.line_buffering
+            )
+            setattr(sys, name, patient)
+
+
 def main() -> None:
     """Entry point: errors made for people are shown as one message and end with status 2.
 
     Status 0 says yes, 1 no (not fit, outside, rejected), 2 that it could not be done or judged.
     """
+    _prepare_streams()
     try:
         app()
     except NlsidError as error:

@@ -49,7 +49,11 @@ def funnel(
     --scheduler share the L-steps of a --problem of shape P.
     """
     from bags.chain.config import load_config
-    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
+    from bags.chain.steps import (
+        design_funnel_files,
+        what_a_funnel_catches,
+        what_a_monitor_would_not_judge,
+    )
     from bags.commands import show
     from bags.designs import documents
     from bags.fleet.workers import Workers
@@ -80,6 +84,8 @@ def funnel(
             raise typer.Exit(2)
     else:
         show.say_catching(out, catching, require)
+    for line in what_a_monitor_would_not_judge(model, settings, design):
+        show.warn(out, line)
     for path in (
         *(out_dir / name for name in design.documents()),
         *([] if catching is None else write_catching(out_dir, catching)),

@@ -81,9 +81,12 @@ def run_init(
         robot=robot,
         definitions=definitions,
         types=types,
+        named=[*responses, *excitations],
         widen=not excitations and not asked,
         alone=not (responses or asked),
     )
+    if not yes:
+        _settle(console, proposal)
     if definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
             os.path.relpath(path, target.parent) for path in definitions
@@ -93,7 +96,7 @@ def run_init(
     taken = [signal["path"] for role in roles for signal in proposal.content["signals"][role]]
     for text in taken:
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
-    for wall in dict.fromkeys(proposal.walls):
+    for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
@@ -125,6 +128,16 @@ def run_init(
     for step in steps:
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
     return proposal
+
+
+def _settle(console: Console, proposal: Proposal) -> None:
+    """Ask what seems wrong; DataError unless somebody says that it is right."""
+    for doubt in dict.fromkeys(proposal.doubts):
+        if not sys.stdin.isatty():
+            raise DataError(f"{doubt} Give --yes to take it as it is")
+        console.print(doubt, soft_wrap=True, markup=False, style="dark_orange3")
+        if not typer.confirm("take it as it is?", default=False):
+            raise DataError("nothing was written: give what is right")
 
 
 def said_briefly(bags: Sequence[Path]) -> str:

@@ -17,7 +17,7 @@ from bags.commands.fleet_cli import (
     StrictOption,
     WorkersOption,
 )
-from bags.commands.options import BagsArgument, ConfigOption, OutOption, out
+from bags.commands.options import BagsArgument, ConfigOption, OutOption, err, out
 from bags.commands.progress import progress_bar
 from nlsid_core.errors import DataError
 
@@ -57,6 +57,7 @@ def init(
 
     from bags.commands.init import run_init
     from bags.commands.listening import listen
+    from bags.setup.proposal import Unfit
 
     if live is bool(bags):
         raise typer.BadParameter("give bags, or --live for the robot that is running")
@@ -65,17 +66,21 @@ def init(
     with tempfile.TemporaryDirectory() as folder:
         if live:
             out.print(f"listening for {seconds:g} s; let the robot move", soft_wrap=True)
-        run_init(
-            out,
-            [listen(Path(folder) / "heard", seconds)] if live else bags or [],
-            out_file,
-            responses=response or (),
-            excitations=excitation or (),
-            definitions=definitions or (),
-            robot=robot,
-            yes=yes,
-            live=live,
-        )
+        try:
+            run_init(
+                out,
+                [listen(Path(folder) / "heard", seconds)] if live else bags or [],
+                out_file,
+                responses=response or (),
+                excitations=excitation or (),
+                definitions=definitions or (),
+                robot=robot,
+                yes=yes,
+                live=live,
+            )
+        except Unfit as reason:
+            err.print(f"nothing was written: {reason}", soft_wrap=True, markup=False)
+            raise typer.Exit(1) from reason
 
 
 def identify(

@@ -90,7 +90,8 @@ def monitor(
             )
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
-        drawn = report_available() and all(entry.half_width for entry in replays)
+        is_judged = any(entry.judged for entry in replays)
+        drawn = report_available() and is_judged and all(entry.half_width for entry in replays)
         if drawn:
             write_margins(picture, replays)
     if as_json:

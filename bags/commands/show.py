@@ -20,6 +20,7 @@ from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
 from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
@@ -100,9 +101,7 @@ def notes(result: Identified) -> list[str]:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
     if said := said_filled(result.trials.filled, sum(map(len, result.trials.every))):
         lines.append(said)
-    lines += result.trials.apart
-    if result.trials.absent:
-        lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")
+    lines += [*said_restarts(result.trials.every), *result.trials.apart]
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
@@ -267,6 +266,13 @@ def _soon(caught: Caught) -> str:
     return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
 
 
+def warn(console: Console, line: str) -> None:
+    """Say what a person should know before they trust what was made."""
+    console.print(
+        f"warning: {line}", soft_wrap=True, markup=False, highlight=False, style="dark_orange3"
+    )
+
+
 def say_catching(console: Console, catching: Catching, require: float | None) -> None:
     """The widths, the table, and what is to be known of a tube that is too wide."""
     for line in width_lines(catching):
@@ -279,15 +285,14 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
         said = "a sensor's fault is in one output at a time; above is the one caught least: "
         console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
     if false := catching.rows[0].funnel.count:
-        console.print(
-            f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "
+        warn(
+            console,
+            f"{false} of {catching.trials} held-back trials, nothing put into them, "
             f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
-            soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
-        )  # fmt: skip
+        )
     for line in (*catching.beyond, *catching.still):
-        said = f"warning: {line}"
-        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+        warn(console, line)
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "

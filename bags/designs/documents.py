@@ -22,6 +22,7 @@ POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
 MODEL_PROOF = "model.proof.json"
 TRAINING = "training.npz"
 HELD_BACK = "held_back.npz"
+FLEET = "fleet.sqlite"  # what was read of many bags
 REPORT = "report.html"
 DESIGN_REPORT = "design.html"
 SELECTION_PLOT = "select.png"

@@ -17,6 +17,7 @@ import numpy as np
 from bags.chain.config import Config
 from bags.chain.steps import Trials, by_use, check_split, read_signals_of
 from bags.chain.training import decoded, encoded
+from bags.designs import documents
 from bags.fleet.bags import Recordings, same_as
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask, without_name
@@ -26,7 +27,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.progress import Progress, silent
 
-MANIFEST = "fleet.sqlite"
+MANIFEST = documents.FLEET
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class FleetTrials:
         """The trials by use; DataError if there is none, or for the split."""
         if not self.read:
             raise DataError(f"none of {len(self.answers)} bags can be used")
-        return by_use(Dataset(self.read), self.config)
+        return by_use(Dataset(self.read), self.config, left_out=list(self.left_out))
 
 
 def read_fleet(

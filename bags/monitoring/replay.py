@@ -18,6 +18,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
+from bags.signals.columns import read_columns
 from bags.signals.reader import bag_digest
 from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sampler, said_filled
 from nlsid_core import files
@@ -434,6 +435,7 @@ def _fed(
         clock.start_ns = source.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
+        doubt = _doubt(watch.pairing, source)
         set_back = watch.pairing.clock == "log" and bool(source.log_order(topics).back)
         for message in source.messages([*run_topics, *topics], as_recorded=set_back):
             if message.topic in run_topics:
@@ -445,8 +447,26 @@ def _fed(
                 continue
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
             clock.add(message.topic, stamp_ns)
+            if doubt and message.topic in watch.pairing.response_topics:
+                yield watch.refuse(stamp_ns, doubt)
+                continue
             decoded = decode(message.data, *source.types_on(message.topic))
             yield watch.message(message.topic, stamp_ns, decoded)
+
+
+def _doubt(sampler: Sampler, source: Bag) -> str:
+    """Why nobody knows whose signals these are; empty if it is known, or they cannot be read."""
+    driving = [factor for part in sampler.excitations for factor in part]
+    paths = {str(signal.path): signal.path for signal in (*sampler.responses, *driving)}
+    measured = {str(signal.path) for signal in sampler.responses}
+    try:
+        columns = read_columns(source, paths)
+    except BagError:
+        return ""  # a message that cannot be read is unknown anyway
+    for name, path in paths.items():
+        if said := columns[path.topic].doubt(name, responds=name in measured):
+            return f"{name}: {said}"
+    return ""
 
 
 def _check(sampler: Sampler, source: Bag, bag: Path) -> None:

@@ -1,25 +1,25 @@
-"""An open bag: its topics, its metadata, and its messages in log order or in batches.
+"""An open bag: its topics, what it states, and its messages in log order or in batches.
 
 Bags are untrusted. Whatever is wrong with one leaves here as a BagError that names the bag.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from mcap.records import Attachment, Metadata
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.definitions import Definition
-from bags.recordings.folders import COMPRESSED, bag_files
-from bags.recordings.mcap_records import MAGIC
-from bags.recordings.message_types import are_same, types_in_bag
+from bags.recordings.folders import METADATA, BagFiles, bag_files, data_files
+from bags.recordings.message_types import are_same, ros2_definition, types_in_bag
 from bags.recordings.names import did_you_mean, listed
-from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.quality import Profile
-from bags.recordings.remote import RemotePath, place
-from bags.recordings.storage import Channel, McapStorage, RosbagsStorage, Storage, defined
+from bags.recordings.remote import place
+from bags.recordings.storage import Channel, Raw, Storage, defined
 from nlsid_core.errors import BagError
 
 RECOVER: Final = "`nlsid bag recover`"
@@ -38,11 +38,14 @@ class Message(NamedTuple):
 class Bag:
     """A bag open for reading. Use as a context manager.
 
-    A bag is a rosbag2 folder (MCAP or sqlite3, split or not), a single .mcap, or a ROS 1 .bag; of
-    MCAP also one in object storage, by its URL (`bags.recordings.remote`).
+    A bag is a rosbag2 folder, one of its files, or a ROS 1 bag: MCAP, SQLite or ROS 1, split or
+    not, compressed or not; of MCAP also one in object storage, by its URL
+    (`bags.recordings.remote`).
     Raises BagError if there is no such bag, if it is damaged or not a bag, or if it is unfinished.
     With `unfinished=True` the last is no error: the messages there are can be read, and `ending`
-    says why there may be more. definitions: of types that the bag itself does not define.
+    says why there may be more. With `salvage=True` damage is no error either: what cannot be read
+    is listed in `lost`, and every data file in the folder is read, whatever its metadata say.
+    definitions: of types that the bag itself does not define.
     """
 
     def __init__(
@@ -50,34 +53,31 @@ class Bag:
         path: Path | str,
         *,
         unfinished: bool = False,
+        salvage: bool = False,
         definitions: Mapping[str, Definition] | None = None,
     ) -> None:
         self.path = place(path)
-        self._described = bag_files(self.path)
+        self._described, self._damaged = _described(self.path, salvage=salvage)
         self.files: tuple[Path, ...] = self._described.files
         self.ending: str | None = None
-        for file in self.files:
-            _check_start(file)
         if not self._described.finished:
-            self.ending = "it has no metadata.yaml: the recording was not closed"
-        if self._described.storage == "mcap" and not self._described.compressed:
-            self._storage: Storage = McapStorage(self.files, CUSTOM_DATA)
-        else:
-            whole = self._described.compressed
-            if isinstance(self.path, RemotePath):
-                raise BagError(
-                    f"{self.path}: only MCAP is read from where it lies, and not if it is "
-                    "compressed whole; copy this bag to this machine"
-                )
-            self._storage = RosbagsStorage([self.path] if whole else self.files)
+            self.ending = f"it has no {METADATA}: the recording was not closed"
+        self._storage = Storage(self.files, salvage=salvage)
+        release = self._described.release or self._storage.release
         self._storage.channels = [
-            defined(channel, definitions or {}) for channel in self._storage.channels
+            defined(self._encoded(channel), definitions or {}, release)
+            for channel in self._storage.channels
         ]
         if self._storage.ending is not None:  # of a bag that is one file that is said already
             self.ending = self._storage.ending.removeprefix(f"{self.path}: ")
-        if self.ending is not None and not unfinished:
+        if self.ending is not None and not (unfinished or salvage):
             self.close()
             raise BagError(self._unfinished())
+
+    def _encoded(self, channel: Channel) -> Channel:
+        """The channel, with the encoding that the metadata state where its file says CDR."""
+        stated = self._described.encodings.get(channel.topic, "cdr")
+        return replace(channel, encoding=stated) if channel.encoding == "cdr" else channel
 
     def close(self) -> None:
         """Close the bag's files."""
@@ -110,6 +110,38 @@ class Bag:
         return dict(self._described.custom if self.path.is_dir() else self._storage.custom)
 
     @property
+    def lost(self) -> tuple[str, ...]:
+        """What cannot be read, as far as it was found by now, and why."""
+        return (*self._damaged, *self._storage.lost)
+
+    @property
+    def kept_beside(self) -> Iterator[Metadata | Attachment]:
+        """The bag's records that are no messages, but for `custom`."""
+        yield from self._storage.records
+        yield from self._storage.attachments()
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """What in the bag says how many messages there should be."""
+        said = {
+            METADATA: self._described.counts is not None,
+            "the files' statistics and indexes": self._storage.stated is not None,
+        }
+        return tuple(name for name, there in said.items() if there)
+
+    @property
+    def disagreements(self) -> tuple[str, ...]:
+        """Where what the bag states and what is there differ, in words."""
+        found = [*self._described.notes]
+        said = {METADATA: self._described.counts, "the file": self._storage.stated}
+        for name, counts in said.items():
+            for topic in {**counts, **self.topics} if counts is not None else ():
+                stated, there = (counts or {}).get(topic, 0), self._there(topic)
+                if stated != there:
+                    found.append(f"{topic}: {name} states {stated} messages, {there} are there")
+        return tuple(dict.fromkeys(found))
+
+    @property
     def start_ns(self) -> int:
         """The first log time in ns; 0 if there are no messages."""
         return self._storage.start_ns
@@ -120,6 +152,7 @@ class Bag:
         Raises BagError if the topic does not exist, holds several types or is not CDR.
         """
         found = [c for c in self.channels if c.topic == topic]
+        found = [c for c in found if c.count] or found
         if not found:
             there = listed(f"{name} ({kind})" for name, kind in self.topics.items())
             near = did_you_mean(topic, self.topics)
@@ -130,13 +163,12 @@ class Bag:
                 f"{self.path}: {topic} holds messages of {self.topics[topic]}; "
                 "a signal needs one type on its topic"
             )
-        stated = self._described.encodings.get(topic, "cdr")
-        for encoding in (*(channel.encoding for channel in found), stated):
-            if encoding != "cdr":
-                raise BagError(
-                    f"{self.path}: {topic} is serialised as '{encoding}', only 'cdr' can be read"
-                )
         try:
+            for channel in found:
+                if channel.encoding == "ros1":
+                    ros2_definition(channel.msgtype, channel.definition)  # says what is wrong
+                if channel.encoding != "cdr":
+                    raise BagError(f"it is serialised as '{channel.encoding}', only 'cdr' is read")
             types = [types_in_bag(channel.msgtype, channel.definition) for channel in found]
         except BagError as error:
             raise BagError(f"{self.path}: {topic}: {error}") from error
@@ -156,15 +188,27 @@ class Bag:
         """How many messages the bag says it has on `topic`."""
         if self._described.counts is not None and self.ending is None:
             return self._described.counts.get(topic, 0)
+        return self._there(topic)
+
+    def _there(self, topic: str) -> int:
         return sum(channel.count for channel in self.channels if channel.topic == topic)
+
+    def strand(self, channel: Channel) -> int:
+        """Which of its topic's channels it is; sequence numbers are counted in each."""
+        return self._storage.strands[channel.key]
 
     def batches(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch]]:
         """The messages on `topics` (None: on all), many at once, in the order of the files.
 
         Memory: one batch. Raises BagError where the bag is damaged.
         """
-        for key, batch in self._storage.batches(self._keys(topics)):
-            yield self.channels[key], batch
+        for channel, batch, _ in self.parts(topics):
+            yield channel, batch
+
+    def parts(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch, int]]:
+        """As `batches`, with the log time in ns that no message from here on goes below."""
+        for key, batch, later_ns in self._storage.parts(self._keys(topics)):
+            yield self.channels[key], batch, later_ns
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""
@@ -178,13 +222,22 @@ class Bag:
     ) -> Iterator[Message]:
         """The messages on `topics` (None: on all) by log time; equal log times as recorded.
 
-        as_recorded: in the order of the files instead. Only MCAP files tell it.
+        as_recorded: in the order of the files instead.
         """
-        storage = self._storage
-        ordered = storage.recorded if as_recorded else storage.messages
-        for raw in ordered(self._keys(topics)):
+        keys = self._keys(topics)
+        recorded = self._storage.recorded(keys) if as_recorded else self._storage.messages(keys)
+        for raw in recorded:
             channel = self.channels[raw.key]
+            if raw.error:
+                raise BagError(f"{self.path}: {channel.topic}: {raw.error}")
             yield Message(channel.topic, channel.msgtype, raw.log_ns, raw.data, raw.publish_ns)
+
+    def raws(self, topics: Sequence[str] | None = None, *, nearly: bool = False) -> Iterator[Raw]:
+        """As `messages`, with all that is recorded of them, and those that cannot be unpacked.
+
+        nearly: where more chunks overlap in time than memory is meant for, do not refuse.
+        """
+        return self._storage.messages(self._keys(topics), nearly=nearly)
 
     def _keys(self, topics: Sequence[str] | None) -> list[int]:
         wanted = None if topics is None else set(topics)
@@ -204,12 +257,15 @@ class Bag:
         )
 
 
-def _check_start(file: Path) -> None:
-    """BagError if an MCAP file does not begin as one."""
-    if file.suffix in (".db3", ".bag", COMPRESSED) or isinstance(file, RemotePath):
-        return  # a remote file says what it is at its end
-    with file.open("rb") as stream:
-        start = stream.read(len(MAGIC))
-    if start != MAGIC:
-        what = f"starts with {start.hex(' ')}" if start else "is empty"
-        raise BagError(f"{file} is not an MCAP file: it {what}")
+def _described(path: Path, *, salvage: bool) -> tuple[BagFiles, list[str]]:
+    """What the bag is made of; with `salvage` also if its metadata are damaged, which is said."""
+    try:
+        found = bag_files(path)
+    except BagError as error:
+        files = data_files(path) if salvage and path.is_dir() else ()
+        if not files:
+            raise
+        return BagFiles(files), [str(error)]
+    if not salvage or not path.is_dir():
+        return found, []
+    return replace(found, files=tuple(dict.fromkeys((*found.files, *data_files(path))))), []

@@ -1,15 +1,15 @@
 """A batch: messages of one topic, still serialised, in one buffer."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from nlsid_core.arrays import IntArray
+from nlsid_core.errors import BagError
 
-BATCH_BYTES: Final = 4 * 2**20
-BATCH_MESSAGES: Final = 4096
+BATCH_BYTES: Final = 4 * 2**20  # of messages that a file without chunks gives at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,8 @@ class Batch:
     """N messages in `buffer`, in the order of recording.
 
     start, size: (N,) bytes, where each message's data lie. log_ns, publish_ns: (N,) ns.
-    sequence: (N,) as the recorder counted them, 0 where it did not.
+    sequence: (N,) as the recorder counted them, 0 where it did not. unreadable: of messages that
+    cannot be unpacked or translated, why.
     """
 
     buffer: bytes
@@ -26,19 +27,23 @@ class Batch:
     log_ns: IntArray
     publish_ns: IntArray
     sequence: IntArray
+    unreadable: Mapping[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.start)
 
     def data(self, i: int) -> bytes:
-        """Message i, serialised."""
+        """Message i, serialised; BagError if it is unreadable."""
+        if i in self.unreadable:
+            raise BagError(self.unreadable[i])
         start = int(self.start[i])
         return self.buffer[start : start + int(self.size[i])]
 
     def select(self, rows: IntArray) -> "Batch":
         """The messages `rows` (indices or a mask), of the same buffer."""
         columns = (self.start, self.size, self.log_ns, self.publish_ns, self.sequence)
-        return Batch(self.buffer, *(column[rows] for column in columns))
+        start, size, log_ns, publish_ns, sequence = (column[rows] for column in columns)
+        return Batch(self.buffer, start, size, log_ns, publish_ns, sequence)
 
 
 class LogOrder:
@@ -62,32 +67,12 @@ class LogOrder:
         self._count += len(log_ns)
 
 
-class BatchBuilder:
-    """Collects single messages of one topic into batches of bounded size."""
+def batch_of(buffer: bytes, start: IntArray, size: IntArray, log_ns: IntArray) -> Batch:
+    """A batch whose messages have one time each, and were not counted."""
+    return Batch(buffer, start, size, log_ns, log_ns, np.zeros(len(size), dtype=np.int64))
 
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._log_ns: list[int] = []
-        self._bytes = 0
 
-    def add(self, data: bytes, log_ns: int) -> None:
-        """Append one message, logged and published at `log_ns`."""
-        self._parts.append(data)
-        self._log_ns.append(log_ns)
-        self._bytes += len(data)
-
-    @property
-    def full(self) -> bool:
-        """Whether it is time to take the batch."""
-        return self._bytes >= BATCH_BYTES or len(self._parts) >= BATCH_MESSAGES
-
-    def take(self) -> Iterator[Batch]:
-        """The batch collected so far, if there is one; collecting starts anew."""
-        if not self._parts:
-            return
-        size = np.array([len(part) for part in self._parts], dtype=np.int64)
-        start = np.concatenate([[0], np.cumsum(size)[:-1]])
-        log_ns = np.array(self._log_ns, dtype=np.int64)
-        buffer = b"".join(self._parts)
-        self._parts, self._log_ns, self._bytes = [], [], 0
-        yield Batch(buffer, start, size, log_ns, log_ns, np.zeros(len(size), dtype=np.int64))
+def joined(parts: Sequence[bytes], log_ns: Sequence[int] | IntArray) -> Batch:
+    """A batch of single messages."""
+    size = np.array([len(part) for part in parts], dtype=np.int64)
+    return batch_of(b"".join(parts), np.cumsum(size) - size, size, np.array(log_ns, np.int64))

@@ -14,12 +14,13 @@ from functools import lru_cache
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.batch import Batch
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 NUMBERS: Final = {
@@ -64,6 +65,7 @@ class Hop(Protocol):
 
 
 Target = Sequence[Hop]
+Numbers = NDArray[Any]  # (N,) of any type of number
 
 
 class Group(NamedTuple):
@@ -114,17 +116,18 @@ class Gatherer:
         self._static: dict[str, bool] = {}
         self._met = _met(msgtype, types, tuple(targets))
 
-    def gather(self, batch: Batch) -> FloatArray:
-        """(targets, N) values of the batch's N messages.
+    def gather(self, batch: Batch) -> list[Numbers]:
+        """For each target its N numbers, of the type that they have in the batch's N messages.
 
         Raises UnreadableMessageError, with the message's place in the batch, if one is damaged.
         """
-        values = np.empty((len(self.targets), len(batch)))
+        for row, reason in batch.unreadable.items():
+            raise UnreadableMessageError(row, BagError(reason))
         for layout in self._met[:]:
             if _matches(layout, batch).all():
-                _take(layout, batch, values)
-                return values
-        rows = np.arange(len(batch))
+                return _taken(layout, batch)
+        values: list[Numbers] = []
+        rows = np.arange(len(batch) if self.targets else 0)
         layouts = 0
         while len(rows):
             first = int(rows[0])
@@ -137,9 +140,10 @@ class Gatherer:
             some = batch.select(rows if layouts <= MAX_LAYOUTS else rows[:1])
             same = np.zeros(len(rows), dtype=bool)
             same[: len(some)] = _matches(layout, some)
-            found = np.empty((len(self.targets), int(same.sum())))
-            _take(layout, batch.select(rows[same]), found)
-            values[:, rows[same]] = found
+            found = _taken(layout, batch.select(rows[same]))
+            values = values or [np.empty(len(batch), column.dtype) for column in found]
+            for column, part in zip(values, found, strict=True):
+                column[rows[same]] = part
             rows = rows[~same]
         return values
 
@@ -171,11 +175,14 @@ class UnreadableMessageError(BagError):
         self.row = row
 
 
-def _take(layout: Layout, batch: Batch, values: FloatArray) -> None:
-    """Put the wanted numbers of messages of this layout into `values` (targets, N)."""
+def _taken(layout: Layout, batch: Batch) -> list[Numbers]:
+    """The wanted numbers of messages of this layout, in the order of the targets."""
+    columns: dict[int, Numbers] = {}
     for kind, is_bool, targets, offsets in layout.groups:
         found = _view(batch.buffer, kind)[offsets[:, None] + batch.start]
-        values[targets] = found != 0 if is_bool else found
+        found = found != 0 if is_bool else found.astype(found.dtype.newbyteorder("="), copy=False)
+        columns.update(zip(targets.tolist(), found, strict=True))
+    return [columns[target] for target in range(len(columns))]
 
 
 def _matches(layout: Layout, batch: Batch) -> Any:

@@ -1,6 +1,7 @@
 """Which bags a person means by a path, and which files a bag is made of."""
 
 import os
+import re
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -27,17 +28,19 @@ _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass(frozen=True)
 class BagFiles:
-    """What a bag is made of: its data files in order, and what its metadata.yaml says of it."""
+    """What a bag is made of: its data files in order, and what its metadata.yaml says of it.
 
-    path: Path
+    release: of ROS 2; empty if it is not named. notes: what in the metadata is not as it should be.
+    """
+
     files: tuple[Path, ...]
-    storage: str
-    compressed: bool = False
     counts: dict[str, int] | None = None
     encodings: dict[str, str] = field(default_factory=dict)
     offered: dict[str, tuple[Profile, ...]] = field(default_factory=dict)
     custom: dict[str, str] = field(default_factory=dict)
     finished: bool = True
+    release: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def expand_bags(paths: Iterable[Path]) -> list[Path]:
@@ -107,23 +110,27 @@ def bag_files(path: Path) -> BagFiles:
     not in its folder.
     """
     if path.is_file():
-        return BagFiles(path, (path,), _storage([path]))
+        return BagFiles((path,))
     if not path.is_dir():
         raise BagError(f"there is no bag {path}; name a rosbag2 folder or an .mcap file")
-    there = sorted(p for p in path.iterdir() if p.suffix in (*DATA_FILES, COMPRESSED))
-    there = [p for p in there if p.is_file()]
     if (path / METADATA).is_file():
         return _described(path, _metadata(path / METADATA))
-    if not there:
+    if not (there := data_files(path)):
         raise BagError(f"{path} is not a bag: it holds no {' or '.join(DATA_FILES)} file")
-    return BagFiles(path, tuple(there), _storage(there), finished=False)
+    return BagFiles(there, finished=False)
 
 
-def _storage(files: list[Path]) -> str:
-    suffixes = {file.suffix for file in files}
-    if ".db3" in suffixes:
-        return "sqlite3"
-    return "ros1" if suffixes == {".bag"} else "mcap"
+def data_files(folder: Path) -> tuple[Path, ...]:
+    """The data files in a folder; part 2 before part 10."""
+    suffixes = (*DATA_FILES, COMPRESSED)
+    there = [p for p in folder.iterdir() if p.suffix in suffixes and p.is_file()]
+    return tuple(sorted(there, key=_by_number))
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """The name, with its numbers as numbers."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _metadata(file: Path) -> dict[str, Any]:
@@ -144,14 +151,21 @@ def _metadata(file: Path) -> dict[str, Any]:
 def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
     file = path / METADATA
     version = metadata.get("version")
-    if not isinstance(version, int) or not 1 <= version <= NEWEST_VERSION:
+    if not isinstance(version, int) or version < 1:
         raise _bad(file, f"version {version!r}; 1 to {NEWEST_VERSION} are known")
-    storage = metadata.get("storage_identifier")
-    if storage not in ("mcap", "sqlite3"):
-        raise _bad(file, f"storage_identifier {storage!r}; 'mcap' and 'sqlite3' are known")
+    notes = []
+    if version > NEWEST_VERSION:
+        notes.append(f"{METADATA} has version {version}; {NEWEST_VERSION} is the newest known")
     names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise _bad(file, "relative_file_paths is not a list of names")
+    files = [_inside(path, name) for name in names]
+    if missing := [name for name, found in zip(names, files, strict=True) if found is None]:
+        if len(missing) < len(names) or not data_files(path):
+            raise _bad(file, f"it names {missing[0]}, which is not there")
+        files = [*data_files(path)]
+        there = ", ".join(found.name for found in files if found)
+        notes.append(f"{METADATA} names {', '.join(missing)}, which is not there; read: {there}")
     counts: dict[str, int] = {}
     encodings: dict[str, str] = {}
     profiles: dict[str, tuple[Profile, ...]] = {}
@@ -159,7 +173,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         for entry in metadata["topics_with_message_count"] or ():
             topic = str(entry["topic_metadata"]["name"])
             counts[topic] = counts.get(topic, 0) + int(entry["message_count"])
-            encodings[topic] = str(entry["topic_metadata"]["serialization_format"])
+            encodings[topic] = str(entry["topic_metadata"].get("serialization_format", "cdr"))
             found = offered(entry["topic_metadata"].get(KEY))
             profiles[topic] = (*profiles.get(topic, ()), *found)
     except (KeyError, TypeError, ValueError) as error:
@@ -168,31 +182,32 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
     if not isinstance(custom, dict):
         raise BagError(f"{path}: custom_data in {METADATA} is not a mapping")
     return BagFiles(
-        path,
-        tuple(_inside(path, name, version) for name in names),
-        storage,
-        compressed=bool(metadata.get("compression_format")),
+        tuple(found for found in files if found),
         counts=counts,
         encodings=encodings,
         offered=profiles,
         custom={str(key): str(value) for key, value in custom.items()},
+        release=str(metadata.get("ros_distro") or ""),
+        notes=tuple(notes),
     )
 
 
-def _inside(folder: Path, name: str, version: int) -> Path:
-    """The data file `name`; BagError unless it is a file in `folder` itself."""
-    file = folder / name
-    if version < 4:  # these named the file from the folder above
-        file = folder / Path(name).name
-    if isinstance(folder, RemotePath):
-        there, home = Path(os.path.normpath("/" / file)), Path(os.path.normpath("/" / folder))
-    else:  # realpath bears loops of links
-        there, home = Path(os.path.realpath(file)), folder.resolve()
-    if not there.is_relative_to(home):
-        raise _bad(folder / METADATA, f"it names {name}, which is outside the bag")
-    if not file.is_file():
-        raise _bad(folder / METADATA, f"it names {name}, which is not there")
-    return file
+def _inside(folder: Path, name: str) -> Path | None:
+    """The data file `name`, None if there is none; BagError unless it is in `folder` itself.
+
+    Until version 4 the names began at the folder above; a file that was compressed whole may have
+    the name that it had before.
+    """
+    for there in (folder / name, folder / Path(name).name, folder / f"{name}{COMPRESSED}"):
+        if isinstance(folder, RemotePath):
+            end, home = Path(os.path.normpath("/" / there)), Path(os.path.normpath("/" / folder))
+        else:  # realpath bears loops of links
+            end, home = Path(os.path.realpath(there)), folder.resolve()
+        if not end.is_relative_to(home):
+            raise _bad(folder / METADATA, f"it names {name}, which is outside the bag")
+        if there.is_file():
+            return there
+    return None
 
 
 def _bad(file: Path, what: str) -> BagError:

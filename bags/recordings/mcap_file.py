@@ -42,7 +42,7 @@ from bags.recordings.remote import RangeReader, RemotePath, place
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
-SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.FOOTER)
+SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.FOOTER)
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
@@ -55,6 +55,7 @@ _INDEX: Final = struct.Struct("<HI")
 _COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
 
 Record = TypeVar("Record")
+Batches = Iterator[tuple[int, Batch]]  # channel id, messages
 
 
 class McapFile:
@@ -104,20 +105,22 @@ class McapFile:
         path.fetch([(0, self._size)])
         return False
 
-    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
-        """(channel id, messages) block by block, in the order of the file; of a file that is not
-        on this machine, several blocks together.
+    def runs(
+        self, channels: Collection[int]
+    ) -> Iterator[tuple[Block, Iterator[tuple[int, Batch]]]]:
+        """(last block, messages by channel id) in the order of the file, block by block; of a file
+        that is not on this machine, several blocks together.
 
         Raises BagError if a block is damaged or not what its index says.
         """
         if self._prepared is not None:
             for blocks in self._prepared.groups(channels):
-                yield from self._prepared_batches(blocks, channels)
+                yield blocks[-1], self._prepared_batches(blocks, channels)
             return
         for block in self.contents.blocks:
-            yield from self.block_batches(block, channels)
+            yield block, self.block_batches(block, channels)
 
-    def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+    def block_batches(self, block: Block, channels: Collection[int]) -> Batches:
         """The messages of one block, one batch per channel that has any."""
         index = block.index
         if index is not None and not any(channel in index for channel in channels):
@@ -138,7 +141,7 @@ class McapFile:
 
     def _prepared_batches(
         self, blocks: Sequence[ListedBlock], channels: Collection[int]
-    ) -> Iterator[tuple[int, Batch]]:
+    ) -> Batches:
         """The messages of blocks that the summary lists, one batch per channel that has any."""
         assert self._prepared is not None
         buffer, offsets, edges = self._prepared.records(blocks, channels)
@@ -168,19 +171,22 @@ class McapFile:
             raise BagError("not an MCAP file")
         at = found.good_bytes = len(MAGIC)
         loose = _LooseRun()
+        repeating = False
         while at + RECORD.size <= self._size:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             content, end = at + RECORD.size, at + RECORD.size + length
             if end > self._size or opcode == 0:
                 what = "runs past the end of the file" if opcode else "is no record"
                 found.ending = f"what starts at byte {at} {what}"
-                following = self._next_chunk(at + 1) if self._salvage else None
+                following = self._next_chunk(at + 1) if self._salvage and not repeating else None
                 if following is None:
                     break
                 found.lost.append(f"bytes {at} to {following}: no records")
                 at = following
                 continue
-            if opcode == Opcode.MESSAGE:
+            if repeating and opcode not in (Opcode.STATISTICS, Opcode.FOOTER):
+                pass  # what is salvaged is not what a summary says
+            elif opcode == Opcode.MESSAGE:
                 if length < MESSAGE_FIXED:
                     raise BagError(f"the message at byte {at} has {length} bytes")
                 header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
@@ -189,14 +195,14 @@ class McapFile:
                 loose.close(found)
                 self._try_note(found, opcode, content, length)
             at = found.good_bytes = end
-            if opcode == Opcode.DATA_END and self._salvage:  # what follows repeats what was said
-                found.ending = None
-                break
+            repeating |= self._salvage and opcode == Opcode.DATA_END
             if opcode == Opcode.FOOTER:
                 if self._read(at, len(MAGIC)) == MAGIC:
                     found.ending = None
                 break
         loose.close(found)
+        if repeating:
+            found.ending = None
         if found.ending is not None and found.blocks:  # its index may be cut off
             last = found.blocks[-1]
             found.blocks[-1] = replace(last, index=None)
@@ -299,7 +305,7 @@ class McapFile:
     def _find_channels(self) -> None:
         """Look into the blocks for channels the rest of the file does not list; count messages."""
         found = self.contents
-        damaged: list[Block] = []
+        damaged: list[Block] = []  # or without a message, so that it has no time
         for block in found.blocks:
             if block.index is not None and all(map(self._is_known, block.index)):
                 counts = {channel: count for channel, (_, count) in block.index.items()}
@@ -312,6 +318,8 @@ class McapFile:
                     found.lost.append(str(error))
                     damaged.append(block)
                     continue
+            if not counts:
+                damaged.append(block)
             for channel_id, count in counts.items():
                 found.counts[channel_id] = found.counts.get(channel_id, 0) + count
         found.blocks = [block for block in found.blocks if block not in damaged]
@@ -341,7 +349,7 @@ class McapFile:
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""
         stated = self.contents.stated
-        if stated is None or self.contents.ending is not None:
+        if stated is None or self.contents.ending is not None or self._salvage:
             return
         for channel, count in stated.items():
             there = self.contents.counts.get(channel, 0)

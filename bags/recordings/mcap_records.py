@@ -22,6 +22,8 @@ from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+CUSTOM_DATA: Final = "custom_data"  # the Metadata record with a bag's own key-value pairs
+ROSBAG2: Final = "rosbag2"  # the Metadata record that names the release of ROS 2
 MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message
 RECORD: Final = struct.Struct("<BQ")
 MESSAGE: Final = np.dtype(
@@ -50,11 +52,16 @@ class Block:
 
     offset: int
     size: int
-    compression: str
-    uncompressed_size: int
-    crc: int
-    start_ns: int
+    compression: str = ""
+    uncompressed_size: int = 0
+    crc: int = 0
+    start_ns: int = 0
     index: dict[int, tuple[int, int]] | None = None
+
+    @property
+    def end(self) -> int:
+        """The byte after it."""
+        return self.offset + self.size
 
 
 @dataclass

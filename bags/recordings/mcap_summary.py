@@ -59,16 +59,11 @@ _INDEX: Final = struct.Struct("<BQHI")  # a message index record before its entr
 class ListedBlock(Block):
     """A chunk as the summary lists it: `index` has (offset, bytes) of its channels' index records.
 
-    record, end: bytes in the file where its record begins, and where its message indexes end.
+    record, last: bytes in the file where its record begins, and where its message indexes end.
     """
 
     record: int = 0
-    end: int = 0
-
-    @property
-    def indexes(self) -> int:
-        """The byte where its message indexes begin."""
-        return self.offset + self.size
+    last: int = 0
 
 
 def summarised(path: RemotePath) -> Contents | None:
@@ -221,7 +216,7 @@ class Prepared:
             self._prepare(list(self._window(self._place[first.offset])))
         if first.compression:
             offsets = self._ready[first.offset]
-            header = self._path.read_range(first.record, first.end)
+            header = self._path.read_range(first.record, first.last)
             crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
             at = first.offset - first.record
             content = uncompressed(replace(first, crc=crc), header[at : at + first.size])
@@ -273,7 +268,7 @@ class Prepared:
         if the index of the last chunk, which tells, would have to be fetched for it.
         """
         last = self._blocks[-1]
-        if last.compression or not self._path.holds(last.indexes, last.end):
+        if last.compression or not self._path.holds(last.end, last.last):
             return 0
         self._ready = {last.offset: self._entries_of(last)}
         _, ends = self._runs_of([last])
@@ -283,11 +278,11 @@ class Prepared:
     def _span(self, block: ListedBlock, ahead: int) -> tuple[int, int]:
         """What is fetched of a block before its indexes are known; with so much of the next."""
         if block.compression:
-            return block.record, block.end
+            return block.record, block.last
         following = self._place[block.offset] + 1
         if following == len(self._blocks) or not self._is_wanted(self._blocks[following]):
-            return block.indexes, block.end
-        return block.indexes, min(block.end + ahead, self._blocks[following].indexes)
+            return block.end, block.last
+        return block.end, min(block.last + ahead, self._blocks[following].end)
 
     def _runs_of(self, blocks: Sequence[ListedBlock]) -> tuple[IntArray, IntArray]:
         """First bytes and ends, in the file, of the wanted messages' records: of runs in a block
@@ -310,10 +305,10 @@ class Prepared:
 
     def _entries_of(self, block: ListedBlock) -> dict[int, IntArray]:
         """Offsets of each channel's messages in the chunk, as its index records have them."""
-        records = self._path.read_range(block.indexes, block.end)
+        records = self._path.read_range(block.end, block.last)
         found = {}
         for channel, (at, length) in (block.index or {}).items():
-            start, where = at - block.indexes, f"the message index at byte {at}"
+            start, where = at - block.end, f"the message index at byte {at}"
             if length < _INDEX.size:
                 raise BagError(f"{where} is damaged")
             opcode, size, of, entries = _INDEX.unpack_from(records, start)

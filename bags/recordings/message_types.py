@@ -1,6 +1,6 @@
 """ROS 2 message types: their fields, their definition text, and the stamp in a serialised message.
 
-Standard types come from the Jazzy release's definitions that rosbags ships, so no ROS is needed.
+Standard types come from the definitions of each release that rosbags ships, so no ROS is needed.
 A bag's own definition is used where it differs: the data were written with it.
 """
 
@@ -25,6 +25,8 @@ from rosbags.typesys.store import Typestore
 from nlsid_core.errors import BagError
 
 HEADER: Final = "std_msgs/msg/Header"
+JAZZY: Final = "ros2_jazzy"
+NOETIC: Final = "ros1_noetic"
 IDL_SEPARATOR: Final = "=" * 80 + "\n"
 ROS1_DIFFERS: Final = (HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 MAX_FIXED_ARRAY: Final = 2**16  # numbers
@@ -38,9 +40,11 @@ _BIG_ENDIAN_STAMP: Final = struct.Struct(">iI")
 
 
 @cache
-def standard_types() -> Typestore:
-    """The message types of ROS 2 Jazzy's common interfaces."""
-    return get_typestore(Stores.ROS2_JAZZY)
+def standard_types(release: str = JAZZY) -> Typestore:
+    """The message types of a release's common interfaces; of Jazzy's if the release is unknown."""
+    if release != JAZZY and release not in {store.value for store in Stores}:
+        return standard_types()
+    return get_typestore(Stores(release))
 
 
 def fields_of(msgtype: str, types: Typestore) -> Mapping[str, FieldDesc]:
@@ -85,9 +89,13 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
 
     Raises BagError if it cannot be used.
     """
-    standard = standard_types().fielddefs
+    standard, noetic = standard_types().fielddefs, standard_types(NOETIC).fielddefs
     with defining(f"'{msgtype}' in the bag"):
-        parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
+        if msgtype in noetic and not embedded.data.strip():
+            parsed = {msgtype: noetic[msgtype]}
+        else:
+            parsed = _parse(msgtype, embedded)
+        parsed = completed(parsed, noetic) | {name: standard[name] for name in ROS1_DIFFERS}
         refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
@@ -137,9 +145,10 @@ def defining(what: str) -> Iterator[None]:
 
 
 def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
+    lines = embedded.data.lstrip("\ufeff").splitlines(keepends=False)
     if embedded.format == MessageDefinitionFormat.MSG:
-        return get_types_from_msg(embedded.data, msgtype)
-    text = embedded.data
+        return get_types_from_msg("\n".join(lines), msgtype)
+    text = "".join(f"{line}\n" for line in lines if not line.lstrip().startswith("#"))
     if not text.startswith(IDL_SEPARATOR + "IDL: "):
         return get_types_from_idl(text)
     types: Typesdict = {}

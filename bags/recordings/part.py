@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import MessageDefinitionFormat
 
 from bags.recordings.definitions import standard_definition
 from bags.recordings.description import FileDescription
+from bags.recordings.mcap_records import CUSTOM_DATA
 from bags.recordings.output import Output, Reserve
 from bags.recordings.quality import KEY, Profile, offered_text
 from bags.recordings.storage import FORMATS, Channel
@@ -17,8 +20,6 @@ from nlsid_core.errors import BagError
 
 PROFILE: Final = "ros2"
 LIBRARY: Final = "nlsid"
-CUSTOM_DATA: Final = "custom_data"  # the MCAP Metadata record with the bag's own key-value pairs
-TYPE_HASH: Final = "topic_type_hash"  # of a channel's metadata, as rosbag2 writes it
 SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
 CHUNK_BYTES: Final = 2**20
 COMPRESSIONS: Final = {
@@ -30,22 +31,28 @@ COMPRESSIONS: Final = {
 
 @dataclass(frozen=True)
 class Topic:
-    """How a topic's messages are written; schema: its encoding and text. offered: see `quality`."""
+    """How a topic's messages are written; schema: its encoding and data. offered: see `quality`."""
 
     name: str
     msgtype: str
     encoding: str
-    schema: tuple[str, str]
+    schema: tuple[str, bytes]
     metadata: Mapping[str, str]
     offered: tuple[Profile, ...] = ()
 
 
 def topic_like(channel: Channel) -> Topic:
     """A topic to which another bag's messages are copied as they are."""
-    schema = SCHEMA_ENCODINGS.get(channel.definition.format, ""), channel.definition.data
-    if not channel.definition.data and channel.encoding == "cdr":
+    definition = channel.definition
+    if definition.format != MessageDefinitionFormat.NONE:
+        encoding = "ros1msg" if channel.encoding == "ros1" else SCHEMA_ENCODINGS[definition.format]
+        schema = encoding, definition.data.encode()
+    else:
+        encoding, _, data = definition.data.partition("\n")
+        schema = encoding, data.encode("latin-1")
+    if schema == ("", b"") and channel.encoding == "cdr":
         with suppress(BagError):  # not a standard type either: copied without its definition
-            schema = "ros2msg", standard_definition(channel.msgtype).text
+            schema = "ros2msg", standard_definition(channel.msgtype).text.encode()
     return Topic(
         channel.topic,
         channel.msgtype,
@@ -71,8 +78,8 @@ class Part:
         self.counts: dict[str, int] = {}
         self.first_ns: int | None = None
         self.last_ns = 0
-        self._schemas: dict[tuple[str, tuple[str, str]], int] = {}
-        self._channels: dict[str, int] = {}
+        self._schemas: dict[tuple[str, tuple[str, bytes]], int] = {}
+        self._channels: list[tuple[str, int]] = []  # topic, number in the file
         self._output = Output(path, reserve)
         # Any: half of mcap's writer is not annotated
         self._mcap: Any = Writer(
@@ -98,32 +105,40 @@ class Part:
         return self._output.closed
 
     def add_topic(self, topic: Topic) -> None:
-        """Announce a topic."""
+        """Announce a topic; the first one is number 0 for `write`."""
         key = (topic.msgtype, topic.schema)
         if key not in self._schemas:
-            encoding, text = topic.schema
-            self._schemas[key] = self._mcap.register_schema(topic.msgtype, encoding, text.encode())
-        self._channels[topic.name] = self._mcap.register_channel(
+            self._schemas[key] = self._mcap.register_schema(topic.msgtype, *topic.schema)
+        channel = self._mcap.register_channel(
             topic.name,
             topic.encoding,
             self._schemas[key],
             {**topic.metadata, KEY: offered_text(topic.offered)},
         )
-        self.counts[topic.name] = 0
+        self._channels.append((topic.name, channel))
+        self.counts.setdefault(topic.name, 0)
 
     def annotate(self, custom: Mapping[str, str]) -> None:
         """Add key-value pairs of the bag's own."""
         if custom:
-            self._mcap.add_metadata(CUSTOM_DATA, dict(custom))
+            self.keep(Metadata(CUSTOM_DATA, dict(custom)))
+
+    def keep(self, record: Metadata | Attachment) -> None:
+        """Add what is no message."""
+        if isinstance(record, Metadata):
+            self._mcap.add_metadata(record.name, record.metadata)
+        else:
+            self._mcap.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
 
     def write(
-        self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int
+        self, topic: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int
     ) -> None:
-        """Append a message of a topic that was announced."""
-        self._mcap.add_message(
-            self._channels[topic], log_time_ns, data, publish_time_ns, sequence=sequence
-        )
-        self.counts[topic] += 1
+        """Append a message of a topic, by its number."""
+        name, channel = self._channels[topic]
+        self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence=sequence)
+        self.counts[name] += 1
         if self.first_ns is None or log_time_ns < self.first_ns:
             self.first_ns = log_time_ns
         if log_time_ns > self.last_ns:

@@ -14,8 +14,9 @@ from bags.recordings.description import (
     TopicDescription,
     write_metadata,
 )
-from bags.recordings.part import CUSTOM_DATA, TYPE_HASH, Part, topic_like
-from bags.recordings.storage import McapStorage
+from bags.recordings.part import Part, topic_like
+from bags.recordings.sqlite_file import TYPE_HASH
+from bags.recordings.storage import Storage
 from bags.recordings.writer import RESERVE
 from nlsid_core.errors import BagError
 
@@ -43,7 +44,7 @@ def repair(bag: Path) -> int:
     scratch = Path(tempfile.mkdtemp(dir=bag.parent, prefix=f".{bag.name}.repair."))
     try:
         for file in _files(bag):
-            storage = McapStorage([file], CUSTOM_DATA, salvage=True)
+            storage = Storage([file], salvage=True)
             try:
                 finished = _finished(file)
                 files.append(finished or _rewritten(storage, scratch / file.name))
@@ -82,17 +83,14 @@ def _finished(file: Path) -> FileDescription | None:
     return FileDescription(file.name, counts, first_ns, there.message_end_time)
 
 
-def _rewritten(storage: McapStorage, target: Path) -> FileDescription:
+def _rewritten(storage: Storage, target: Path) -> FileDescription:
     """A finished copy of the messages that are there."""
     part = Part(target)
     part.annotate(storage.custom)
     for channel in storage.channels:
-        if channel.topic not in part.counts:
-            part.add_topic(topic_like(channel))
-    for message in storage.messages(range(len(storage.channels))):
-        topic = storage.channels[message.key].topic
-        count = part.counts[topic]
-        part.write(topic, message.data, message.log_ns, message.publish_ns, count)
+        part.add_topic(topic_like(channel))
+    for raw in storage.messages(range(len(storage.channels)), nearly=True):
+        part.write(raw.key, raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
     part.finish()
     return part.description
 

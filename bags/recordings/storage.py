@@ -1,41 +1,56 @@
-"""Where a bag's messages are: MCAP files read block by block, anything else through rosbags."""
+"""Where a bag's messages are: MCAP, SQLite and ROS 1 files, as one recording.
+
+What a file is, its first bytes say, not its name. Whatever it is, its messages leave here in CDR:
+those of ROS 1 are translated, those that rosbag2 compressed one by one are unpacked.
+"""
 
 import heapq
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO, Final, NamedTuple
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader as Ros2Reader
+import numpy as np
+import zstandard
+from mcap.records import Attachment, Metadata
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
-from bags.recordings.batch import Batch, BatchBuilder
+from bags.recordings.batch import Batch, joined
 from bags.recordings.definitions import Definition
-from bags.recordings.mcap_file import McapFile
-from bags.recordings.mcap_records import Block
-from bags.recordings.message_types import ros2_definition, types_in_bag
-from bags.recordings.quality import KEY, LATCHED, Profile, offered, profile_of
+from bags.recordings.mcap_file import Batches, McapFile
+from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, ROSBAG2, Block
+from bags.recordings.message_types import JAZZY, ros2_definition, standard_types, types_in_bag
+from bags.recordings.quality import KEY, Profile, offered
+from bags.recordings.remote import RemotePath
+from bags.recordings.ros1_file import ROS1_MAGIC, Ros1File
+from bags.recordings.sqlite_file import SqliteFile
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 FORMATS: Final = {
+    "ros1msg": MessageDefinitionFormat.MSG,
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
 }
+SQLITE_MAGIC: Final = b"SQLite format 3\0"
+ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_OVERLAP_BYTES: Final = 256 * 2**20  # chunks that overlap in time are sorted in memory
+MOST_PADDING: Final = 3  # bytes that rosserial leaves after a message
+NEVER: Final = 2**63 - 1  # ns: after every message
+
+DataFile = McapFile | SqliteFile | Ros1File
 
 
 @dataclass(frozen=True)
 class Channel:
     """One recorded stream of messages; a topic has one, or several if it was recorded in parts.
 
-    key: its place in `Storage.channels`. count: messages it has. metadata: the recorder's own.
+    key: its place in `Storage.channels`. definition: of the type, see `_definition`. count:
+    messages it has. metadata: the recorder's own.
     offered: what its publishers offered, as far as the file says so.
     """
 
@@ -49,241 +64,365 @@ class Channel:
     offered: tuple[Profile, ...] = ()
 
 
-@dataclass(frozen=True)
-class Raw:
-    """One message: the key of its channel, times in ns, its data."""
+class Raw(NamedTuple):
+    """One message: times in ns, where it is recorded, the key of its channel, its data.
 
-    key: int
+    place: number of the file, of the block in it, of the byte or message in that. error: why there
+    are no data; empty otherwise.
+    """
+
     log_ns: int
+    place: tuple[int, int, int]
+    key: int
     publish_ns: int
+    sequence: int
     data: bytes
+    error: str = ""
 
 
-# log time (ns), file, block, place in it, channel's key, publish time (ns), data: in this order
-Entry: TypeAlias = tuple[int, int, int, int, int, int, bytes]
-
-
-def _raw(entry: Entry) -> Raw:
-    log_ns, *_, key, publish_ns, data = entry
-    return Raw(key, log_ns, publish_ns, data)
-
-
-def defined(channel: Channel, definitions: Mapping[str, Definition]) -> Channel:
-    """The channel, with the given definition of its type where its file has none."""
-    given = definitions.get(channel.msgtype)
-    if given is None or channel.definition.format != MessageDefinitionFormat.NONE:
+def defined(channel: Channel, given: Mapping[str, Definition], release: str) -> Channel:
+    """The channel, with a definition where its file has none: the given one, or the release's."""
+    if channel.definition.format != MessageDefinitionFormat.NONE:
         return channel
-    return replace(channel, definition=MessageDefinition(MessageDefinitionFormat.MSG, given.text))
+    if channel.msgtype in given:
+        text = given[channel.msgtype].text
+    elif f"ros2_{release}" == JAZZY or channel.encoding != "cdr":
+        return channel
+    else:
+        text = _text_of(channel.msgtype, f"ros2_{release}")
+    if not text:
+        return channel
+    return replace(channel, definition=MessageDefinition(MessageDefinitionFormat.MSG, text))
 
 
-class Storage(Protocol):
-    """An open bag's messages."""
-
-    channels: list[Channel]
-    custom: dict[str, str]
-    ending: str | None
-
-    @property
-    def start_ns(self) -> int:
-        """The first log time; 0 if there are no messages."""
-
-    def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
-        """(channel key, messages), in the order of the files."""
-
-    def messages(self, keys: Collection[int]) -> Iterator[Raw]:
-        """The messages by log time; equal log times as recorded."""
-
-    def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
-        """The messages in the order of the files, where the storage tells it; else by log time."""
-
-    def close(self) -> None:
-        """Close the files."""
+@cache
+def _text_of(msgtype: str, release: str) -> str:
+    types = standard_types(release)
+    return types.generate_msgdef(msgtype, ros_version=2)[0] if msgtype in types.fielddefs else ""
 
 
-class McapStorage:
-    """MCAP files, the parts of one recording. Memory: one chunk, or the chunks that overlap."""
+class Storage:
+    """The files of one recording, by their first log times. Memory: one chunk, or those that
+    overlap in time.
 
-    def __init__(self, files: Sequence[Path], custom_record: str, *, salvage: bool = False) -> None:
+    strands: for each channel, which of its
+    topic's channels in its file it is: those of one recording are counted on from file to file.
+    """
+
+    def __init__(self, paths: Sequence[Path], *, salvage: bool = False) -> None:
         self.channels: list[Channel] = []
+        self.strands: list[int] = []
         self.custom: dict[str, str] = {}
-        self.files: list[McapFile] = []
-        self.ending: str | None = None
+        self.records: list[Metadata] = []
+        self._refused: list[str] = []
+        self.files: list[DataFile] = []
         self._keys: list[dict[int, int]] = []
+        self._unpacked: list[TemporaryDirectory[str]] = []
+        self._translated: dict[int, Callable[[bytes], bytes]] = {}
         try:
-            for path in files:
-                with reading(path):
-                    self._add(McapFile(path, salvage=salvage), custom_record)
+            for path in paths:
+                self._open(path, salvage=salvage)
+            self.files.sort(key=_first_ns)
+            for file in self.files:
+                with reading(file.path):
+                    self._add(file)
         except BaseException:
             self.close()
             raise
 
-    def _add(self, file: McapFile, custom_record: str) -> None:
-        self.files.append(file)
-        found = file.contents
-        if found.ending is not None:
-            self.ending = f"{file.path}: {found.ending}"
-        for record in found.metadata:
-            if record.name == custom_record:
-                self.custom.update(record.metadata)
-        keys = {}
-        for channel_id, channel in found.channels.items():
-            schema = found.schemas.get(channel.schema_id)
-            if schema is None and channel.schema_id:
-                raise BagError(f"channel {channel_id} has schema {channel.schema_id}, not declared")
-            keys[channel_id] = len(self.channels)
-            self.channels.append(
-                Channel(
-                    key=keys[channel_id],
-                    topic=channel.topic,
-                    msgtype=_type_name(schema.name if schema else ""),
-                    encoding=channel.message_encoding,
-                    definition=_definition(schema),
-                    count=found.counts.get(channel_id, 0),
-                    metadata=channel.metadata,
-                    offered=offered(channel.metadata.get(KEY, "")),
+    def _open(self, path: Path, *, salvage: bool) -> None:
+        try:
+            with reading(path):
+                file = self._opened(path, salvage=salvage)
+                file.path = path  # also of one that is unpacked elsewhere
+                self.files.append(file)
+        except BagError as error:
+            if not salvage:
+                raise
+            self._refused.append(str(error))
+
+    def _opened(self, path: Path, *, salvage: bool) -> DataFile:
+        if isinstance(path, RemotePath):
+            if path.suffix in (".db3", ".bag", ".zstd"):
+                raise BagError(
+                    "only MCAP is read from where it lies, and not if it is compressed whole; copy "
+                    "this bag to this machine"
                 )
+            return McapFile(path, salvage=salvage)
+        with path.open("rb") as stream:
+            start = stream.read(len(SQLITE_MAGIC))
+            if start.startswith(ZSTD_MAGIC):
+                stream.seek(0)
+                return self._opened(self._unzipped(path, stream, salvage=salvage), salvage=salvage)
+        if start.startswith(SQLITE_MAGIC):
+            return SqliteFile(path, salvage=salvage)
+        if start.startswith(ROS1_MAGIC):
+            return Ros1File(path, salvage=salvage)
+        if start.startswith(MAGIC):
+            return McapFile(path, salvage=salvage)
+        what = f"starts with {start[:8].hex(' ')}" if start else "is empty"
+        raise BagError(f"{path} is not an MCAP, SQLite or ROS 1 file: it {what}")
+
+    def _unzipped(self, path: Path, stream: BinaryIO, *, salvage: bool) -> Path:
+        """A file that was compressed whole, unpacked for as long as this is open."""
+        folder = TemporaryDirectory()
+        self._unpacked.append(folder)
+        target = Path(folder.name) / path.name.removesuffix(".zstd")
+        left = shutil.disk_usage(folder.name).free // 2
+        with target.open("wb") as unpacked:
+            try:
+                for part in zstandard.ZstdDecompressor().read_to_iter(stream):
+                    left -= unpacked.write(part)
+                    if left < 0:
+                        raise BagError("unpacked it fills more than half of the free disk")
+            except zstandard.ZstdError as error:
+                if not salvage:
+                    raise
+                self._refused.append(f"{path.name}: {error}")
+        return target
+
+    def _add(self, file: DataFile) -> None:
+        found = file.contents
+        for record in found.metadata:
+            if record.name == CUSTOM_DATA:
+                self.custom.update(record.metadata)
+            elif record not in self.records:
+                self.records.append(record)
+        keys: dict[int, int] = {}
+        strands: dict[str, int] = {}
+        for number, recorded in found.channels.items():
+            schema = found.schemas.get(recorded.schema_id)
+            if schema is None and recorded.schema_id:
+                raise BagError(f"channel {number} has schema {recorded.schema_id}, not declared")
+            keys[number] = len(self.channels)
+            strand = strands[recorded.topic] = strands.get(recorded.topic, -1) + 1
+            self.strands.append(strand)
+            channel = Channel(
+                key=keys[number],
+                topic=recorded.topic,
+                msgtype=_type_name(schema.name if schema else ""),
+                encoding=recorded.message_encoding,
+                definition=_definition(schema),
+                count=found.counts.get(number, 0),
+                metadata=recorded.metadata,
+                offered=offered(recorded.metadata.get(KEY, "")),
             )
+            self.channels.append(self._in_cdr(channel))
         self._keys.append(keys)
+
+    def _in_cdr(self, channel: Channel) -> Channel:
+        """A channel of ROS 1 as one of ROS 2; as it is if its type cannot be translated."""
+        if channel.encoding != "ros1":
+            return channel
+        try:
+            definition = ros2_definition(channel.msgtype, channel.definition)
+            types = types_in_bag(channel.msgtype, definition)
+        except BagError:
+            return channel
+
+        def translate(data: bytes) -> bytes:
+            for padding in range(MOST_PADDING + 1):
+                try:
+                    there = data[: len(data) - padding]
+                    return bytes(types.ros1_to_cdr(there, channel.msgtype))
+                except Exception as error:  # generated code raises what the bytes make it raise
+                    reason = f"{type(error).__name__}: {str(error)[:200]}"
+            raise BagError(f"not a '{channel.msgtype}' of ROS 1: {reason}")
+
+        self._translated[channel.key] = translate
+        return replace(channel, encoding="cdr", definition=definition)
+
+    @property
+    def ending(self) -> str | None:
+        """Why the recording stops early; None if all files are finished."""
+        ends = [f"{f.path}: {f.contents.ending}" for f in self.files if f.contents.ending]
+        return ends[-1] if ends else None
+
+    @property
+    def lost(self) -> list[str]:
+        """Of what cannot be read, with `salvage=True`, why, as far as it was found by now."""
+        found = [*self._refused]
+        for file in self.files:
+            contents = file.contents
+            found += [f"{file.path.name}: {what}" for what in contents.lost]
+            if contents.ending is not None:
+                rest = file.path.stat().st_size - contents.good_bytes
+                cut = f"; the last {rest} bytes hold no whole chunk" if rest > 0 else ""
+                found.append(f"{file.path.name}: {contents.ending}{cut}")
+        return found
+
+    @property
+    def release(self) -> str:
+        """The release of ROS 2 that the files name; empty if they name none."""
+        named = [r.metadata.get("ROS_DISTRO", "") for r in self.records if r.name == ROSBAG2]
+        return next(filter(None, named), "")
 
     @property
     def start_ns(self) -> int:
-        """The first log time, as the chunks state it; 0 if there are no messages."""
-        return min((b.start_ns for file in self.files for b in file.contents.blocks), default=0)
+        """The first log time; 0 if there are no messages."""
+        first = min(map(_first_ns, self.files), default=NEVER)
+        return 0 if first == NEVER else first
 
-    def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
-        """(channel key, messages), in the order of the files."""
-        for file, known in zip(self.files, self._keys, strict=True):
-            wanted = {channel: key for channel, key in known.items() if key in keys}
+    @property
+    def stated(self) -> dict[str, int] | None:
+        """Topic -> messages, as the files' statistics and indexes say; None if one says nothing."""
+        found: dict[str, int] = {}
+        for file, keys in zip(self.files, self._keys, strict=True):
+            if file.contents.stated is None:
+                return None
+            for number, count in file.contents.stated.items():
+                if number in keys:
+                    topic = self.channels[keys[number]].topic
+                    found[topic] = found.get(topic, 0) + count
+        return found
+
+    def attachments(self) -> Iterator[Attachment]:
+        """The attachments of MCAP files, with their data."""
+        for file in self.files:
+            if isinstance(file, McapFile):
+                for found in file.contents.attachments:
+                    yield replace(found, data=file.attachment_data(found))
+
+    def parts(self, keys: Collection[int]) -> Iterator[tuple[int, Batch, int]]:
+        """(channel key, messages, ns), in the order of the files.
+
+        ns: no part from here on has a message with an earlier log time, as the chunks state them.
+        """
+        later: dict[tuple[int, int], int] = {}
+        earliest = NEVER
+        for n in reversed(range(len(self.files))):
+            for block in reversed(self.files[n].contents.blocks):
+                later[n, block.offset] = earliest
+                earliest = min(earliest, block.start_ns)
+        for n, file in enumerate(self.files):
+            wanted = {number: key for number, key in self._keys[n].items() if key in keys}
             with reading(file.path):
-                for channel, batch in file.batches(wanted):
-                    yield wanted[channel], batch
+                for block, batches in _runs(file, wanted):
+                    for number, batch in batches:
+                        yield wanted[number], self._plain(wanted[number], batch), earliest
+                    earliest = later[n, block.offset]
 
     def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages in the order of the files."""
         for n, file in enumerate(self.files):
-            for i, block in enumerate(file.contents.blocks):
-                for entry in sorted(self._entries(n, i, block, keys), key=lambda entry: entry[3]):
-                    yield _raw(entry)
+            for i in range(len(file.contents.blocks)):
+                yield from sorted(self._raws(n, i, keys), key=lambda raw: raw.place)
 
-    def messages(self, keys: Collection[int]) -> Iterator[Raw]:
+    def messages(self, keys: Collection[int], *, nearly: bool = False) -> Iterator[Raw]:
         """The messages by log time; equal log times as recorded.
 
-        Raises BagError if so many chunks overlap in time that sorting needs MAX_OVERLAP_BYTES.
+        Raises BagError if so many chunks overlap in time that sorting needs MAX_OVERLAP_BYTES;
+        with `nearly` they are sorted as far as that goes.
         """
-        parts: list[tuple[int, int, int, Block]] = []
-        for n, file in enumerate(self.files):
-            parts += [(b.start_ns, n, i, b) for i, b in enumerate(file.contents.blocks)]
-        parts.sort(key=lambda part: part[:3])
-        waiting: list[Entry] = []
+        order = sorted(
+            (block.start_ns, n, i)
+            for n, file in enumerate(self.files)
+            for i, block in enumerate(file.contents.blocks)
+        )
+        waiting: list[Raw] = []
         held = 0
-        for start_ns, n, i, block in parts:
-            while waiting and waiting[0][0] < start_ns:
-                entry = heapq.heappop(waiting)
-                held -= len(entry[-1])
-                yield _raw(entry)
-            for entry in self._entries(n, i, block, keys):
-                heapq.heappush(waiting, entry)
-                held += len(entry[-1])
-            if held > MAX_OVERLAP_BYTES:
+        for start_ns, n, i in order:
+            while waiting and (waiting[0].log_ns < start_ns or held > MAX_OVERLAP_BYTES):
+                raw = heapq.heappop(waiting)
+                held -= len(raw.data)
+                yield raw
+            for raw in self._raws(n, i, keys):
+                heapq.heappush(waiting, raw)
+                held += len(raw.data)
+            if held > MAX_OVERLAP_BYTES and not nearly:
                 raise BagError(
                     f"{self.files[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes overlap "
                     "in time; sort the file first (`mcap sort`)"
                 )
         while waiting:
-            yield _raw(heapq.heappop(waiting))
+            yield heapq.heappop(waiting)
 
-    def _entries(self, n: int, i: int, block: Block, keys: Collection[int]) -> Iterator[Entry]:
-        file, known = self.files[n], self._keys[n]
-        wanted = {channel: key for channel, key in known.items() if key in keys}
+    def _raws(self, n: int, i: int, keys: Collection[int]) -> Iterator[Raw]:
+        file = self.files[n]
+        wanted = {number: key for number, key in self._keys[n].items() if key in keys}
         with reading(file.path):
-            for channel, batch in file.block_batches(block, wanted):
-                for k in range(len(batch)):
-                    times = int(batch.log_ns[k]), int(batch.publish_ns[k])
-                    at = int(batch.start[k])
-                    yield times[0], n, i, at, wanted[channel], times[1], batch.data(k)
+            for number, batch in file.block_batches(file.contents.blocks[i], wanted):
+                plain = self._plain(wanted[number], batch)
+                columns = (batch.log_ns, batch.start, batch.publish_ns, batch.sequence)
+                rows = zip(*(column.tolist() for column in columns), strict=True)
+                for k, (log_ns, at, publish_ns, sequence) in enumerate(rows):
+                    error = plain.unreadable.get(k, "")
+                    data = b"" if error else plain.data(k)
+                    place = n, i, at
+                    yield Raw(log_ns, place, wanted[number], publish_ns, sequence, data, error)
+
+    def _plain(self, key: int, batch: Batch) -> Batch:
+        """The messages in CDR."""
+        translate = self._translated.get(key)
+        if translate is None:
+            if self.channels[key].encoding != "cdr" or not _packed(batch).any():
+                return batch
+            translate = _unpacked
+        parts: list[bytes] = []
+        unreadable: dict[int, str] = {}
+        for i in range(len(batch)):
+            data = batch.data(i)
+            try:
+                parts.append(translate(data))
+            except BagError as error:
+                parts.append(data)
+                unreadable[i] = str(error)
+        found = joined(parts, batch.log_ns)
+        return replace(
+            found,
+            publish_ns=batch.publish_ns,
+            sequence=batch.sequence,
+            unreadable=unreadable,
+        )
 
     def close(self) -> None:
         """Close the files."""
         for file in self.files:
             file.close()
+        for folder in self._unpacked:
+            folder.cleanup()
 
 
-class RosbagsStorage:
-    """A bag that rosbags reads: sqlite3, compressed whole, ROS 1.
+def _runs(file: DataFile, channels: Collection[int]) -> Iterator[tuple[Block, Batches]]:
+    """(last block, messages by channel), of blocks that are read together."""
+    if isinstance(file, McapFile):
+        yield from file.runs(channels)
+        return
+    for block in file.contents.blocks:
+        yield block, file.block_batches(block, channels)
 
-    Each file is opened by itself: given the folder, rosbags leaves out topics whose quality of
-    service reads otherwise in metadata.yaml than in the file.
-    """
 
-    ending: str | None = None
+def _packed(batch: Batch) -> Any:
+    """Which messages begin as a zstd frame does, and as no CDR message."""
+    words = len(batch.buffer) - len(ZSTD_MAGIC) + 1
+    if words <= 0:
+        return np.zeros(len(batch), bool)
+    starts = np.ndarray((words,), "<u4", batch.buffer, strides=(1,))
+    magic = int.from_bytes(ZSTD_MAGIC, "little")
+    there: IntArray = np.minimum(batch.start, words - 1)
+    return (starts[there] == magic) & (batch.size >= len(ZSTD_MAGIC))
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self.channels: list[Channel] = []
-        self.custom: dict[str, str] = {}
-        self._readers: list[tuple[Path, Any, list[Connection]]] = []
-        for path in paths:
-            with reading(path):
-                ros1 = path.suffix == ".bag"
-                reader: Any = Ros1Reader(path) if ros1 else Ros2Reader(path)
-                reader.open()
-                connections = list(reader.connections)
-            self._readers.append((path, reader, connections))
-            for connection in connections:
-                self.channels.append(_channel(len(self.channels), connection, ros1=ros1))
 
-    @property
-    def start_ns(self) -> int:
-        """The first log time; 0 if there are no messages."""
-        starts = [reader.start_time for _, reader, _ in self._readers if reader.message_count]
-        return int(min(starts, default=0))
+def _unpacked(data: bytes) -> bytes:
+    """A message that may be a zstd frame, as rosbag2 makes one of each."""
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    try:
+        if not 0 <= zstandard.frame_content_size(data) <= MAX_CHUNK_BYTES:
+            raise BagError("a message in a zstd frame without a size, or with a huge one")
+        return zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError as error:
+        raise BagError(f"a message cannot be unpacked: {error}") from error
 
-    def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
-        """(channel key, messages), in the order of log time."""
-        builders = {key: BatchBuilder() for key in keys}
-        for message in self.messages(keys):
-            builder = builders[message.key]
-            builder.add(message.data, message.log_ns)
-            if builder.full:
-                yield from ((message.key, batch) for batch in builder.take())
-        for key, builder in builders.items():
-            yield from ((key, batch) for batch in builder.take())
 
-    def messages(self, keys: Collection[int]) -> Iterator[Raw]:
-        """The messages by log time; equal log times as recorded."""
-        first, streams = 0, []
-        for path, reader, connections in self._readers:
-            wanted = [c for key, c in enumerate(connections, first) if key in keys]
-            if wanted:
-                place = {id(c): key for key, c in enumerate(connections, first)}
-                streams.append(self._read(path, reader, wanted, place))
-            first += len(connections)
-        return heapq.merge(*streams, key=lambda raw: raw.log_ns)
-
-    recorded = messages  # rosbags tells no other order
-
-    def _read(
-        self, path: Path, reader: Any, wanted: Sequence[Connection], place: Mapping[int, int]
-    ) -> Iterator[Raw]:
-        with reading(path):
-            for connection, log_ns, data in reader.messages(wanted):
-                if not 0 <= log_ns < 2**63:
-                    raise BagError(f"a message on {connection.topic} has log time {log_ns} ns")
-                channel = self.channels[place[id(connection)]]
-                if path.suffix == ".bag" and channel.encoding == "cdr":
-                    types = types_in_bag(channel.msgtype, channel.definition)
-                    data = types.ros1_to_cdr(data, channel.msgtype)
-                yield Raw(channel.key, log_ns, log_ns, bytes(data))
-
-    def close(self) -> None:
-        """Close the files."""
-        for _, reader, _ in self._readers:
-            reader.close()
-        self._readers = []
+def _first_ns(file: DataFile) -> int:
+    """The first log time, as the blocks state it; NEVER without messages."""
+    return min((block.start_ns for block in file.contents.blocks), default=NEVER)
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what rosbags and mcap raise on damaged input into a BagError that names the bag.
+    """Turn what mcap, SQLite and others raise on damaged input into a BagError that names the bag.
 
     They raise nearly anything there (struct.error, KeyError, TypeError, decompression errors), so
     every Exception is caught, but only around calls into them.
@@ -302,34 +441,13 @@ def reading(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _channel(key: int, connection: Connection, *, ros1: bool) -> Channel:
-    encoding, definition = "cdr", connection.msgdef
-    profiles: tuple[Profile, ...] = ()
-    if isinstance(connection.ext, ConnectionExtRosbag2):
-        encoding = connection.ext.serialization_format
-        profiles = tuple(profile_of(found) for found in connection.ext.offered_qos_profiles)
-    elif connection.ext.latching:
-        profiles = (LATCHED,)
-    if ros1:
-        try:
-            definition = ros2_definition(connection.msgtype, definition)
-        except BagError:
-            encoding = "ros1"  # of a type that cannot be translated; the others can be read
-    msgtype = _type_name(connection.msgtype)
-    return Channel(
-        key,
-        connection.topic,
-        msgtype,
-        encoding,
-        definition,
-        connection.msgcount,
-        offered=profiles,
-    )
-
-
 def _definition(schema: Any) -> MessageDefinition:
-    if schema is None or schema.encoding not in FORMATS:
+    """What a schema says; of one that is not read, its encoding in a line, and its bytes."""
+    if schema is None or not (schema.encoding or schema.data):
         return MessageDefinition(MessageDefinitionFormat.NONE, "")
+    if schema.encoding not in FORMATS:
+        content = f"{schema.encoding}\n{schema.data.decode('latin-1')}"
+        return MessageDefinition(MessageDefinitionFormat.NONE, content)
     return MessageDefinition(FORMATS[schema.encoding], schema.data.decode("utf-8", "replace"))
 
 

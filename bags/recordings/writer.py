@@ -4,18 +4,19 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Final
 
+from mcap.records import Attachment, Metadata
+
 from bags.recordings.definitions import Definition, standard_definition
 from bags.recordings.description import TopicDescription, write_metadata
-from bags.recordings.message_types import are_same, types_in_bag
 from bags.recordings.output import Reserve
-from bags.recordings.part import TYPE_HASH, Part, Topic, topic_like
+from bags.recordings.part import Part, Topic, topic_like
 from bags.recordings.quality import Profile
-from bags.recordings.storage import Channel
+from bags.recordings.sqlite_file import TYPE_HASH
+from bags.recordings.storage import Channel, Raw
 from nlsid_core.errors import BagError
 
 RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
@@ -53,8 +54,9 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self.counts: dict[str, int] = {}
-        self._topics: dict[str, Topic] = {}
-        self._like: dict[str, Channel] = {}
+        self._topics: list[Topic] = []
+        self._numbers: dict[str, int] = {}  # topic -> its place in `_topics`, of those not copied
+        self._copies: dict[tuple[object, ...], int] = {}
         self._custom = dict(custom or {})
         self._max_chunk_age = max_chunk_age
         self._chunk_opened: float | None = None
@@ -97,7 +99,7 @@ class BagWriter:
         )
         self._parts.append(part)
         part.annotate(self._custom)
-        for topic in self._topics.values():
+        for topic in self._topics:
             part.add_topic(topic)
         part.close_chunk()
 
@@ -107,48 +109,45 @@ class BagWriter:
         msgtype: str,
         *,
         definition: Definition | None = None,
-        like: Channel | None = None,
         offered: tuple[Profile, ...] = (),
     ) -> None:
         """Announce a topic, so that the bag lists it even if no message comes.
 
-        `definition`: what defines its type, `like`: the channel of another bag that it is a copy
-        of, with its own definition; without either the type is a standard one. `offered`: the
-        quality of service of its publishers, if it is no copy. Raises BagError for
-        a type that is not known and for a second type on one topic.
+        `definition`: what defines its type; without it the type is a standard one. `offered`: the
+        quality of service of its publishers. Raises BagError for a type that is not known and for a
+        second type on one topic.
         """
-        if topic in self._topics:
-            known = self._topics[topic].msgtype
+        if topic in self._numbers:
+            known = self._topics[self._numbers[topic]].msgtype
             if known != msgtype:
                 raise BagError(
                     f"{self.path}: {topic} holds '{known}', not '{msgtype}'; a topic has one type"
                 )
-            if like is not None and self._like.setdefault(topic, like) is not like:
-                self._refuse_another(self._like[topic], like)
             return
-        if like is None:
-            defined = definition or standard_definition(msgtype)
-            metadata = {TYPE_HASH: defined.type_hash}
-            schema = ("ros2msg", defined.text)
-            added = Topic(topic, msgtype, "cdr", schema, metadata, offered)
-        else:
-            added = replace(topic_like(like), name=topic)
-            self._like[topic] = like
-        self._parts[-1].add_topic(added)
-        self._topics[topic] = added
-        self.counts[topic] = 0
+        defined = definition or standard_definition(msgtype)
+        metadata = {TYPE_HASH: defined.type_hash}
+        schema = ("ros2msg", defined.text.encode())
+        self._numbers[topic] = self._add(Topic(topic, msgtype, "cdr", schema, metadata, offered))
 
-    def _refuse_another(self, first: Channel, second: Channel) -> None:
-        """BagError if two channels copied to one topic were written with different definitions."""
-        if first.encoding == second.encoding and (
-            first.definition == second.definition
-            or are_same(*(types_in_bag(c.msgtype, c.definition) for c in (first, second)))
-        ):
-            return
-        raise BagError(
-            f"{self.path}: {first.topic} comes with two definitions of '{first.msgtype}'; keep "
-            "them in two bags"
-        )
+    def add_copy(self, channel: Channel, strand: object = 0) -> int:
+        """Announce the topic of a channel of another bag; its number for `copy`.
+
+        What is copied from channels of one `strand`, topic and definition is one channel again.
+        """
+        key = (strand, channel.topic, channel.msgtype, channel.encoding, channel.definition)
+        if key not in self._copies:
+            self._copies[key] = self._add(topic_like(channel))
+        return self._copies[key]
+
+    def _add(self, topic: Topic) -> int:
+        self._parts[-1].add_topic(topic)
+        self._topics.append(topic)
+        self.counts.setdefault(topic.name, 0)
+        return len(self._topics) - 1
+
+    def keep(self, record: Metadata | Attachment) -> None:
+        """Copy what is no message of another bag."""
+        self._parts[-1].keep(record)
 
     def write(
         self,
@@ -168,16 +167,22 @@ class BagWriter:
         if not (0 <= log_time_ns < 2**63 and 0 <= publish_time_ns < 2**63):
             raise BagError(f"{self.path}: {topic}: times {log_time_ns}, {publish_time_ns} ns")
         self.add_topic(topic, msgtype)
+        number = self._numbers[topic]
+        count = self.counts[topic] if sequence is None else sequence
+        self._write(number, data, log_time_ns, publish_time_ns, count)
+
+    def copy(self, number: int, raw: Raw) -> None:
+        """Append a message of another bag, as it is, to what `add_copy` announced."""
+        self._write(number, raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
+
+    def _write(self, number: int, data: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
         part = self._parts[-1]
-        if self._is_full(part, log_time_ns):
+        if self._is_full(part, log_ns):
             self._open_part()
             part.finish()
             part, self._chunk_opened = self._parts[-1], None
-        count = self.counts[topic]
-        part.write(
-            topic, data, log_time_ns, publish_time_ns, count if sequence is None else sequence
-        )
-        self.counts[topic] = count + 1
+        part.write(number, data, log_ns, publish_ns, sequence)
+        self.counts[self._topics[number].name] += 1
         if self._max_chunk_age is not None:
             now = time.monotonic()
             if self._chunk_opened is None:
@@ -216,12 +221,10 @@ class BagWriter:
             for part in self._parts:
                 if not part.closed:
                     part.finish()
-            topics = {
-                name: TopicDescription(
-                    t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""), t.offered
-                )
-                for name, t in self._topics.items()
-            }
+            topics: dict[str, TopicDescription] = {}
+            for t in self._topics:
+                said = t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""), t.offered
+                topics.setdefault(t.name, TopicDescription(*said))
             files = [part.description for part in self._parts]
             write_metadata(self._folder, files, topics, self._custom)
         except OSError:

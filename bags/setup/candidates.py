@@ -16,6 +16,7 @@ import numpy as np
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
+from bags.setup.proposal import Unfit
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.delays import Delay, delay
 from bags.signals.expressions import derivative, turn_of
@@ -35,6 +36,7 @@ LONGEST_DELAY: Final = 3.0  # s, of what still counts as an answer
 WINDOW: Final = 5  # messages of a slope
 OTHER_KIND_LIKED: Final = 0.7  # a rate for a reference position; positions that add up a command
 HELD: Final = 0.5  # of the messages repeat the value before: a command, or a robot at rest
+COMMANDS_SURELY: Final = 0.7  # the share by which type and names say that a number drives
 HELD_IS_DRIVEN: Final = 0.05  # for what neither type nor name says the role of
 LEAP: Final = 0.9  # of a turn, from one message to the next: the angle begins again
 ROOM: Final = 1.1  # turns that such an angle, with its noise, lies in
@@ -140,11 +142,23 @@ class Pair:
 
 @dataclass(frozen=True)
 class Found:
-    """What a look into bags found; pairs: the best first; still: what measures and never varies."""
+    """What a look into bags found: candidates vary, pairs are the best first, constant never do."""
 
     candidates: tuple[Candidate, ...]
     pairs: tuple[Pair, ...]
-    still: tuple[str, ...] = ()
+    constant: tuple[Candidate, ...] = ()
+
+    @property
+    def still(self) -> list[str]:
+        """Some of what measures and never varies."""
+        return [c.text for c in self.constant if c.command < 0.5][:SHOWN]
+
+    @property
+    def constant_commands(self) -> list[str]:
+        """Some of what surely commands and never varies, where nothing on its topic does."""
+        moving = {c.topic for c in self.candidates}
+        surely = [c for c in self.constant if c.command > COMMANDS_SURELY]
+        return [c.text for c in surely if c.topic not in moving][:SHOWN]
 
     def commands(self) -> list[Candidate]:
         """What may drive the robot, the best first."""
@@ -184,9 +198,9 @@ def look(bags: Sequence[Path], *, definitions: Mapping[str, Definition] | None =
             candidates[new.text] = replace(old or new, low=low, high=high)
     varying = tuple(c for c in candidates.values() if c.high > c.low)
     if not varying:
-        raise BagError(f"no number varies in {', '.join(path.name for path in explored)}")
-    still = (c for c in candidates.values() if c.low == c.high and c.command < 0.5)
-    return Found(varying, tuple(_pairs(varying, series)), tuple(c.text for c in still)[:SHOWN])
+        raise Unfit(f"no number varies in {', '.join(path.name for path in explored)}")
+    constant = tuple(c for c in candidates.values() if c.low == c.high)
+    return Found(varying, tuple(_pairs(varying, series)), constant)
 
 
 def _of_bag(

@@ -36,6 +36,7 @@ def say_class(proposal: Proposal, train: Dataset) -> None:
         return
     names = train.names[1::3]
     fitted, held_back = (train.without(names), train.select(names)) if names else hold_out(train)
+    judges = "trials held back" if names else "the part of the trial held back"
     section = proposal.content["identification"]
     (_, error), *others = tried_classes(section, fitted, held_back)
     if not others:
@@ -46,13 +47,13 @@ def say_class(proposal: Proposal, train: Dataset) -> None:
         for s, e in [(section, error), *others]
     )
     proposal.why["model"] = (
-        f"proved models of {SAMPLES} samples or fewer, simulated on trials held back without "
-        f"their first {START} samples, are off by {said}"
+        f"proved models of {SAMPLES} samples or fewer, simulated on {judges} without the first "
+        f"{START} samples, are off by {said}"
     )
     # Of so few samples the known class may have no proved model; of all of them it had one.
     if least <= min(BETTER * min(error, proposal.error), POOR):
         proposal.content["identification"] = dict(best)
-        proposal.error, proposal.tried_on = least, "trials held back"
+        proposal.error, proposal.tried_on = least, judges
         for key in ("lags", "delays", "right_degree", "input_range", "method"):
             proposal.why.pop(key, None)
 

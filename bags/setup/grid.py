@@ -14,6 +14,7 @@ from bags.setup.proposal import Proposal, Signal
 from bags.signals.expressions import factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from bags.signals.timing import held
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
 from nlsid_core.running.grid import TOLERANCE
 
@@ -21,6 +22,8 @@ ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they 
 ROUND: Final = 0.002  # relative: a period this near a round number is that number
 FEW_GAPS: Final = 5.0  # periods: gaps up to here are filled in, longer ones cut out
 DYNAMICS: Final = 40.0  # samples in a period of the fastest motion that are enough
+STEADY: Final = 0.5 * TOLERANCE  # periods that stamps may be off one grid to be used as they come
+SLOW: Final = 1.0  # s between samples: of most robots milliseconds that were taken for seconds
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 
 
@@ -28,12 +31,14 @@ LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed
 class Paces:
     """What the chosen signals of all bags show: the responses' steps, the commands' ages.
 
+    off_grid: periods by which the stamps of a run of responses stray from one grid of the period.
     longest_tail: s of responses after the last command, where those have come to an end and the
     last is not held.
     """
 
     period: float
     on_grid: float
+    off_grid: float
     repeated: int
     longest_gap: float
     band: float
@@ -41,6 +46,7 @@ class Paces:
     longest_held: float
     longest_tail: float
     u_ranges: tuple[tuple[float, float], ...]
+    y_ranges: tuple[tuple[float, float], ...]
     topics: int
 
 
@@ -54,7 +60,8 @@ def read_paces(
     y_paths = [signal.path for signal in chosen["response"]]
     drives = [factors(signal.path) for signal in chosen["excitation"]]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
-    steps, commanded, bands, ranges, u_steps = [], [], [], [], []
+    steps, commanded, bands, u_steps = [], [], [], []
+    ranges: dict[str, list[list[tuple[float, float]]]] = {"u": [], "y": []}
     repeated = 0
     for path in bags:
         read = read_signals(
@@ -71,25 +78,66 @@ def read_paces(
             stamps = read[name].stamp_ns
             commanded.append(held(stamps, last))
             u_steps.append(np.diff(stamps) / 1e9)
-        ranges.append([_range([read[name] for name in parts]) for parts in drives])
+        ranges["u"].append([_range([read[name] for name in parts]) for parts in drives])
+        ranges["y"].append([_range([read[name]]) for name in y_paths])
     every, u_every = np.concatenate(steps), np.concatenate(u_steps)
     if not len(every):
         raise BagError(f"{y_paths[0]} has one sample a bag; a period needs two")
     median = float(np.median(every))
     near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
-    lows, highs = np.array(ranges).min(axis=0)[:, 0], np.array(ranges).max(axis=0)[:, 1]
+    period, off_grid = _grid(steps, median)
     return Paces(
-        period=_round(median),
+        period=period,
         on_grid=float(near.mean()),
+        off_grid=off_grid,
         repeated=repeated,
         longest_gap=float(every.max()),
         band=float(np.median([b for b in bands if b > 0] or [0.0])),
         command_period=float(np.median(u_every)) if len(u_every) else math.inf,
         longest_held=max(each.longest for each in commanded),
         longest_tail=max(each.tail for each in commanded),
-        u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
+        u_ranges=_whole(ranges["u"]),
+        y_ranges=_whole(ranges["y"]),
         topics=len({name.partition(":")[0] for name in y_paths}),
     )
+
+
+def _grid(steps: Sequence[FloatArray], median: float) -> tuple[float, float]:
+    """The period of responses with these steps in s, and how far from its grid they stray.
+
+    A round one near the median step if all stamps of a run are near its grid, which a monitor holds
+    them to; else the mean step.
+    """
+    runs = [run for each in steps for run in _runs(each, median) if len(run)]
+    if not runs:
+        return _round(median), 0.0
+
+    counts = [np.cumsum(np.rint(run / median)) for run in runs]
+    times = [np.cumsum(run) for run in runs]
+    mean = sum(float(t[-1]) for t in times) / sum(float(k[-1]) for k in counts)
+    strays = {
+        period: max(
+            float(np.ptp(np.r_[0.0, t / period - k])) for t, k in zip(times, counts, strict=True)
+        )
+        for period in (_round(median), float(f"{mean:.6g}"))
+    }
+    period = next(
+        (p for p, stray in strays.items() if stray <= STEADY), min(strays, key=strays.__getitem__)
+    )
+    return period, strays[period]
+
+
+def _runs(steps: FloatArray, median: float) -> list[FloatArray]:
+    """The steps between gaps."""
+    gaps = np.flatnonzero(steps > FEW_GAPS * median)
+    return [part[part <= FEW_GAPS * median] for part in np.split(steps, gaps)]
+
+
+def _whole(ranges: Sequence[Sequence[tuple[float, float]]]) -> tuple[tuple[float, float], ...]:
+    """The range of each signal over all bags."""
+    ends = np.array(ranges)
+    lows, highs = ends.min(axis=0)[:, 0], ends.max(axis=0)[:, 1]
+    return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
 
 def _range(parts: Sequence[Samples]) -> tuple[float, float]:
@@ -134,8 +182,17 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
     """Period, resampling, gaps and holding of the configuration, and what follows from them."""
     grid: dict[str, Any] = {"period": read.period}
     why, walls = proposal.why, proposal.walls
-    why["period"] = f"the response's median step; {100 * read.on_grid:.0f} % of steps are near it"
-    regular = read.on_grid >= ON_GRID and read.topics == 1 and not read.repeated
+    why["period"] = (
+        f"the response's step; {100 * read.on_grid:.0f} % of steps are near it, and stamps of a "
+        f"run stray by {read.off_grid:.2g} periods from its grid"
+    )
+    steady = read.on_grid >= ON_GRID and read.off_grid <= TOLERANCE
+    regular = steady and read.topics == 1 and not read.repeated
+    if read.period >= SLOW:
+        proposal.doubts.append(
+            f"samples are {read.period:.4g} s apart, {1.0 / read.period:.2g} Hz; is it so, or were "
+            "times in milliseconds taken for seconds?"
+        )
     factor = 1
     if read.band > 0:
         factor = max(int(1.0 / (DYNAMICS * read.band) / read.period), 1)
@@ -147,11 +204,14 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
         )
         regular = False
     if not regular:
-        grid["resample"] = "last" if factor > 1 and read.on_grid >= ON_GRID else "linear"
+        grid["resample"] = "last" if factor > 1 and steady else "linear"
         why["resample"] = (
             "fewer samples than are recorded" if factor > 1
             else "responses come from several topics" if read.topics > 1
             else f"only {100 * read.on_grid:.0f} % of steps are near the period"
+            if read.on_grid < ON_GRID
+            else f"stamps of a run stray by {read.off_grid:.2g} periods from one grid, and "
+            f"a monitor takes {TOLERANCE:g}"
         )  # fmt: skip
     most = FEW_GAPS * read.period
     grid["max_gap"] = _up(max(min(1.2 * read.longest_gap, most), 2.0 * grid["period"]))

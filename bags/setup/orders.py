@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from bags.setup.candidates import Found, Pair, slope_window
-from bags.setup.proposal import Proposal
+from bags.setup.proposal import FITTED, Proposal
 from bags.signals.delays import RELATED
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
@@ -70,7 +70,8 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     proposal.error = min(known.values())
     proposal.varies = _varies(train.select(held_back))
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
-    proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
+    if alone:
+        _say_alone(proposal, train, "lags")
     proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"
 
 
@@ -80,7 +81,8 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
     ranges = tuple((float(low), float(high)) for low, high in section["input_range"])
     names = train.names
     held_back = list(names[1::3]) or list(names[:1])
-    fitted = train if len(held_back) == len(names) else train.without(held_back)
+    alone = len(held_back) == len(names)
+    fitted = train if alone else train.without(held_back)
     known: dict[StateAffineClass, float] = {}
     for lags, degree in product(FEW_LAGS, DEGREES):
         for delays in (None, *((k,) for k in range(1, lags + 1))):
@@ -111,7 +113,11 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
         f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.right_degree}: {error:.3g} %"
         for c, error in shown
     )
-    proposal.why["lags"] = f"least squares on trials held back; lags, delays, right_degree: {said}"
+    if alone:
+        _say_alone(proposal, train, "lags, delays and degree")
+    proposal.why["lags"] = (
+        f"least squares on {proposal.tried_on}; lags, delays, right_degree: {said}"
+    )
     proposal.why["right_degree"] = "as the lags"
 
 
@@ -122,6 +128,16 @@ def followed(proposal: Proposal, found: Found) -> list[Pair]:
     pairs = found.best_for(signals["response"][0]["path"])
     follows = [p for p in pairs if p.command.text not in chosen and abs(p.correlation) >= RELATED]
     return follows[:OTHERS]
+
+
+def _say_alone(proposal: Proposal, train: Dataset, what: str) -> None:
+    """That no trial judges the choice."""
+    proposal.tried_on = FITTED
+    why = "one training trial" if len(train) == 1 else "too little in a part of the trials"
+    proposal.walls.append(
+        f"there is {why}: {what} were chosen by the error on what they were fitted to, which more "
+        "lags always lower; with more bags they are chosen on trials that are held back"
+    )
 
 
 def _varies(trials: Dataset) -> str:

@@ -7,9 +7,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from bags.chain.config import Config
+from nlsid_core.errors import BagError
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
+FITTED: Final = "what it was fitted to"  # of which an error says little
 GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
+
+
+class Unfit(BagError):  # noqa: N818 - an answer, not a fault
+    """Bags from which nothing can be identified, whatever a configuration says."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +30,15 @@ class Signal:
 
 @dataclass
 class Proposal:
-    """A configuration as nested keys (`content`), a reason for keys (`why`), and later walls."""
+    """A configuration as nested keys (`content`), a reason for keys (`why`), and later walls.
+
+    doubts: what seems wrong with what was given, as questions to who gave it.
+    """
 
     content: dict[str, Any]
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     error: float = math.inf  # %, of the best model that was tried, in simulation
     tried_on: str = "trials held back"
     varies: str = ""  # by how much the response does in these
@@ -39,8 +49,11 @@ class Proposal:
         if math.isinf(self.error):
             return "no model that was tried is stable: expect identification to refuse"
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
+        if self.tried_on == FITTED:
+            grade = "nothing was held back, so other data may be simulated far worse"
         of = self.tried_on + self.varies
-        return f"expect {self.error:.3g} % error in simulation (of {of}): {grade}"
+        said = f"expect {self.error:.3g} % error in simulation (of {of}): {grade}"
+        return f"{said}, if the question above is answered" if self.doubts else said
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
         """As the later steps read it."""

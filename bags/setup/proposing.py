@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from bags.chain.steps import Trials, read_trials
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
@@ -18,9 +20,10 @@ from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, slope_window
 from bags.setup.curved import say_class
+from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.orders import followed, say_degree, say_lags
-from bags.setup.proposal import GRADES, POOR, Proposal, Signal
+from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
@@ -34,6 +37,7 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 SIMULATED: Final = "/clock"
+ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 
@@ -43,10 +47,17 @@ def choose(
 ) -> tuple[list[str], list[str]]:
     """The signals that were named, and for a side that was not the best that goes with the other.
 
-    Raises BagError if nothing goes with anything.
+    Raises Unfit if nothing goes with anything.
     """
     if responses and excitations:
         return list(responses), list(excitations)
+    constant = {each.text for each in found.constant}
+    still = [text for text in excitations if text in constant]
+    if still := still or ([] if excitations else _unmoved(found)):
+        raise Unfit(
+            f"the command never varies ({', '.join(still)}): a model is identified from how a "
+            "robot answers to one that does; if another number drives it, name that with -u"
+        )
     best = []
     for response in responses or [""]:
         pairs = [
@@ -59,13 +70,19 @@ def choose(
         if not pairs:
             what = f"{response} follows no command" if response else "no number follows another"
             still = f"; always the same: {', '.join(found.still)}" if found.still else ""
-            raise BagError(
+            raise Unfit(
                 f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
                 f"there is){still}"
             )
         best.append(pairs[0])
     commands = dict.fromkeys(pair.command.text for pair in best)
     return list(responses) or [best[0].response.text], list(excitations) or list(commands)
+
+
+def _unmoved(found: Found) -> list[str]:
+    """Commands that never vary, where nothing else that may be one leads anything."""
+    others = any(pair.command.command >= 0.5 and pair.score > 0.0 for pair in found.pairs)
+    return [] if others else found.constant_commands
 
 
 def propose(
@@ -77,10 +94,13 @@ def propose(
     robot: str,
     definitions: Sequence[Path] = (),
     types: Mapping[str, Definition] | None = None,
+    named: Sequence[str] = (),
     widen: bool = False,
     alone: bool = False,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
+
+    named: those that a person named.
 
     widen: where models of one excitation are poor, take those too that the response follows
     besides, if that is better. alone: nobody chose the one response, and others like it are said.
@@ -90,7 +110,7 @@ def propose(
     texts = [*responses, *excitations]
     if twice := next((text for text in texts if texts.count(text) > 1), None):
         raise BagError(f"{twice} is named twice")
-    signals = _named_apart([_signal(found, text) for text in texts])
+    signals = _named_apart([_signal(found, text, named) for text in texts])
     chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
     proposal = Proposal({"robot": robot})
     _say_signals(proposal, chosen, found)
@@ -104,6 +124,8 @@ def propose(
     with Bag(bags[0], definitions=types) as bag:
         _say_clock(proposal, chosen, bag)
     read = read_paces(bags, chosen, proposal.content["clock"], types)
+    _refuse_constant(excitations, read.u_ranges, "drives", "these bags")
+    _refuse_constant(responses, read.y_ranges, "answers", "these bags")
     say_grid(proposal, read)
     _say_split(proposal, bags)
     linear = len(responses) == len(excitations) == 1
@@ -117,6 +139,8 @@ def propose(
         proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
+    _refuse_constant(excitations, _ranges(trials.train), "drives", "the training trials")
+    say_direction(proposal, found, trials.every)
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
@@ -126,6 +150,7 @@ def propose(
             moved = propose(
                 bags, found, responses=[f"{responses[0]}|washout({WASHOUT:g} s)"],
                 excitations=excitations, robot=robot, definitions=definitions, types=types,
+                named=named,
             )  # fmt: skip
             if moved.error <= proposal.error / 2.0:
                 _say_washed_out(moved, proposal.error)
@@ -138,7 +163,7 @@ def propose(
     if widen and proposal.error > POOR and others:
         wider = propose(
             bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
-            definitions=definitions, types=types,
+            definitions=definitions, types=types, named=named,
         )  # fmt: skip
         wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
@@ -151,6 +176,24 @@ def propose(
         _say_poor(proposal, found)
     proposal.walls += _beside(proposal, found) if alone else []
     return proposal
+
+
+def _ranges(trials: Dataset) -> list[tuple[float, float]]:
+    """The least and the greatest value of each excitation."""
+    u = np.concatenate([trial.u for trial in trials])
+    return list(zip(u.min(axis=0).tolist(), u.max(axis=0).tolist(), strict=True))
+
+
+def _refuse_constant(
+    texts: Sequence[str], ranges: Sequence[tuple[float, float]], does: str, where: str
+) -> None:
+    """Raise Unfit for the first signal that does not vary by more than rounding."""
+    for text, (low, high) in zip(texts, ranges, strict=True):
+        if high - low <= ROUNDED * max(abs(low), abs(high)):
+            raise Unfit(
+                f"{text} is what {does}, and it is always {low:g} in {where}: a model is "
+                "identified from how a response follows a command that varies"
+            )
 
 
 def _may_add_up(proposal: Proposal, found: Found) -> bool:
@@ -169,7 +212,8 @@ def _say_washed_out(proposal: Proposal, error: float) -> None:
         else "no number of lags gave a model of it that is proved stable"
     )
     whole = text.rpartition("|")[0]
-    proposal.why[text] += f"; what {whole} moved in the last {WASHOUT:g} s or so: {tried}"
+    before = f"{proposal.why[text]}; " if proposal.why[text] else ""
+    proposal.why[text] = f"{before}what {whole} moved in the last {WASHOUT:g} s or so: {tried}"
     proposal.walls.append(
         f"{whole} seems to add up its command, so |washout({WASHOUT:g} s) of it is proposed: the "
         f"tube is of what it moved of late, and after {WASHOUT:g} s a third is left of an error "
@@ -236,7 +280,7 @@ def _same(candidate: str, named: str) -> bool:
     return candidate == named or candidate.partition("|")[0] == named
 
 
-def _signal(found: Found, text: str) -> Signal:
+def _signal(found: Found, text: str, named: Sequence[str]) -> Signal:
     known = next((c for c in found.candidates if c.text == text), None)
     known = known or next((c for c in found.candidates if _same(c.text, text)), None)
     if known is None:
@@ -246,7 +290,9 @@ def _signal(found: Found, text: str) -> Signal:
         )
         recorded = None if len(factors(text)) > 1 else next((c.unit for c in numbers), None)
         unit = "" if recorded is None else Expression.parse(text).unit_of(recorded)
-        return Signal(_name(text), unit.partition(" or ")[0], text, "named by you")
+        return Signal(
+            _name(text), unit.partition(" or ")[0], text, "named by you" if text in named else ""
+        )
     unit = known.unit.partition(" or ")[0]
     why = f"{known.low:.4g} to {known.high:.4g} {unit}".strip()
     return Signal(_name(text), unit, text, f"{why} at {known.rate:.4g} Hz; {known.why}")
@@ -293,7 +339,8 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                  if p.command.text in {u.path for u in chosen["excitation"]}]  # fmt: skip
         if pairs:
             best = pairs[0]
-            proposal.why[y.path] += f"; follows {best.command.text}: {best}"
+            before = f"{y.why}; " if y.why else ""
+            proposal.why[y.path] = f"{before}follows {best.command.text}: {best}"
             if abs(best.correlation) < RELATED:
                 proposal.walls.append(
                     f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"

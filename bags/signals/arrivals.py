@@ -12,6 +12,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 
 GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
+SOON: Final = 100  # messages: a publisher does not begin anew twice in so many
 SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
 SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
 
@@ -87,23 +88,32 @@ class Regularity:
 class Sequence:
     """Messages missing from a publisher's own count of what it sent.
 
-    A count that begins anew is a publisher that came back. With several publishers on the topic, of
-    which the middleware does not say who sent what, nothing can be said: `missing` stays 0.
+    A count that begins anew is a publisher that came back. One that goes back again within SOON
+    messages is that of several publishers, of which the middleware does not say who sent what:
+    `mixed`, and from then on `missing` says nothing.
     """
 
     missing: int = 0
+    mixed: bool = False
     _last: int | None = None
-    _several: bool = False
+    _since_back: int = SOON
 
     def update(self, number: int) -> None:
         """Take the next message's number."""
         last, self._last = self._last, number
-        if last is None or self._several or number == 1:
+        self._since_back += 1
+        if last is None:
             return
-        if number <= last:
-            self._several, self.missing = True, 0
+        if number > last:
+            self.missing += number - last - 1
             return
-        self.missing += number - last - 1
+        self.mixed |= self._since_back <= SOON
+        self._since_back = 0
+
+    @property
+    def alternates(self) -> bool:
+        """Whether several publishers sent the last messages."""
+        return self.mixed and self._since_back <= SOON
 
 
 @dataclass

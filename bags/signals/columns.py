@@ -1,19 +1,20 @@
 """Signals of a bag as columns, topic by topic, in bounded memory.
 
-`stream_columns` gives them part by part, as many messages at once as a chunk holds; `read_columns`
-puts the parts together. Memory: one chunk and its index, and what is returned.
+`TopicReader` turns as many messages at once as a chunk holds; `read_columns` puts the parts
+together. Memory: one chunk and its index, and what is returned.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.cdr import Gatherer, Numbers, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
+from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath, Step
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
@@ -32,47 +33,59 @@ class Columns:
 
     log_ns, publish_ns: (N,) ns. back: where log times go back inside a file (`LogOrder`).
     stamp_ns: (N,) ns, the header's stamps; None without a header.
-    values: signal -> (N,), in the message's unit.
+    values: signal -> (N,), in the message's unit, and of its type of number. sequence: (N,) as the
+    recorder counted them.
     """
 
     topic: str
     log_ns: IntArray
     publish_ns: IntArray
     stamp_ns: IntArray | None
-    values: Mapping[str, FloatArray]
+    values: Mapping[str, Numbers]
+    sequence: IntArray
     back: Sequence[tuple[int, int, int]] = ()
 
     def __len__(self) -> int:
         return len(self.log_ns)
 
+    def doubt(self, name: str, *, responds: bool) -> str:
+        """Say why the messages that have a signal are of several publishers; else empty.
 
-def stream_columns(
-    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress = silent
-) -> Iterator[Columns]:
-    """The signals part by part, in the order of the bag's files.
+        A message of other transforms has it not. responds: whether the signal is measured; a
+        command may jump as it likes.
+        """
+        if len(self.back):
+            return ""  # a clock was set, and what is here is not in the order in which it came
+        values = np.asarray(self.values[name], dtype=np.float64)
+        has = np.isfinite(values)
+        stamps = self.log_ns if self.stamp_ns is None else self.stamp_ns
+        said = counted_in_turn(self.sequence[has])
+        return said or (two_curves(stamps[has], values[has]) if responds else "")
 
-    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
-    All are checked against the types in the bag before a message is read. Raises BagError where
-    `signals` or the bag are wrong.
-    """
-    for _, columns in _parts(bag, signals, progress):
-        yield columns
+    def select(self, rows: IntArray | slice) -> "Columns":
+        """The messages `rows`."""
+        return replace(
+            self,
+            log_ns=self.log_ns[rows],
+            publish_ns=self.publish_ns[rows],
+            stamp_ns=None if self.stamp_ns is None else self.stamp_ns[rows],
+            values={name: values[rows] for name, values in self.values.items()},
+            sequence=self.sequence[rows],
+        )
 
 
-def _parts(
-    bag: Bag, signals: Mapping[str, SignalPath], progress: Progress
-) -> Iterator[tuple[int, Columns]]:
-    """(channel, its next messages), in the order of the bag's files."""
-    topics: dict[str, dict[str, SignalPath]] = {}
-    for name, signal in signals.items():
-        topics.setdefault(signal.topic, {})[name] = signal
-    readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
-    total = sum(c.count for c in bag.channels if c.topic in readers)
-    done = 0
-    for channel, batch in bag.batches(list(readers)):
-        yield channel.key, readers[channel.topic].read(batch)
-        done += len(batch)
-        progress("reading", done / max(total, 1))
+def joined_columns(parts: Sequence[Columns]) -> Columns:
+    """The messages of several parts of one topic, one part behind the other."""
+    first = parts[0]
+    stamps = [part.stamp_ns for part in parts if part.stamp_ns is not None]
+    return replace(
+        first,
+        log_ns=np.concatenate([part.log_ns for part in parts]),
+        publish_ns=np.concatenate([part.publish_ns for part in parts]),
+        stamp_ns=np.concatenate(stamps) if stamps else None,
+        values={name: np.concatenate([p.values[name] for p in parts]) for name in first.values},
+        sequence=np.concatenate([part.sequence for part in parts]),
+    )
 
 
 def read_columns(
@@ -80,15 +93,22 @@ def read_columns(
 ) -> dict[str, Columns]:
     """Topic -> its signals over the whole bag, by log time; equal log times as recorded.
 
-    As `stream_columns`; a topic without messages gives columns of length 0.
+    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
+    All are checked against the types in the bag before a message is read. A topic without messages
+    gives columns of length 0. Raises BagError where `signals` or the bag are wrong.
     """
-    names: dict[str, list[str]] = {}
+    topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
-        names.setdefault(signal.topic, []).append(name)
-    growing = {topic: _Growing(bag, topic, columns) for topic, columns in names.items()}
-    for channel, part in _parts(bag, signals, progress):
-        growing[part.topic].append(channel, part)
-    return {topic: growing.pop(topic).columns() for topic in names}
+        topics.setdefault(signal.topic, {})[name] = signal
+    readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
+    growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
+    total = sum(c.count for c in bag.channels if c.topic in readers)
+    done = 0
+    for channel, batch in bag.batches(list(readers)):
+        growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
+        done += len(batch)
+        progress("reading", done / max(total, 1))
+    return {topic: growing.pop(topic).columns() for topic in topics}
 
 
 def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
@@ -141,11 +161,14 @@ class TopicReader:
         stamp_ns = None
         if self._stamped:
             stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
-        values = {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
+        values: dict[str, Numbers] = {}
+        values |= {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
         for name, group in self._targets.items():
             values[name] = self._signals[name].combine(numbers[at : at + len(group)])
             at += len(group)
-        return Columns(self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values)
+        return Columns(
+            self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values, batch.sequence
+        )
 
     def _framed(self, batch: Batch, signal: SignalPath) -> FloatArray:
         """Read by decoding: which message of an array is meant differs from message to message."""
@@ -173,7 +196,7 @@ class _Growing:
         self._topic = topic
         self._names = names
         self._stamped = is_stamped(*bag.types_on(topic))
-        self._times = np.empty((3 if self._stamped else 2, capacity), dtype=np.int64)
+        self._times = np.empty((4 if self._stamped else 3, capacity), dtype=np.int64)
         self._values = np.empty((len(names), capacity))
         self._length = 0
         self._order = LogOrder()
@@ -188,8 +211,9 @@ class _Growing:
         here = slice(start, self._length)
         self._times[0, here] = part.log_ns
         self._times[1, here] = part.publish_ns
+        self._times[2, here] = part.sequence
         if part.stamp_ns is not None:
-            self._times[2, here] = part.stamp_ns
+            self._times[3, here] = part.stamp_ns
         for row, name in enumerate(self._names):
             self._values[row, here] = part.values[name]
 
@@ -203,7 +227,8 @@ class _Growing:
             self._topic,
             times[0],
             times[1],
-            times[2] if self._stamped else None,
+            times[3] if self._stamped else None,
             dict(zip(self._names, values, strict=True)),
+            times[2],
             self._order.back,
         )

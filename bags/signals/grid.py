@@ -18,6 +18,7 @@ from bags.signals.reader import (
     HEADER_STAMP,
     LOG_TIME,
     Samples,
+    SamplesError,
     bag_origin,
     read_signals,
     stamp_text,
@@ -206,7 +207,7 @@ def _trajectory(
     stamps = np.array([sample.stamp_ns for sample in run], dtype=np.int64)
     y = np.array([sample.y for sample in run])
     u = np.array([sample.u for sample in run])
-    filled = sum(bool(sample.filled) for sample in run)
+    filled, restarts = sum(bool(sample.filled) for sample in run), 0
     if not sampler.on_grid:
         where = f"{label}: {sampler.responses[0]}"
         _refuse_gaps(stamps, gap_ns, where)
@@ -214,6 +215,7 @@ def _trajectory(
         grid = np.arange(points[-1][0] + 1)
         at, rows = (np.array(column) for column in zip(*points, strict=True))
         filled = len(grid) - len(rows)
+        restarts = _restarts(stamps[rows], at, period_ns)
         y = np.column_stack([np.interp(grid, at, column) for column in y[rows].T])
         u = u[rows]
         if filled:
@@ -232,8 +234,9 @@ def _trajectory(
                 ]
             )
     t = seconds(period_ns * np.arange(len(y)), 0)
-    if filled:
-        origin = json.loads(labels["provenance"] or "{}") | {"filled": filled}
+    counted = {"filled": filled, "restarts": restarts}
+    if counted := {what: count for what, count in counted.items() if count}:
+        origin = json.loads(labels["provenance"] or "{}") | counted
         labels = labels | {"provenance": canonical(origin).decode()}
     names = {
         "y_names": labels["y_paths"],
@@ -243,7 +246,7 @@ def _trajectory(
 
 
 def _points(stamps: IntArray, period_ns: int, where: str) -> list[tuple[int, int]]:
-    """(point of the grid, sample on it); the grid follows the samples, as the monitor does.
+    """(point of the grid, sample on it); the grid follows the samples, other than a monitor's.
 
     A sample more than GRID_TOLERANCE periods off the grid from the last one is on no point.
     DataError if that leaves more than MOST_FILLED of the points empty.
@@ -376,6 +379,9 @@ def _read_trials(
             gaps_in=texts["responses"] if options["split_gaps"] else (),
         )
         _refuse_other_clocks(path, read, wanted)
+        for text, samples in read.items():
+            if doubt := samples.doubt(responds=text in texts["responses"]):
+                raise SamplesError(f"{path}: {doubt}; record it again with one of them")
         origin = bag_origin(bag)
     responses = [read[text] for text in texts["responses"]]
     trials = to_trajectories(
@@ -431,6 +437,34 @@ def skipped_samples(dataset: Dataset) -> int:
 def filled_samples(dataset: Dataset) -> int:
     """How many samples of `dataset` were not measured but filled in between others."""
     return sum(json.loads(trial.provenance or "{}").get("filled", 0) for trial in dataset)
+
+
+def _restarts(stamp_ns: IntArray, points: IntArray, period_ns: int) -> int:
+    """How often a monitor begins a new run with samples that are on these points of the grid.
+
+    It holds every stamp against the start of its run.
+    """
+    count, start = 0, 0
+    for k in range(len(points)):
+        due = stamp_ns[start] + (points[k] - points[start]) * period_ns
+        if abs(int(stamp_ns[k] - due)) > GRID_TOLERANCE * period_ns:
+            count, start = count + 1, k
+    return count
+
+
+def said_restarts(dataset: Dataset) -> list[str]:
+    """Of each trial that a monitor would not judge as one run: that, and what to do."""
+    counts = {
+        trial.name: (json.loads(trial.provenance or "{}").get("restarts", 0), trial.period)
+        for trial in dataset
+    }
+    return [
+        f"{name}: its stamps stray from a grid of {period:g} s, so that a monitor begins {count} "
+        "new runs in it and judges it in pieces or not at all; give grid.period the mean step of "
+        "the samples, or set grid.resample to linear"
+        for name, (count, period) in counts.items()
+        if count
+    ]
 
 
 def _period_ns(stamp_ns: IntArray, period: float | None, label: str, *, on_grid: bool) -> int:

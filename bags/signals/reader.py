@@ -15,6 +15,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.remote import RemotePath
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.expressions import Expression
+from bags.signals.publishers import two_curves
 from bags.signals.timing import without_duplicates
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
@@ -35,7 +36,8 @@ class Samples:
     """A signal as recorded; arrays are read-only.
 
     stamp_ns: (N,) ns since the epoch, not decreasing. values: (N,) finite, in `unit` ("": unknown).
-    clock: where the stamps come from, one of CLOCKS.
+    clock: where the stamps come from, one of CLOCKS. counted: why the messages' counts are not of
+    one publisher; empty if they can be.
     """
 
     path: str
@@ -43,6 +45,7 @@ class Samples:
     values: FloatArray
     clock: str = HEADER_STAMP
     unit: str = ""
+    counted: str = ""
 
     def __post_init__(self) -> None:
         self.stamp_ns.setflags(write=False)
@@ -50,6 +53,14 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+    def doubt(self, *, responds: bool) -> str:
+        """Say why nobody knows whose signal this is: it has several publishers; else empty.
+
+        responds: whether it is measured. A command may jump as it likes.
+        """
+        said = self.counted or (two_curves(self.stamp_ns, self.values) if responds else "")
+        return f"{self.path}: {said}" if said else ""
 
 
 def read_signals(
@@ -102,6 +113,7 @@ def read_signals(
                     topics[key].drop_duplicates()
             gaps = name in gaps_in or expression.path.framed
             recorded = topics[key].samples(name, gaps=gaps)
+            recorded = replace(recorded, counted=columns[topic].doubt(name, responds=False))
             samples[name] = _applied(source, expression, recorded, kinds[topic], gaps=gaps)
     return samples
 

@@ -9,6 +9,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Regularity, Sequence
 
+UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"
 UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
 
 
@@ -60,7 +61,7 @@ class Recording:
             self._end(str(error))
 
     def lose(self, topic: str, count: int) -> None:
-        """Count messages that the middleware says it lost."""
+        """Count messages that were lost before any was handed on."""
         self._lost[topic] += count
 
     def annotate(self, custom: Mapping[str, str]) -> None:
@@ -108,7 +109,8 @@ class Recording:
         values = {}
         for topic, regularity in self._regularity.items():
             values[f"{topic} received"] = str(self.bag.counts.get(topic, 0))
-            values[f"{topic} lost"] = str(self._lost_on(topic))
+            mixed = self._sequence[topic].mixed
+            values[f"{topic} lost"] = UNCOUNTED if mixed else str(self._lost_on(topic))
             values[f"{topic} gaps"] = str(regularity.gaps)
             values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
             values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
@@ -118,14 +120,17 @@ class Recording:
         """What a person should look at."""
         silent = [topic for topic in self._lost if not self.bag.counts.get(topic)]
         losing = [topic for topic in self._lost if self._lost_on(topic)]
+        mixed = [topic for topic in self._lost if self._sequence[topic].mixed]
         return [
             *(f"nothing on {topic} yet" for topic in silent),
             *(f"messages lost on {topic}" for topic in losing),
+            *(f"{topic}: {UNCOUNTED}" for topic in mixed),
         ]
 
     def _lost_on(self, topic: str) -> int:
-        """By the middleware's count or by the publisher's, whichever knows of more."""
-        return max(self._lost[topic], self._sequence[topic].missing)
+        """Before they could be handed on, and by the publisher's count since then."""
+        sequence = self._sequence[topic]
+        return self._lost[topic] + (0 if sequence.mixed else sequence.missing)
 
     def _end(self, why: str) -> None:
         self.ended = f"recording stopped: {why}"

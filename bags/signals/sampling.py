@@ -114,6 +114,7 @@ class Sampler:
         self.on_grid = all(gridded)
         self._single = all(len(part) == 1 for part in self.excitations)
         self.response_topics = tuple(dict.fromkeys(s.path.topic for s in self.responses))
+        self.shared_topics = {s.path.topic for s in signals if s.path.framed}
         self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
         self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
         for k, signal in enumerate(signals):
@@ -169,6 +170,12 @@ class Sampler:
         Signals are counted through responses first, then every factor of the excitations.
         """
         return {k: self._signals[k].path.value(message) for k in self._on[topic]}
+
+    def measures(self, topic: str, message: Any) -> bool:
+        """Whether a message has any of its topic's signals; one of other transforms has none."""
+        if not all(self._signals[k].path.framed for k in self._on[topic]):
+            return True
+        return any(map(math.isfinite, self.numbers(topic, message).values()))
 
     def unknown(self, topic: str) -> dict[int, float]:
         """What `numbers` gives for a message that cannot be read: NaN of each of its signals."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
@@ -24,9 +25,10 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
 
 QUATERNION: Final = "geometry_msgs/msg/Quaternion"
+NO_FIELD: Final = "structure_needs_at_least_one_member"  # what a type without fields has in CDR
 ANGLES: Final = ("roll", "pitch", "yaw")
 
-_TOPIC: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+_TOPIC: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # ROS 1: without a slash
 _STEP: Final = re.compile(
     r"([A-Za-z]\w*)(?:\[(?:(\d{1,9})|(\*)|([A-Za-z]\w*)=([^\]=]{1,200}))\])?", re.ASCII
 )
@@ -75,7 +77,7 @@ class SignalPath:
         if not colon:
             raise BagError(f"'{text}' has no ':'; {_FORM}")
         if not _TOPIC.fullmatch(topic):
-            raise BagError(f"'{topic}' in '{text}' is not an absolute topic name; {_FORM}")
+            raise BagError(f"'{topic}' in '{text}' is not a topic's name; {_FORM}")
         steps, at = [], 0
         while True:
             match = _STEP.match(path, at)
@@ -153,12 +155,11 @@ class SignalPath:
             return [self.steps]
         return [(*self.steps[:-1], Step(letter)) for letter in "xyzw"]
 
-    def combine(self, numbers: FloatArray) -> FloatArray:
-        """(N,) values from (targets, N) numbers: themselves, or the angle of the quaternions."""
+    def combine(self, numbers: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """(N,) values from the targets' numbers: themselves, or the angle of the quaternions."""
         if len(numbers) == 1:
-            value: FloatArray = numbers[0]
-            return value
-        return quaternion_angle(self.steps[-1].field, numbers)
+            return numbers[0]
+        return quaternion_angle(self.steps[-1].field, np.array(numbers, dtype=float))
 
     def value(self, message: Any) -> float:
         """The number in a decoded message of the checked type (of rosbags' or of rclpy).
@@ -288,7 +289,7 @@ def numeric_paths(
         element: Any = found[1][0] if is_array else found
         path = f"{name}[*]" if is_array else name
         if element[0] == Nodetype.BASE:
-            if element[1][0] not in ("string", "wstring"):
+            if element[1][0] not in ("string", "wstring") and name != NO_FIELD:
                 yield path, str(element[1][0]), ((msgtype, name),)
         elif depth:
             for inner, kind, owners in numeric_paths(str(element[1]), types, depth=depth - 1):

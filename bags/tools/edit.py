@@ -1,25 +1,21 @@
 """New bags from old ones: a part of one, several as one, one in parts."""
 
-import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
-from bags.recordings.bag import Bag, Message
+from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.recordings.quality import Profile
-from bags.recordings.storage import Channel
+from bags.recordings.message_types import are_same
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals, stamp_text
 from bags.signals.repeats import find_period
+from bags.tools.copying import Copied, copy_messages
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
-
-REPORT_EVERY: Final = 1000  # messages between two reports of progress
 
 
 def cut(
@@ -32,12 +28,12 @@ def cut(
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
     progress: Progress = silent,
-) -> int:
+) -> Copied:
     """Copy the messages logged from `start` to before `end` s after the first (None: to the last).
 
     Only those on `topics` (None: on all). definitions: of types that the bag does not define; the
-    copy does. Returns how many there were; raises BagError for a bag
-    that cannot be read, for a topic that is not there, if nothing is left, and if `out` exists.
+    copy does. Raises BagError for a bag that cannot be read, for a topic that is not there, if
+    nothing is left, and if `out` exists.
     """
     with Bag(path, unfinished=unfinished, definitions=definitions) as bag:
         for topic in topics or ():
@@ -47,23 +43,18 @@ def cut(
         low = origin + round(start * 1e9)
         high = None if end is None else origin + round(end * 1e9)
         with BagWriter(out, custom=bag.custom) as writer:
-            copied = _copy(
-                (
-                    (message, channel)
-                    for message, channel in _with_channels(bag, topics)
-                    if message.log_time_ns >= low and (high is None or message.log_time_ns < high)
-                ),
-                writer,
-                progress,
-                sum(c.count for c in bag.channels if topics is None or c.topic in topics),
-            )
-            if not copied:
+
+            def choose(log_ns: int) -> BagWriter | None:
+                return writer if low <= log_ns and (high is None or log_ns < high) else None
+
+            copied = copy_messages([bag], [writer], choose, topics=topics, progress=progress)
+            if not copied.messages:
                 raise BagError(f"{path} has no message from {start:g} s to {end or np.inf:g} s")
     return copied
 
 
-def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress = silent) -> int:
-    """Copy several bags into one, by log time; returns how many messages there were.
+def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress = silent) -> Copied:
+    """Copy several bags into one, by log time.
 
     Raises BagError if a bag cannot be read, if two have one topic with different types, and if
     `out` exists.
@@ -75,12 +66,32 @@ def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress = 
             for key, value in bag.custom.items():
                 if custom.setdefault(key, value) != value:
                     custom[key] = f"{custom[key]}; {value}"
+        first: dict[str, Bag] = {}
+        for bag in bags:
+            for topic in bag.topics:
+                _refuse_another_type(topic, first.setdefault(topic, bag), bag)
         writer = stack.enter_context(BagWriter(out, custom=custom))
-        profiles = _offered(bags)
-        streams = [_with_channels(bag, None, profiles) for bag in bags]
-        merged = heapq.merge(*streams, key=lambda entry: entry[0].log_time_ns)
-        total = sum(channel.count for bag in bags for channel in bag.channels)
-        return _copy(merged, writer, progress, total)
+        return copy_messages(bags, [writer], lambda _: writer, progress=progress)
+
+
+def _refuse_another_type(topic: str, first: Bag, second: Bag) -> None:
+    """BagError if two bags have a topic with two types, or with two definitions of its type."""
+    types = []
+    for bag in (first, second):
+        try:
+            types.append(bag.types_on(topic))
+        except BagError:  # nothing is known of what is copied as it is
+            return
+    (one, defined), (other, redefined) = types
+    if one != other:
+        raise BagError(
+            f"{topic} holds '{one}' in {first.path} and '{other}' in {second.path}; a topic has "
+            "one type: keep them in two bags"
+        )
+    if not are_same(defined, redefined):
+        raise BagError(
+            f"{second.path}: {topic} comes with two definitions of '{one}'; keep them in two bags"
+        )
 
 
 def split(
@@ -90,7 +101,7 @@ def split(
     repeats: str | None = None,
     every: float | None = None,
     progress: Progress = silent,
-) -> list[Path]:
+) -> Copied:
     """Copy a bag in parts to the new bags `out`_01, `out`_02, ...
 
     repeats: a signal whose repetitions are the parts; each is marked as a repeat of one excitation.
@@ -108,14 +119,13 @@ def split(
         writers = [
             stack.enter_context(BagWriter(part, custom=bag.custom | custom)) for part in parts
         ]
-        total = sum(channel.count for channel in bag.channels)
-        for done, (message, channel) in enumerate(_with_channels(bag, None), start=1):
-            k = int(np.searchsorted(edges_ns, message.log_time_ns, side="right")) - 1
-            if 0 <= k < len(writers):
-                _write(writers[k], message, channel)
-            if done % REPORT_EVERY == 0:
-                progress("copying", done / max(total, 1))
-    return parts
+
+        def choose(log_ns: int) -> BagWriter | None:
+            k = int(np.searchsorted(edges_ns, log_ns, side="right")) - 1
+            return writers[k] if 0 <= k < len(writers) else None
+
+        copied = copy_messages([bag], writers, choose, progress=progress)
+        return replace(copied, parts=parts)
 
 
 def _edges(
@@ -149,53 +159,7 @@ def _edges(
 
 
 def _first_ns(bag: Bag) -> int:
-    first = next(bag.messages(), None)
+    first = next(bag.raws(), None)
     if first is None:
         raise BagError(f"{bag.path} has no messages")
-    return first.log_time_ns
-
-
-def _offered(bags: Sequence[Bag]) -> dict[str, tuple[Profile, ...]]:
-    """What the publishers of each topic offered, those of all bags together."""
-    found: dict[str, tuple[Profile, ...]] = {}
-    for bag in bags:
-        for topic in bag.topics:
-            found[topic] = tuple(dict.fromkeys((*found.get(topic, ()), *bag.offered(topic))))
-    return found
-
-
-def _with_channels(
-    bag: Bag,
-    topics: Sequence[str] | None,
-    profiles: Mapping[str, tuple[Profile, ...]] | None = None,
-) -> Iterator[tuple[Message, Channel]]:
-    profiles = _offered([bag]) if profiles is None else profiles
-    channels = {c.topic: replace(c, offered=profiles[c.topic]) for c in bag.channels}
-    for message in bag.messages(topics):
-        yield message, channels[message.topic]
-
-
-def _copy(
-    messages: Iterator[tuple[Message, Channel]],
-    writer: BagWriter,
-    progress: Progress,
-    total: int,
-) -> int:
-    done = 0
-    for message, channel in messages:
-        _write(writer, message, channel)
-        done += 1
-        if done % REPORT_EVERY == 0:
-            progress("copying", done / max(total, 1))
-    return done
-
-
-def _write(writer: BagWriter, message: Message, channel: Channel) -> None:
-    writer.add_topic(message.topic, message.msgtype, like=channel)
-    writer.write(
-        message.topic,
-        message.msgtype,
-        message.data,
-        log_time_ns=message.log_time_ns,
-        publish_time_ns=message.publish_time_ns,
-    )
+    return first.log_ns

@@ -16,14 +16,17 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from bags.recordings.bag import Bag
+from bags.recordings.batch import Batch
+from bags.recordings.cdr import Numbers
 from bags.recordings.definitions import Definition
-from bags.signals.columns import Columns, expand_paths, stream_columns
+from bags.recordings.message_types import fields_of
+from bags.recordings.storage import NEVER
+from bags.signals.columns import Columns, TopicReader, expand_paths, joined_columns
 from bags.signals.expressions import Expression, Running
 from bags.signals.grid import seconds
 from bags.signals.reader import expanded, read_signals
 from bags.signals.resample import Method, resample
-from bags.signals.signal import SignalPath, numeric_paths
-from nlsid_core.arrays import FloatArray, IntArray
+from bags.signals.signal import NO_FIELD, SignalPath, numeric_paths
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
 
@@ -35,10 +38,14 @@ Table = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Exported:
-    """Rows of each file written; left_out: what of everything is not there, and why."""
+    """Rows of each file written; left_out: what of everything is not there, and why.
+
+    notes: where what the bag states and what is there differ.
+    """
 
     counts: Mapping[Path, int]
     left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def export_topics(
@@ -53,9 +60,10 @@ def export_topics(
 ) -> Exported:
     """One table per topic in the new folder `out`: times in ns, the signals after their operations.
 
-    A derivative is NaN until its window is full. signals: which (None: every number in every
-    message whose type can be read, but for arrays whose length changes). Raises BagError as
-    `read_signals` does for damage, and if `out` exists.
+    Rows are in the order of log time; a number has the type that it has in the message. A
+    derivative is NaN until its window is full. signals: which (None: every number in every message
+    that can be read, but for arrays whose length changes). Raises BagError as `read_signals` does
+    for damage, if there is nothing to export, and if `out` exists.
     """
     _check_format(form)
     out = Path(out)
@@ -63,17 +71,26 @@ def export_topics(
         raise BagError(f"{out} exists already; name another folder or move it away")
     with Bag(path, unfinished=unfinished, definitions=definitions) as bag:
         left_out: list[str] = []
+        tables: dict[str, dict[str, Expression]] = {}
         if signals:
-            columns = {str(found): found for found in expanded(bag, signals).values()}
+            for found in expanded(bag, signals).values():
+                tables.setdefault(found.path.topic, {})[str(found)] = found
         else:
-            columns = {str(path): Expression(path) for path in _every_number(bag, left_out)}
+            tables = _every_number(bag, left_out)
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             folder_path = Path(folder) / out.name
             folder_path.mkdir()
-            rows = _write_topics(bag, columns, folder_path, form, progress)
+            written = _Tables(bag, tables, folder_path, form)
+            written.write(progress, None if signals else left_out)
+            if not written.rows:
+                what = "; ".join(left_out) or "there are no messages"
+                raise BagError(f"{path}: nothing was exported: {what}")
             folder_path.rename(out)
-    return Exported({out / name: count for name, count in rows.items()}, tuple(left_out))
+        notes = tuple(bag.disagreements)
+    return Exported(
+        {out / name: count for name, count in written.rows.items()}, tuple(left_out), notes
+    )
 
 
 def export_grid(
@@ -131,23 +148,31 @@ def export_grid(
     return errors
 
 
-def _every_number(bag: Bag, left_out: list[str]) -> list[SignalPath]:
-    """Every number of every topic that has messages and a type that can be read."""
-    found: list[SignalPath] = []
+def _every_number(bag: Bag, left_out: list[str]) -> dict[str, dict[str, Expression]]:
+    """Topic -> every number of it, of those that have messages and a type that can be read.
+
+    One without any field has no column but its times.
+    """
+    found: dict[str, dict[str, Expression]] = {}
     for topic in bag.topics:
-        if not bag.count(topic):
+        if not any(channel.count for channel in bag.channels if channel.topic == topic):
             continue
+        paths: list[SignalPath] = []
         try:
-            kind = bag.types_on(topic)
-            texts = [f"{topic}:{path}" for path, *_ in numeric_paths(*kind)]
+            msgtype, types = bag.types_on(topic)
+            texts = [f"{topic}:{path}" for path, *_ in numeric_paths(msgtype, types)]
         except BagError as error:
             left_out.append(str(error))
             continue
         for path in map(SignalPath.parse, texts):
             try:
-                found += _steady(bag, path) if path.every else [path]
+                paths += _steady(bag, path) if path.every else [path]
             except BagError as error:
                 left_out.append(f"{path}: {error}")
+        if paths or fields_of(msgtype, types).keys() <= {NO_FIELD}:
+            found[topic] = {str(path): Expression(path) for path in paths}
+        elif not texts:
+            left_out.append(f"{topic}: a '{msgtype}' holds no number, and text is not exported")
     return found
 
 
@@ -158,34 +183,91 @@ def _steady(bag: Bag, path: SignalPath) -> list[SignalPath]:
     elements = expand_paths(bag, [path])
     if len(elements) > MAX_COLUMNS:
         raise BagError(f"{len(elements)} elements; name those you need")
-    for _ in stream_columns(bag, {str(element): element for element in elements}):
-        pass
+    reader = TopicReader(bag, path.topic, {str(element): element for element in elements})
+    for _, batch in bag.batches([path.topic]):
+        reader.read(batch)
     return elements
 
 
-def _write_topics(
-    bag: Bag,
-    columns: Mapping[str, Expression],
-    folder: Path,
-    form: str,
-    progress: Progress,
-) -> dict[str, int]:
-    writers: dict[str, TableWriter] = {}
-    rows: dict[str, int] = {}
-    try:
-        paths = {name: signal.path for name, signal in columns.items()}
-        operations = _Operations(bag, columns)
-        for recorded in stream_columns(bag, paths, progress=progress):
-            part = operations.on(recorded)
-            name = f"{part.topic.strip('/').replace('/', '__')}.{form}"
-            if name not in writers:
-                writers[name] = _WRITERS[form](folder / name)
-            writers[name].write(_table(part))
-            rows[name] = rows.get(name, 0) + len(part)
-    finally:
-        for writer in writers.values():
+class _Tables:
+    """The tables of all topics. rows: of each file."""
+
+    def __init__(
+        self, bag: Bag, tables: Mapping[str, Mapping[str, Expression]], folder: Path, form: str
+    ) -> None:
+        self.rows: dict[str, int] = {}
+        self._bag, self._folder, self._form = bag, folder, form
+        self._tables = {topic: _Table(bag, topic, columns) for topic, columns in tables.items()}
+        self._writers: dict[str, tuple[str, Any]] = {}
+
+    def write(self, progress: Progress, left_out: list[str] | None) -> None:
+        """Write them all; a topic that cannot be read is left out, or with None an error."""
+        total, done = sum(c.count for c in self._bag.channels if c.topic in self._tables), 0
+        try:
+            for channel, batch, later_ns in self._bag.parts(list(self._tables)):
+                try:
+                    if channel.topic in self._tables:
+                        self._append(
+                            channel.topic, self._tables[channel.topic].add(batch, later_ns)
+                        )
+                except BagError as error:
+                    if left_out is None:
+                        raise
+                    left_out.append(str(error))
+                    self._remove(channel.topic)
+                done += len(batch)
+                progress("reading", done / max(total, 1))
+            for topic, table in self._tables.items():
+                self._append(topic, table.ready(NEVER))
+        finally:
+            for _, writer in self._writers.values():
+                writer.close()
+
+    def _append(self, topic: str, part: Columns | None) -> None:
+        if part is None or not len(part):
+            return
+        if topic not in self._writers:
+            name = topic.strip("/").replace("/", "__")
+            while f"{name}.{self._form}" in self.rows:  # /a/b and /a__b
+                name += "_"
+            name += f".{self._form}"
+            self._writers[topic] = name, _WRITERS[self._form](self._folder / name)
+        name, writer = self._writers[topic]
+        writer.write(_table(part))
+        self.rows[name] = self.rows.get(name, 0) + len(part)
+
+    def _remove(self, topic: str) -> None:
+        del self._tables[topic]
+        if topic in self._writers:
+            name, writer = self._writers.pop(topic)
             writer.close()
-    return rows
+            (self._folder / name).unlink()
+            del self.rows[name]
+
+
+class _Table:
+    """The rows of one topic, which wait until no message with an earlier log time can come."""
+
+    def __init__(self, bag: Bag, topic: str, columns: Mapping[str, Expression]) -> None:
+        self._reader = TopicReader(bag, topic, {name: s.path for name, s in columns.items()})
+        self._operations = _Operations(bag, columns)
+        self._waiting: list[Columns] = []
+
+    def add(self, batch: Batch, later_ns: int) -> Columns | None:
+        """Read more messages; the rows that are ready."""
+        self._waiting.append(self._reader.read(batch))
+        return self.ready(later_ns)
+
+    def ready(self, later_ns: int) -> Columns | None:
+        """The rows with log times before `later_ns`, in order; None if there are none."""
+        if not self._waiting or min(int(p.log_ns.min()) for p in self._waiting) >= later_ns:
+            return None
+        part = joined_columns(self._waiting)
+        if (np.diff(part.log_ns) < 0).any():
+            part = part.select(np.argsort(part.log_ns, kind="stable"))
+        count = int(np.searchsorted(part.log_ns, later_ns))
+        self._waiting = [part.select(slice(count, None))] if count < len(part) else []
+        return self._operations.on(part.select(slice(count)))
 
 
 class _Operations:
@@ -204,7 +286,7 @@ class _Operations:
         values = {name: self._value(name, part) for name in part.values}
         return replace(part, values=values)
 
-    def _value(self, name: str, part: Columns) -> FloatArray:
+    def _value(self, name: str, part: Columns) -> Numbers:
         recorded = part.values[name]
         if name not in self._running:
             return recorded
@@ -214,9 +296,9 @@ class _Operations:
         return np.array([self._running[name].update(*row) for row in rows])
 
 
-def _table(part: Columns) -> dict[str, IntArray | FloatArray]:
+def _table(part: Columns) -> dict[str, Numbers]:
     times = (part.log_ns, part.publish_ns, part.stamp_ns)
-    table: dict[str, IntArray | FloatArray] = {
+    table: dict[str, Numbers] = {
         name: column for name, column in zip(TIMES, times, strict=True) if column is not None
     }
     return table | {name.partition(":")[2]: values for name, values in part.values.items()}

@@ -1,4 +1,5 @@
-"""Is a recording fit for identification? Clock, regularity, excitation, saturation, quantisation.
+"""Is a recording fit for identification? Clock, regularity, excitation, saturation, quantisation,
+one publisher of each signal.
 
 Each check gives findings; the worst of them is the verdict. The thresholds are named below with
 their reasons; none of them proves anything, they say where to look.
@@ -110,6 +111,9 @@ def check_fitness(
             commands.append(None)
             continue
         commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
+        for name, samples in read.items():
+            if doubt := samples.doubt(responds=name in y_names):
+                findings.append(Finding(Level.BAD, "publishers", doubt))
         for samples in measured:
             findings += _regularity(samples)
             findings += _range(samples)

@@ -87,7 +87,10 @@ class TopicInfo:
 
 @dataclass(frozen=True, eq=False)
 class BagInfo:
-    """A bag and its topics. ending: why it stops early, None if it is whole."""
+    """A bag and its topics. ending: why it stops early, None if it is whole.
+
+    notes: where what it states and what is there differ, and records that are no messages.
+    """
 
     path: Path
     files: int
@@ -95,11 +98,14 @@ class BagInfo:
     ending: str | None
     custom: Mapping[str, str]
     topics: tuple[TopicInfo, ...]
+    notes: tuple[str, ...] = ()
 
     def lost(self, topic: TopicInfo) -> int | None:
         """Messages lost, by the recorder's count or sequence numbers; None if neither counts."""
         said = self.custom.get(topic.topic + LOST, "")
-        counts = [int(said)] if said.isdecimal() else []
+        if said and not said.isdecimal():
+            return None  # of several publishers
+        counts = [int(said)] if said else []
         counts += [] if topic.missing is None else [topic.missing]
         return max(counts, default=None)
 
@@ -137,7 +143,7 @@ def bag_info(
         }
         total, done = sum(c.count for c in bag.channels if c.topic in found), 0
         for channel, batch in bag.batches(list(found)):
-            found[channel.topic].add(batch)
+            found[channel.topic].add(batch, bag.strand(channel))
             done += len(batch)
             progress("reading", done / max(total, 1))
         return BagInfo(
@@ -147,6 +153,7 @@ def bag_info(
             ending=bag.ending,
             custom=bag.custom,
             topics=tuple(collector.info() for collector in found.values()),
+            notes=(*bag.lost, *bag.disagreements),
         )
 
 
@@ -158,7 +165,7 @@ class _Collector:
     size: int = 0
     log_ns: list[IntArray] = field(default_factory=list)
     stamp_ns: list[IntArray] = field(default_factory=list)
-    sequence: list[IntArray] = field(default_factory=list)
+    sequence: dict[int, list[IntArray]] = field(default_factory=dict)
     unreadable: str = ""
 
     def __post_init__(self) -> None:
@@ -170,14 +177,17 @@ class _Collector:
         except BagError as error:
             self.unreadable = str(error)
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: Batch, strand: int) -> None:
         self.size += int(batch.size.sum())
         self.log_ns.append(batch.log_ns)
-        self.sequence.append(batch.sequence)
+        self.sequence.setdefault(strand, []).append(batch.sequence)
+        if batch.unreadable and not self.unreadable:
+            self.unreadable = next(iter(batch.unreadable.values()))
+            self._gatherer = None
         if self._gatherer is None:
             return
         try:
-            seconds, nanoseconds = self._gatherer.gather(batch).astype(np.int64)
+            seconds, nanoseconds = (n.astype(np.int64) for n in self._gatherer.gather(batch))
         except UnreadableMessageError as error:
             self.unreadable, self._gatherer = str(error), None
             return
@@ -195,7 +205,9 @@ class _Collector:
             "first_ns": int(log_ns[0]),
             "last_ns": int(log_ns[-1]),
         }
-        values["missing"] = _missing(np.concatenate(self.sequence))
+        counted = [missing(np.concatenate(parts)) for parts in self.sequence.values()]
+        known = [count for count in counted if count is not None]
+        values["missing"] = sum(known) if known else None
         if self._gatherer is not None:
             stamp_ns = np.concatenate(self.stamp_ns)[order]
             steps = np.diff(stamp_ns)
@@ -218,7 +230,7 @@ class _Collector:
         return TopicInfo(**values)
 
 
-def _missing(sequence: IntArray) -> int | None:
+def missing(sequence: IntArray) -> int | None:
     """Numbers left out by a recorder that counted up from message to message; None otherwise."""
     steps = np.diff(np.sort(sequence))
     if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):

@@ -29,12 +29,13 @@ def test_a_publishers_count_tells_what_is_missing_until_there_is_another_publish
     for number in (7, 8, 11, 12, 20):
         sequence.update(number)
     assert sequence.missing == 2 + 7
-    for number in (1, 2, 4):  # it came back
+    for number in (5, 6, 8):  # it came back, and was heard from its fifth message on
         sequence.update(number)
     assert sequence.missing == 2 + 7 + 1
-    for number in (300, 5, 301, 6):  # another one beside it
+    assert not sequence.mixed
+    for number in (300, 9, 301, 10):  # another one beside it
         sequence.update(number)
-    assert sequence.missing == 0
+    assert sequence.mixed
 
 
 def test_the_last_seconds_are_kept_and_nothing_older(tmp_path: Path) -> None:

@@ -144,7 +144,7 @@ def test_two_types_on_one_topic(tmp_path: Path) -> None:
 def test_a_serialisation_that_is_not_cdr(tmp_path: Path) -> None:
     file = tmp_path / "json.mcap"
     _write_mcap(file, ("Float64", "float64 data", "json"))
-    assert "/x is serialised as 'json', only 'cdr' can be read" in refused(file, "/x:data")
+    assert "/x: it is serialised as 'json', only 'cdr' is read" in refused(file, "/x:data")
 
 
 @pytest.mark.skipif(not RESOURCES.is_dir(), reason=f"needs {RESOURCES.name} beside the repository")
@@ -218,8 +218,7 @@ def test_a_dynamic_array_that_becomes_too_short(tmp_path: Path) -> None:
     [
         lambda text: text.replace("trial.mcap", "../../elsewhere.mcap"),
         lambda text: text.replace("trial.mcap", "/etc/passwd"),
-        lambda text: text.replace("version: 9", "version: 99"),
-        lambda text: text.replace("storage_identifier: mcap", "storage_identifier: pickle"),
+        lambda text: text.replace("version: 9", "version: nine"),
     ],
 )
 def test_metadata_that_lies_is_refused(bag: Path, damage: Callable[[str], str]) -> None:

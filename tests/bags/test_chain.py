@@ -1,8 +1,11 @@
 """The chain on the shipped F1TENTH bags, through the command line, with the promised figures."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -322,12 +325,17 @@ def replay(chain: Path, bag: Path) -> Replay:
     return replay_bag(proved, bag, centre=Centre.COMMAND)
 
 
-def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
-    split = config.split.model_copy(update={"test": ("trial_05", "trial_5"), "calibration": ()})
-    bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
-    given = config.model_copy(update={"split": split})
-    trials = read_trials(bags, given, progress=silent)
-    assert trials.absent == ("trial_5",)
+@pytest.mark.parametrize("use", ["test", "validation", "calibration"])
+@pytest.mark.parametrize("name", ["trial_5", "trial_?", "trial_04.2"])
+def test_a_name_in_the_split_that_no_bag_has_is_refused(
+    config: Config, use: str, name: str
+) -> None:
+    split = {"test": ("trial_05",), "calibration": ()}
+    split[use] = (*split.get(use, ()), name)
+    given = config.model_copy(update={"split": config.split.model_copy(update=split)})
+    bags = [bag for bag in f1tenth() if bag.name in ("trial_04", "trial_05", "trial_06")]
+    with pytest.raises(DataError, match=rf"split\.{use} names {re.escape(name)}"):
+        read_trials(bags, given, progress=silent)
 
 
 def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Path) -> None:
@@ -516,6 +524,48 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
     assert not (tmp_path / documents.FUNNEL).exists()
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("monitor", "--replay", "BAG", "--funnel", "FUNNEL"),
+        ("check", "FUNNEL_PROOF"),
+        ("bag", "info", "BAG"),
+        ("bag", "signals", "BAG", "--json"),
+        ("fleet", "monitor", "BAG", "--funnel", "FUNNEL"),
+    ],
+)
+def test_the_status_is_the_same_where_nobody_reads_what_is_said(
+    chain: Path, verb: tuple[str, ...]
+) -> None:
+    """As in `nlsid ... | head`: status 1 means outside, bad or rejected, and nothing is."""
+    words = {
+        "BAG": trial("05"),
+        "FUNNEL": chain / documents.FUNNEL,
+        "FUNNEL_PROOF": chain / documents.FUNNEL_PROOF,
+    }
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "bags.commands.cli", *(str(words.get(w, w)) for w in verb)]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.pictures
+def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_path: Path) -> None:
+    with Bag(trial("05")) as source, BagWriter(tmp_path / "short") as target:
+        for message in list(source.messages())[:9]:
+            kind, _ = source.types_on(message.topic)
+            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
+            target.write(message.topic, kind, message.data, **times)
+    picture = tmp_path / "monitor.png"
+    picture.write_bytes(b"of another run")
+    arguments = ["monitor", "--replay", str(tmp_path / "short"), "--plot", str(picture)]
+    done = CliRunner().invoke(app, [*arguments, "--funnel", str(chain / documents.FUNNEL)])
+    assert done.exit_code == 2
+    assert picture.read_bytes() == b"of another run"
+
+
 def edited(tmp_path: Path, **changes: object) -> Path:
     """The shipped configuration with dotted keys changed."""
     import yaml
@@ -563,9 +613,10 @@ def test_a_configuration_that_is_no_mapping_is_refused(tmp_path: Path, text: str
     [
         (["nowhere"], {}, "there is no bag"),
         (["01", "02"], {}, "none of the bags is a test trial"),
-        (["05", "11"], {}, "all of the bags are test trials"),
+        (["05"], {}, "all of the bags are test trials"),
+        (["01", "05", "06"], {"split__test": ["trial_05", "trial_6"]}, "no bag is called so"),
         (["01", "05"], {"grid__period": 0.05}, "period"),
-        (["06", "07", "08", "11"], {}, "constant"),
+        (["06", "07", "05"], {}, "constant"),
         (["01", "02", "05"], {"identification__lags": 40}, "rows for 82 parameters"),
     ],
 )
@@ -574,7 +625,8 @@ def test_bad_input_ends_in_one_message_and_leaves_nothing_behind(
 ) -> None:
     out = tmp_path / "out"
     paths = [str(trial(b)) if b.isdigit() else str(tmp_path / b) for b in bags]
-    arguments = ["identify", *paths, "--config", str(edited(tmp_path, **changes))]
+    split = {"split__test": ["trial_05"], "split__calibration": []}
+    arguments = ["identify", *paths, "--config", str(edited(tmp_path, **(split | changes)))]
     done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
     assert isinstance(done.exception, NlsidError)
     assert reason in str(done.exception)

@@ -80,7 +80,8 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
             messages = [
                 (str(c), str(batch.sequence[i]), str(batch.log_ns[i]), str(batch.publish_ns[i]),
                  batch.data(i))
-                for c, batch in file.batches(list(found.channels))
+                for _, batches in file.runs(list(found.channels))
+                for c, batch in batches
                 for i in range(len(batch))
             ]  # fmt: skip
             assert messages == [
@@ -163,7 +164,7 @@ def test_service_event_schemas_spoil_only_their_own_topics() -> None:
 @needs_resources
 def test_a_serialisation_that_is_not_cdr_is_refused_by_name() -> None:
     for storage in ("mcap", "sqlite3"):
-        with pytest.raises(BagError, match="'wrong_format', only 'cdr' can be read"):
+        with pytest.raises(BagError, match="'wrong_format', only 'cdr' is read"):
             read_signals(TESTS / storage / "wrong_rmw_test", ["/test_topic:data"])
 
 

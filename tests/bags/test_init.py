@@ -282,7 +282,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
     named += [argument for u in excitations for argument in ("-u", u)]
-    nlsid("init", *f1tenth()[:4], "--out", config, *named)
+    nlsid("init", *f1tenth()[:6], "--out", config, *named)
     signals = load_config(config).signals
     assert [signal.unit for signal in signals.response] == ["m/s", "cm/s", "m"]
     assert [signal.name for signal in signals.response] == [
@@ -291,7 +291,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
     again = nlsid(
-        "init", *f1tenth()[:4], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
+        "init", *f1tenth()[:6], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
     )
     assert "is named twice" in again
 
@@ -450,6 +450,93 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     assert all(trial.u.min() > 0.4 for trial in trained)
     spread = np.std(np.concatenate([t.y for t in trained if t.name.startswith("run_1")]))
     assert float(expected[2]) == pytest.approx(spread, rel=5e-3), "run_1 was held back"
+
+
+def lagging(folder: Path, *, period: float, trials: int = 3) -> Path:
+    """Bags of a number `/b` that follows `/a` with a lag, on topics that say nothing of a role."""
+    kind = "std_msgs/msg/Float64"
+    number = standard_types().types[kind]
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        drives = answers = 0.0
+        with BagWriter(folder / f"run_{trial}") as writer:
+            for k in range(300):
+                drives = float(rng.uniform(-1.0, 1.0)) if k % 15 == 0 else drives
+                answers += 0.2 * (drives - answers)
+                values = {"/a": drives, "/b": answers + 0.01 * float(rng.standard_normal())}
+                for topic, value in values.items():
+                    data = bytes(standard_types().serialize_cdr(number(value), kind))
+                    stamp = START_NS + round(1e9 * period * k)
+                    writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("period", "named", "question"),
+    [
+        (0.02, ("-u", "/a:data", "-y", "/b:data"), ""),
+        (0.02, ("-u", "/b:data", "-y", "/a:data"), "are they swapped? /b:data follows /a:data by"),
+        (20.0, ("-u", "/a:data", "-y", "/b:data"), "20 s apart, 0.05 Hz; is it so, or were times"),
+    ],
+)
+def test_what_seems_wrong_is_asked_before_anything_is_written(
+    tmp_path: Path, period: float, named: tuple[str, ...], question: str
+) -> None:
+    bags, config = lagging(tmp_path / "bags", period=period), tmp_path / "robot.yaml"
+    if question:
+        refused = nlsid("init", bags, "--out", config, *named, status=None)
+        assert question in refused
+        assert not config.exists()
+    said = nlsid("init", bags, "--out", config, *named, *(["--yes"] if question else []))
+    assert said.count("mind: ") == 1 + bool(question), "and that they have no stamps"
+    assert question in said
+    assert ("if the question above is answered" in said) is bool(question)
+
+
+def test_a_command_that_by_its_type_is_measured_is_asked_about(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    speeds = [np.cumsum(rng.standard_normal(100)) for _ in range(2)]
+    bag = speed_bag(tmp_path / "run", *speeds)
+    said = nlsid("init", bag, "--out", tmp_path / "a.yaml", "-u", SPEED, "-y", CMD, status=None)
+    assert f"by type and name {CMD} drives and {SPEED} is measured" in said
+
+
+@pytest.mark.parametrize("named", [("-u", CMD, "-y", SPEED), ("-u", CMD), ("-y", SPEED), ()])
+def test_a_command_that_never_varies_is_an_answer_and_no_configuration(
+    tmp_path: Path, named: tuple[str, ...]
+) -> None:
+    speeds = np.cumsum(np.random.default_rng(0).standard_normal((2, 200)), axis=1)
+    for k, speed in enumerate(speeds):
+        speed_bag(tmp_path / "bags" / f"run_{k}", speed, np.full(200, 0.3))
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", tmp_path / "bags", "--yes", "--out", config, *named, status=1)
+    assert said.count("nothing was written: ") == 1
+    assert CMD in said
+    assert not config.exists()
+
+
+def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) -> None:
+    """Steps of 20, 22 and 22 ms in turn: on a grid of the median a monitor judges 4 samples."""
+    stamps = START_NS + np.cumsum([20_000_000, 22_000_000, 22_000_000] * 100)
+    for k in range(3):
+        rng = np.random.default_rng(k)
+        command = np.repeat(rng.uniform(-1.0, 1.0, 20), 15)
+        speed = np.convolve(command, 0.2 * 0.8 ** np.arange(60))[:300]
+        speed += 0.01 * rng.standard_normal(300)
+        speed_bag(tmp_path / "bags" / f"run_{k}", speed, command, stamps_ns=stamps.tolist())
+    config = tmp_path / "robot.yaml"
+    nlsid("init", tmp_path / "bags", "--out", config, "-u", CMD, "-y", SPEED)
+    grid = load_config(config).grid
+    assert grid.period == pytest.approx(0.0213333, rel=1e-3)
+    assert grid.resample == "none"
+    whole_way(tmp_path / "bags", config, tmp_path / "out")
+    median = config.read_text().replace(f"period: {grid.period}", "period: 0.022")
+    config.write_text(median)
+    out = tmp_path / "median"
+    told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 33 new runs"
+    assert told in nlsid("identify", tmp_path / "bags", "--config", config, "--out", out)
+    model = out / documents.MODEL
+    assert told in nlsid("funnel", "--model", model, "--config", config, "--out", out)
 
 
 def two_axes(folder: Path) -> None:
@@ -696,7 +783,7 @@ def heater(folder: Path, *, trials: int, kelvin: int = -1, motions: int = 0) -> 
     return folder
 
 
-SLOW = ("-u", "/power:data", "-y", "/temperature:data")
+SLOW = ("-u", "/power:data", "-y", "/temperature:data", "--yes")  # a sample a second it is
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ def test_a_damaged_chunk_is_named_and_the_others_come_back(chunked: Path, tmp_pa
         read_signals(chunked, [SPEED])
     recovery = recover(chunked, tmp_path / "whole")
     assert recovery.messages == (CHUNKS - 1) * PER_CHUNK
-    assert len(recovery.lost) == 1
+    assert any("states 120 messages, 110 are there" in what for what in recovery.lost)
     assert f"the chunk at byte {block.offset}" in recovery.lost[0]
     values = read_signals(tmp_path / "whole", [SPEED])[SPEED].values
     assert set(values) == set(range(120)) - set(range(40, 50))
@@ -110,7 +110,9 @@ def test_a_folder_without_metadata_gets_them(tmp_path: Path) -> None:
     bag = speed_bag(tmp_path / "run", np.arange(5.0), np.arange(5.0))
     (bag / "metadata.yaml").write_text("not: [metadata")
     recovery = recover(bag, tmp_path / "whole")
-    assert (recovery.messages, recovery.lost) == (10, ())
+    assert recovery.messages == 10
+    [lost] = recovery.lost
+    assert "metadata.yaml: it is not YAML" in lost
     with Bag(bag / "run.mcap") as before, Bag(tmp_path / "whole") as after:
         assert list(before.messages()) == list(after.messages())
 
@@ -130,11 +132,11 @@ def test_an_interrupted_copy_leaves_nothing_half_written(tmp_path: Path) -> None
         "import os, signal, sys\n"
         "from bags.tools import recover\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # some shells ignore it
-        "original = recover._copy\n"
-        "def copy(*a):\n"
-        "    original(*a)\n"
+        "original = recover.copy_messages\n"
+        "def copy(*a, **k):\n"
+        "    original(*a, **k)\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "recover._copy = copy\n"
+        "recover.copy_messages = copy\n"
         f"recover.recover({str(bag)!r}, {str(tmp_path / 'whole')!r})\n"
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)

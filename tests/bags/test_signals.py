@@ -25,7 +25,7 @@ def test_a_path_parses_into_topic_and_steps_and_prints_back() -> None:
         "",
         "/odom",
         "/odom:",
-        "odom:twist",
+        "odom-:twist",
         "/odom/:twist",
         "/odom:twist..x",
         "/odom:twist.x[",

@@ -1,5 +1,6 @@
 """Cone programs with known answers, by every solver there is, and the ladder."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -124,3 +125,28 @@ def test_sizes_and_numbers_are_checked_before_solving() -> None:
         ConeProgram(program.P, program.q * np.nan, program.A, program.b, program.cones)
     with pytest.raises(SolverError, match="not installed"):
         solve(program, "no such solver")
+
+
+def test_a_panic_of_the_solver_is_an_attempt_that_failed_and_prints_nothing(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """One column, entries of 10^-215 to 10^241: the eigenvalues of a step are not numbers."""
+    column = """-2.88481220941042e-82 0 0 -3.054797044781065e101 0
+        -3.094823539018133e-36 0 -1.611280049830286e-215 0 3.578324344076351e20"""
+    limits = """1.5052027581482968e72 3.272103161582988e-89 5.302264302162142e46
+        -2.695988004602899e-283 3.850686863014254e76 -2.8356640469606646e154
+        -3.3870182999492134e-186 -1.4487954331111758e-103 4.365991851993807e156
+        -1.6834951674147448e241"""
+    A, b = (np.array(numbers.split(), dtype=np.float64) for numbers in (column, limits))
+    program = ConeProgram(
+        sp.csc_matrix((1, 1)),
+        np.array([4.04773233831723e285]),
+        sp.csc_matrix(A[:, None]),
+        b,
+        (Cone("psd", 4),),
+    )
+    outcome = conic._clarabel(program, conic.TOLERANCE, refine=True)
+    with conic._STDERR.without_panics():
+        os.write(2, b"kept")
+    assert outcome.status == "panicked"
+    assert capfd.readouterr().err == "kept"

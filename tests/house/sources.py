@@ -11,7 +11,7 @@ from functools import cache, cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("nlsid_core", "bags", "nlsid_ros")
+PACKAGES = ("nlsid_core", "bags", "nlsid_ros", "nlsid")
 ROS = re.compile(
     r"rcl\w*|ros\w*_runtime_py|\w+_(msgs|srvs|interfaces)|ament_\w+|launch(_ros)?|tf2\w*"
 )

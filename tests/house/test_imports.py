@@ -5,10 +5,12 @@ import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+import nlsid
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, modules_loaded_by, sources
 
 # Each package may import itself and those before it.
@@ -16,6 +18,7 @@ DOWNWARD = {
     "nlsid_core": {"nlsid_core"},
     "bags": {"nlsid_core", "bags"},
     "nlsid_ros": {"nlsid_core", "bags", "nlsid_ros"},
+    "nlsid": {"nlsid_core", "bags"},  # hands names on, and nothing inside uses it
 }
 # The rooms of bags, each standing on those before it.
 ROOMS = (
@@ -28,7 +31,7 @@ BANDS = {
     "run": {"running"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs", "designs"},
-    "base": {"errors", "arrays", "files", "options", "progress"},
+    "base": {"errors", "arrays", "files", "options", "progress", "native"},
     "kernel": {"kernel"},
 }
 BELOW = {
@@ -230,6 +233,19 @@ HEAVY = {"numpy", "scipy", "matplotlib", "yaml", "rosbags", "mcap", "lz4", "zsta
 def test_importing_the_packages_loads_nothing_else() -> None:
     assert loaded_by(["nlsid_core", "bags"]) == {"nlsid_core", "bags"}
     assert loaded_by(["nlsid_core.kernel"]) == {"nlsid_core"}
+
+
+def test_the_face_hands_names_on_and_loads_nothing_before_one_is_used() -> None:
+    assert loaded_by(["nlsid"]) == {"nlsid"}
+    assert 25 <= len(nlsid.__all__) <= 40
+    written = sources("nlsid")[0].imports
+    said = {entry.name: entry.module for entry in written if entry.package != "typing"}
+    for name in nlsid.__all__:
+        thing = getattr(nlsid, name)
+        there = getattr(thing, "__name__", name)
+        assert getattr(import_module(said[there]), there) is thing, name
+    with pytest.raises(AttributeError, match="no attribute 'Kalman'"):
+        nlsid.Kalman  # type: ignore[attr-defined]  # noqa: B018
 
 
 def test_help_and_check_start_without_numpy(tmp_path: Path) -> None:

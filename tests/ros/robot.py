@@ -22,19 +22,13 @@ PERIOD_NS = 25_000_000
 GOOD = list(range(10))
 
 
-class Robot:
-    """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
+class Ear:
+    """Hears what nodes say of themselves."""
 
-    def __init__(self, node: Node, spin_until: SpinUntil, folder: Path) -> None:
+    def __init__(self, node: Node, spin_until: SpinUntil) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
         self.levels: dict[str, bytes] = {}
-        self.bundle = Bundle.load(folder / FUNNEL)
-        self.latched = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
-        self.publish(self.bundle)
-        self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
-        self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
-        self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
 
     def _hear(self, message: DiagnosticArray) -> None:
@@ -43,13 +37,26 @@ class Robot:
             self.said.setdefault(status.name, []).append((status.message, values))
             self.levels[status.name] = status.level
 
-    def publish(self, bundle: Bundle) -> None:
-        """Publish a design, latched."""
-        self.latched.publish(String(data=bundle.text()))
-
     def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
         """Whether `node` has said `text`."""
         return any(text in said for said, _ in self.said.get(node, []))
+
+
+class Robot(Ear):
+    """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
+
+    def __init__(self, node: Node, spin_until: SpinUntil, folder: Path) -> None:
+        super().__init__(node, spin_until)
+        self.bundle = Bundle.load(folder / FUNNEL)
+        self.latched = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
+        self.publish(self.bundle)
+        self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
+        self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
+        self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
+
+    def publish(self, bundle: Bundle) -> None:
+        """Publish a design, latched."""
+        self.latched.publish(String(data=bundle.text()))
 
     def ready(self, monitors: int = 1) -> None:
         """Wait until the monitors listen."""

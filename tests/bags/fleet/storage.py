@@ -11,7 +11,7 @@ from threading import Thread
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from bags.recordings.part import CUSTOM_DATA
+from bags.recordings.mcap_records import CUSTOM_DATA
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,

@@ -1,0 +1,242 @@
+"""A ROS 1 bag as blocks of messages, also one that was not closed.
+
+The file is walked record by record from its start. Its index is not needed: chunks say how many
+messages of each connection they have, and the last chunk of a killed recorder is looked into.
+
+Source: the ROS bag format, version 2.0, http://wiki.ros.org/Bags/Format/2.0.
+"""
+
+import bz2
+import mmap
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import lz4.frame
+import numpy as np
+from mcap.records import Channel, Schema
+
+from bags.recordings.batch import Batch, batch_of
+from bags.recordings.mcap_records import MAX_CHUNK_BYTES, Block, Contents
+from bags.recordings.quality import KEY, LATCHED, offered_text
+from nlsid_core.errors import BagError
+
+ROS1_MAGIC: Final = b"#ROSBAG V2.0\n"
+MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+LOOSE: Final = ""  # the compression of messages outside chunks
+_LENGTH: Final = struct.Struct("<I")
+_TIME: Final = struct.Struct("<II")
+_INDEX_ENTRY: Final = np.dtype([("seconds", "<u4"), ("nanoseconds", "<u4"), ("offset", "<u4")])
+
+Fields = Mapping[bytes, bytes]
+
+
+class Ros1File:
+    """A ROS 1 bag open for reading. Close it.
+
+    Raises BagError if a record is damaged; one that was not closed opens, and says so in
+    `contents.ending`. With `salvage=True` damaged chunks are left out and listed in
+    `contents.lost`.
+    """
+
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+        self.path = path
+        self.contents = Contents(good_bytes=len(ROS1_MAGIC))
+        self._salvage = salvage
+        with path.open("rb") as stream:
+            self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            self._walk()
+            self._look_into_chunks()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._content.close()
+
+    def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """The messages of one block, one batch per channel that has any."""
+        if not any(channel in (block.index or {}) for channel in channels):
+            return
+        content = self._unpacked(block)
+        found: dict[int, list[tuple[int, int, int]]] = {}
+        for fields, start, end in _records(content, 0, len(content)):
+            if _number(fields, b"op") == MESSAGE:
+                place = start, end - start, _time(fields)
+                found.setdefault(_number(fields, b"conn"), []).append(place)
+        for channel in channels:
+            if channel in found:
+                start, size, log_ns = np.array(found[channel], np.int64).T
+                yield channel, batch_of(content, start, size, log_ns)
+
+    def _walk(self) -> None:
+        found = self.contents
+        header: Fields = {}
+        try:
+            for fields, start, end in _records(self._content, len(ROS1_MAGIC), len(self._content)):
+                kind = _number(fields, b"op")
+                if kind == HEADER:
+                    header = fields
+                elif kind == CONNECTION:
+                    self._add_connection(fields, self._content[start:end])
+                elif kind == CHUNK:
+                    found.blocks.append(_chunk(fields, start, end))
+                elif kind == INDEX:
+                    self._add_index(fields, start, end)
+                elif kind == MESSAGE:
+                    self._add_loose(found.good_bytes, end)
+                found.good_bytes = end
+        except BagError as error:
+            found.ending = str(error)
+        if header.get(b"encryptor"):
+            raise BagError("it is encrypted")
+        if found.ending is None and not _number(header, b"index_pos"):
+            found.ending = "it was not closed: it has no index"
+        chunks = sum(block.compression != LOOSE for block in found.blocks)
+        if found.ending is None and chunks != _number(header, b"chunk_count"):
+            found.ending = f"it has {chunks} chunks, and says another number at its start"
+
+    def _add_loose(self, start: int, end: int) -> None:
+        """A message outside chunks: of the chunk in which a recorder was killed."""
+        last = self.contents.blocks[-1] if self.contents.blocks else None
+        if last is not None and last.compression == LOOSE and last.end == start:
+            self.contents.blocks[-1] = replace(last, size=end - last.offset)
+        else:
+            self.contents.blocks.append(Block(start, end - start, LOOSE, end - start))
+
+    def _add_connection(self, fields: Fields, data: bytes) -> None:
+        number, said = _number(fields, b"conn"), _fields(data)
+        topic = fields.get(b"topic", b"").decode("utf-8", "replace")
+        kind = said.get(b"type", b"").decode("utf-8", "replace")
+        profiles = {KEY: offered_text([LATCHED])} if said.get(b"latching") == b"1" else {}
+        schema = Schema(number, said.get(b"message_definition", b""), "ros1msg", kind)
+        self.contents.schemas.setdefault(number, schema)
+        self.contents.channels.setdefault(number, Channel(number, topic, "ros1", profiles, number))
+
+    def _add_index(self, fields: Fields, start: int, end: int) -> None:
+        count = _number(fields, b"count")
+        if not self.contents.blocks or count * _INDEX_ENTRY.itemsize != end - start:
+            raise BagError(f"the index at byte {start} is damaged")
+        entries = np.frombuffer(self._content[start:end], _INDEX_ENTRY)
+        block = self.contents.blocks[-1]
+        times = entries["seconds"].astype(np.int64) * 10**9 + entries["nanoseconds"]
+        first_ns = int(times.min()) if count else block.start_ns
+        self.contents.blocks[-1] = replace(
+            block,
+            start_ns=min(block.start_ns, first_ns) if block.index else first_ns,
+            index={**(block.index or {}), _number(fields, b"conn"): (start, count)},
+        )
+
+    def _look_into_chunks(self) -> None:
+        """Find what chunks without an index, or of connections not told yet, declare and hold."""
+        found, kept = self.contents, []
+        found.stated = None if found.ending else _counts(found.blocks)
+        for block in found.blocks:
+            told = block.index is not None and block.index.keys() <= found.channels.keys()
+            try:
+                kept.append(block if told and not self._salvage else self._indexed(block))
+            except BagError as error:
+                if not self._salvage and found.ending is None:
+                    raise
+                found.lost.append(str(error))
+        found.blocks = kept
+        found.counts = _counts(kept)
+        if unknown := found.counts.keys() - found.channels.keys():
+            raise BagError(f"messages of connection {min(unknown)}, which nothing declares")
+
+    def _indexed(self, block: Block) -> Block:
+        counts: dict[int, int] = {}
+        times = []
+        content = self._unpacked(block)
+        for fields, start, end in _records(content, 0, len(content)):
+            if _number(fields, b"op") == CONNECTION:
+                self._add_connection(fields, content[start:end])
+            elif _number(fields, b"op") == MESSAGE:
+                times.append(_time(fields))
+                number = _number(fields, b"conn")
+                counts[number] = counts.get(number, 0) + 1
+        index = {number: (0, count) for number, count in counts.items()}
+        return replace(block, start_ns=min(times, default=0), index=index)
+
+    def _unpacked(self, block: Block) -> bytes:
+        where, size = f"the chunk at byte {block.offset}", block.uncompressed_size
+        if size > MAX_CHUNK_BYTES:
+            raise BagError(f"{where} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES} are read")
+        raw = self._content[block.offset : block.end]
+        if block.compression in (LOOSE, "none"):
+            return raw
+        decompressors = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+        if block.compression not in decompressors:
+            raise BagError(f"{where} is compressed by '{block.compression}'; known are bz2 and lz4")
+        try:
+            content: bytes = decompressors[block.compression]().decompress(raw, max_length=size + 1)
+        except (OSError, EOFError, RuntimeError) as error:
+            raise BagError(f"{where} cannot be decompressed: {error}") from error
+        if len(content) != size:
+            raise BagError(f"{where} holds {len(content)} bytes, its header says {size}")
+        return content
+
+
+def _counts(blocks: Sequence[Block]) -> dict[int, int]:
+    """Messages of each connection, as the blocks' indexes say."""
+    found: dict[int, int] = {}
+    for block in blocks:
+        for number, (_, count) in (block.index or {}).items():
+            found[number] = found.get(number, 0) + count
+    return found
+
+
+def _chunk(fields: Fields, start: int, end: int) -> Block:
+    compression = fields.get(b"compression", b"").decode("utf-8", "replace")
+    return Block(start, end - start, compression, _number(fields, b"size"))
+
+
+def _records(content: bytes | mmap.mmap, at: int, end: int) -> Iterator[tuple[Fields, int, int]]:
+    """(header, first byte of the data, their end) of each record; BagError if one is cut."""
+    while at < end:
+        header, header_end = _span(content, at, end)
+        start, at = _span(content, header_end, end)
+        yield _fields(content[header:header_end]), start, at
+
+
+def _span(content: bytes | mmap.mmap, at: int, end: int) -> tuple[int, int]:
+    """First byte and end of what follows its length."""
+    start = at + _LENGTH.size
+    if start <= end:
+        length: int = _LENGTH.unpack_from(content, at)[0]
+        if start + length <= end:
+            return start, start + length
+    raise BagError(f"what starts at byte {at} runs past the end")
+
+
+def _fields(header: bytes) -> Fields:
+    found, at = {}, 0
+    while at < len(header):
+        start = at + _LENGTH.size
+        if start > len(header):
+            raise BagError("a record's header is damaged")
+        at = start + _LENGTH.unpack_from(header, at)[0]
+        name, equals, value = header[start:at].partition(b"=")
+        if not equals or at > len(header):
+            raise BagError("a record's header is damaged")
+        found[name] = value
+    return found
+
+
+def _number(fields: Fields, name: bytes) -> int:
+    """A number of a record's header, of as many bytes as it has there."""
+    if name not in fields:
+        raise BagError(f"a record without '{name.decode()}'")
+    return int.from_bytes(fields[name], "little")
+
+
+def _time(fields: Fields) -> int:
+    stamp = fields.get(b"time", b"")
+    if len(stamp) != _TIME.size:
+        raise BagError("a message without a time")
+    seconds, nanoseconds = _TIME.unpack(stamp)
+    return int(seconds) * 10**9 + int(nanoseconds)

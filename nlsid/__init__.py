@@ -1,0 +1,122 @@
+"""Provably stable models from a robot's recordings, proved funnels, and the monitor of a robot.
+
+`read_bags` gives trials, `identify` a model, `design` a funnel with its proof; `load` and `check`
+have a proof decided again, and `Monitor` holds a robot against it. A name is imported when it is
+first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from bags.samples import f1tenth
+    from bags.signals.grid import read_dataset as read_bags
+    from nlsid_core.data.trajectory import Dataset, Trajectory
+    from nlsid_core.design import (
+        ContinuousTracking,
+        Goal,
+        OutputTube,
+        SampledTracking,
+        compose_funnels,
+        design,
+        integrate_nominal,
+        nominal_through,
+        plan_motion,
+    )
+    from nlsid_core.designs import Design
+    from nlsid_core.designs import load_design as load
+    from nlsid_core.dynamics import Nominal, VectorField
+    from nlsid_core.dynamics.taylor import taylor_field
+    from nlsid_core.errors import NlsidError
+    from nlsid_core.identification import (
+        BlockCascadeClass,
+        CellClass,
+        FeedbackClass,
+        Fit,
+        ImplicitClass,
+        LeastSquares,
+        LinearClass,
+        Rie,
+        Rse,
+        Sem,
+        StateAffineClass,
+        identify,
+    )
+    from nlsid_core.models import Signal
+    from nlsid_core.proofs import check
+    from nlsid_core.running.monitor import Monitor
+    from nlsid_core.running.reading import Reading, Status
+
+__all__ = [
+    "BlockCascadeClass",
+    "CellClass",
+    "ContinuousTracking",
+    "Dataset",
+    "Design",
+    "FeedbackClass",
+    "Fit",
+    "Goal",
+    "ImplicitClass",
+    "LeastSquares",
+    "LinearClass",
+    "Monitor",
+    "NlsidError",
+    "Nominal",
+    "OutputTube",
+    "Reading",
+    "Rie",
+    "Rse",
+    "SampledTracking",
+    "Sem",
+    "Signal",
+    "StateAffineClass",
+    "Status",
+    "Trajectory",
+    "VectorField",
+    "check",
+    "compose_funnels",
+    "design",
+    "f1tenth",
+    "identify",
+    "integrate_nominal",
+    "load",
+    "nominal_through",
+    "plan_motion",
+    "read_bags",
+    "taylor_field",
+]
+
+_CLASSES: Final = (
+    "LinearClass", "StateAffineClass", "ImplicitClass", "BlockCascadeClass", "CellClass",
+    "FeedbackClass",
+)  # fmt: skip
+_METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
+_PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
+_MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
+_HOMES: Final = {
+    "bags.samples": ("f1tenth",),
+    "bags.signals.grid": ("read_bags",),
+    "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
+    "nlsid_core.models": ("Signal",),
+    "nlsid_core.identification": ("identify", "Fit", *_CLASSES, *_METHODS),
+    "nlsid_core.design": ("design", *_PROBLEMS, *_MOTIONS, "compose_funnels"),
+    "nlsid_core.designs": ("Design", "load"),
+    "nlsid_core.dynamics": ("Nominal", "VectorField"),
+    "nlsid_core.dynamics.taylor": ("taylor_field",),
+    "nlsid_core.proofs": ("check",),
+    "nlsid_core.running.monitor": ("Monitor",),
+    "nlsid_core.running.reading": ("Reading", "Status"),
+    "nlsid_core.errors": ("NlsidError",),
+}
+_CALLED_THERE: Final = {"read_bags": "read_dataset", "load": "load_design"}
+_HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'nlsid' has no attribute '{name}'")
+    return getattr(import_module(_HOME_OF[name]), _CALLED_THERE.get(name, name))
+
+
+def __dir__() -> list[str]:
+    return __all__
