@@ -24,6 +24,7 @@ from bags.chain.simulation import Push, record_repeats, run_policy
 from benchmarks.machine import describe
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import (
     TrackingDesign,
     assume,
@@ -193,7 +194,7 @@ def designed(robot: Robot, task: Task, model: MeasuredState, seed: int) -> Made:
     runs = Dataset(tuple(commissioning))
     assumption = assume(model, policy, feedback, runs, safety_factor=task.safety_factor)
     started, cpu = time.perf_counter(), time.process_time()
-    design = design_state_funnel(model, policy, feedback, assumption=assumption)
+    design = design_state_funnel(SampledTracking(model, policy, feedback, assumption=assumption))
     design_seconds = time.perf_counter() - started
     with tempfile.TemporaryDirectory() as name:
         proof = design.save(name)[-1]
@@ -211,13 +212,17 @@ def compared(design: TrackingDesign, feedback: Feedback) -> tuple[float, float]:
     """
     assumption = design.funnel.assumption
     ideal = design_state_funnel(
-        design.model,
-        design.policy,
-        feedback,
-        assumption=replace(assumption, bound=0.0, measured=0.0),
+        SampledTracking(
+            design.model,
+            design.policy,
+            feedback,
+            assumption=replace(assumption, bound=0.0, measured=0.0),
+        )
     )
     small = design_state_funnel(
-        design.model, design.policy, feedback, assumption=assumption, start=assumption.bound
+        SampledTracking(
+            design.model, design.policy, feedback, assumption=assumption, start=assumption.bound
+        )
     )
     ratio = float(design.funnel.inlet[0] / ideal.funnel.inlet[0])
     widths = small.funnel.half_widths[:, 0]

@@ -20,6 +20,7 @@ from bags.chain.plants import ROBOTS, Robot
 from bags.chain.simulation import record_repeats
 from benchmarks.bridge import TASKS, VALIDATION, compared, designed
 from benchmarks.machine import describe
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import assume, design_state_funnel, frame
 from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import FORMS
@@ -66,7 +67,9 @@ def compared_forms(robot: Robot, seed: int) -> dict[str, Form]:
             safety_factor=task.safety_factor,
         )
         try:
-            design = design_state_funnel(model, policy, feedback, assumption=assumption)
+            design = design_state_funnel(
+                SampledTracking(model, policy, feedback, assumption=assumption)
+            )
             kept, floor = compared(design, feedback)
             found[form] = Form(assumption.bound, floor, kept)
         except Infeasible:

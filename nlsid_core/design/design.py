@@ -45,8 +45,8 @@ def design(
         raise DataError(f"the problem should be one of {kinds}, is {problem!r}")
     match problem:
         case OutputTube():
-            return design_output_tube(**vars(problem))
+            return design_output_tube(problem)
         case SampledTracking():
-            return design_state_funnel(**vars(problem), progress=progress)
+            return design_state_funnel(problem, progress=progress)
         case ContinuousTracking():
             return design_funnel(problem, executor=executor, progress=progress)
