@@ -48,7 +48,9 @@ class Infeasible(SolverError):  # noqa: N818 - a result of the field, named as t
 
 
 class CertificateRejected(NlsidError):  # noqa: N818 - a verdict, not a fault
-    """A proof does not prove its claim."""
+    """A proof does not prove its claim; reason: one of kernel.REASONS, if the kernel says so."""
+
+    reason = ""
 
 
 class CertificateMismatch(CertificateRejected):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nlsid_core import files, kernel
 from nlsid_core.arrays import Json
+from nlsid_core.deciding import Deciding
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.kernel import Verdict
 
@@ -17,18 +18,13 @@ FORMAT = "nlsid/proof"
 
 
 def check(path: Path | str) -> Verdict:
-    """Decide the proof file at `path` about the files beside it.
+    """Decide the proof file at `path` about the files beside it, in a process with limits.
 
     Returns a Verdict if, and only if, the claim is proved. Raises CertificateMismatch if a file
     is not the one that the proof is about, CertificateRejected with the reason if the proof is
     damaged, incomplete or does not prove its claim. OS errors for `path` itself pass through.
     """
-    try:
-        return kernel.check(path)
-    except kernel.Mismatch as refusal:
-        raise CertificateMismatch(str(refusal)) from refusal
-    except kernel.Rejected as refusal:
-        raise CertificateRejected(str(refusal)) from refusal
+    return Deciding(Path(path)).wait()
 
 
 def decide(document: Json | bytes, about: Mapping[str, Json | bytes]) -> Verdict:

@@ -152,11 +152,11 @@ class DesignSubscription:
             if "refused" in answer:
                 self._refuse(str(answer["refused"]))
             else:
-                self._accept(text, str(answer["proved"]))
+                when = " (decided before on this machine)" if answer["before"] else ""
+                self._accept(text, f"{answer['proved']}{when}")
         if self._check is not None and (seconds := self._check.seconds) > LONG:
             self.state = (
-                f"{CHECKING} for {seconds:.0f} s now, at a low priority: it is slow where others "
-                "want the processors"
+                f"{CHECKING} for {seconds:.0f} s now: it is slow where others want the processors"
             )
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None

@@ -2,8 +2,10 @@
 
 import functools
 import gc
+import os
 import signal
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +34,9 @@ gc.disable()
 
 # A runner reads the signatures of all commands whenever it runs one: 35 ms of processor time.
 pytest.MonkeyPatch().setattr("typer.testing._get_command", functools.cache(get_command))
+
+# What tests decide is remembered in no user's cache.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="nlsid-test-cache-")
 
 TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
 TRUE_B = np.array([0.0, 0.05, 0.03])

@@ -352,7 +352,7 @@ def split(
 
 @bag_app.command("import")
 def import_command(
-    tables: Annotated[list[Path], typer.Argument(help="CSV, MAT or HDF5 files.")],
+    tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
     bag_out: OutOption,
     assignments: Annotated[
         list[str],

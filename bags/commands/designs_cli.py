@@ -14,7 +14,7 @@ import typer
 from bags.commands.fleet_cli import SchedulerOption, WorkersOption
 from bags.commands.options import BagsArgument, OutOption, out
 from bags.commands.progress import progress_bar
-from nlsid_core import kernel
+from nlsid_core import deciding
 from nlsid_core import second as second_kernel
 from nlsid_core.errors import CertificateRejected
 
@@ -179,24 +179,38 @@ def check(
     second: Annotated[
         bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
     ] = False,
+    seconds: Annotated[
+        int, typer.Option(min=1, help="Processor time that a proof may take.")
+    ] = deciding.SECONDS,
+    memory: Annotated[int, typer.Option(min=1, help="MB that a proof may take.")] = deciding.MEMORY,
 ) -> None:
     """Decide proofs without a solver: PROVED (status 0), or REJECTED (status 1).
 
-    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
-    kernel was asked and has no opinion of it.
+    Below the verdict stands what its assumptions were measured on, which is not proved: status 1 if
+    that contradicts itself. Status 2 if a proof cannot be read, so that nothing was decided about
+    it, or if the second kernel was asked and has no opinion of it.
     """
+    from bags.designs.provenance import of_proof
+
     status = 0
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            said = str(kernel.check(path))
+            at_work = deciding.Deciding(path, seconds=seconds, memory=memory, remembered=False)
+            said = str(at_work.wait())
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
+            provenance = of_proof(path)
+            for line in provenance.said:
+                typer.echo(f"  measured, not proved: {line}")
+            for line in provenance.wrong:
+                typer.echo(f"  CONTRADICTED {line}")
+                status = max(status, 1)
             if second:
                 opinion = second_kernel.opinion(path)
                 typer.echo(f"  {opinion}")
                 status = max(status, {"accepted": 0, "refused": 1}.get(opinion.verdict, 2))
-        except (kernel.Rejected, CertificateRejected) as refusal:
+        except CertificateRejected as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")
         except OSError as error:

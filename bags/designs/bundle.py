@@ -1,26 +1,20 @@
 """A design's files as one text, which is published once and decided again by whoever receives it.
 
-What arrives is untrusted. A `Check` decides it in a process of its own, with bounds on its time and
-its memory, so that neither a large proof nor a hostile one holds up the loop that waits for it.
-
-python -m bags.designs.bundle < BUNDLE    one JSON object on standard output
+What arrives is untrusted. A `Check` has it decided in a process of its own, with limits of time and
+memory, so that neither a large proof nor a hostile one holds up the loop that waits for it.
 """
 
 import contextlib
 import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from bags.designs.design import AnyDesign, Wiring, read_design
-from nlsid_core import designs, files, proofs
+from nlsid_core import designs, files
 from nlsid_core.arrays import Json
+from nlsid_core.deciding import Deciding
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.files import read_regular
@@ -29,9 +23,6 @@ FORMAT: Final = "nlsid/bundle"
 PROOF: Final = "proof"  # the role of the file that names the others
 MAX_BYTES: Final = 16 * 2**20  # of a bundle; real ones have about 1 MB
 MAX_ROLES: Final = 401  # of a composition of 100 stages
-MAX_MEMORY: Final = 4 * 2**30  # bytes of address space to decide in
-MAX_TIME: Final = 600.0  # s to decide in
-NICE: Final = 10  # the loop that runs meanwhile comes first
 
 
 @dataclass(frozen=True)
@@ -109,16 +100,24 @@ class Bundle:
 
         Raises CertificateRejected or CertificateMismatch with the reason.
         """
+        verdict = self.deciding().wait()
+        self.refuse_others(verdict)
+        return verdict
+
+    def deciding(self) -> Deciding:
+        """The kernel at work on these files; CertificateRejected if there is no proof."""
         if PROOF not in self.contents:
             raise CertificateRejected("there is no proof in the bundle")
-        verdict = proofs.decide(self.contents[PROOF], self._files())
+        return Deciding.of(self.contents[PROOF], self._files())
+
+    def refuse_others(self, verdict: Verdict) -> None:
+        """Raise CertificateMismatch if the verdict is about other files than these."""
         found = {role: files.digest(content) for role, content in self.contents.items()}
         if found != verdict.digests or not ("funnel" in found or self._stages):
             raise CertificateMismatch(
                 f"the proof is about {', '.join(sorted(verdict.digests))}; with a funnel come "
                 f"{', '.join(sorted(found))}"
             )
-        return verdict
 
     def design(self, wiring: Wiring | None = None) -> AnyDesign:
         """The files as what a robot runs; decides nothing.
@@ -142,56 +141,43 @@ class Bundle:
 
 
 class Check:
-    """Decides a bundle's text in a process of its own; `poll` until it returns something."""
+    """Has the kernel decide a bundle's text in a process of its own; `poll` until it answers."""
 
     def __init__(self, text: str) -> None:
-        self.text = text
-        self._ends = time.monotonic() + MAX_TIME
-        self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - until close
-        with tempfile.TemporaryFile() as question:
-            question.write(text.encode("utf-8", "replace"))
-            question.seek(0)
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__],
-                stdin=question,
-                stdout=self._answer,
-                stderr=subprocess.DEVNULL,
-            )
+        self.text, self._deciding = text, None
+        self._refusal = ""
+        try:
+            self._bundle = Bundle.parse(text)
+            self._deciding = self._bundle.deciding()
+        except NlsidError as refusal:
+            self._refusal = str(refusal)
 
     def poll(self) -> Json | None:
-        """None while it works; then `proved` with the sentence, or `refused` with the reason."""
-        if self._process.poll() is None:
-            if time.monotonic() < self._ends:
+        """None while it works; then `proved` with the sentence, or `refused` with the reason.
+
+        digest: the funnel's. before: whether this machine had decided it.
+        """
+        if self._deciding is None:
+            return {"refused": self._refusal}
+        try:
+            verdict = self._deciding.poll()
+            if verdict is None:
                 return None
-            self._process.kill()
-            self._process.wait()
-            return {"refused": f"not decided within {MAX_TIME:g} s"}
-        self._answer.seek(0)
-        with contextlib.suppress(DocumentError):
-            return files.parse_document(self._answer.read(), source="verdict")
-        return {"refused": f"the kernel ended with status {self._process.returncode}"}
+            self._bundle.refuse_others(verdict)
+        except NlsidError as refusal:
+            return {"refused": str(refusal)}
+        before = self._deciding.before
+        return {"proved": str(verdict), "digest": self._bundle.digest, "before": before}
 
     @property
     def seconds(self) -> float:
         """s since it began."""
-        return time.monotonic() - self._ends + MAX_TIME
+        return 0.0 if self._deciding is None else self._deciding.seconds
 
     def close(self) -> None:
         """Call it off, or let go of what is left of it."""
-        self._process.kill()
-        self._process.wait()
-        self._answer.close()
-
-
-def decide(text: str) -> Json:
-    """`proved` with the sentence and the funnel's digest, or `refused` with the reason."""
-    try:
-        bundle = Bundle.parse(text)
-        verdict = bundle.decided()
-        bundle.design()
-    except (NlsidError, MemoryError) as refusal:
-        return {"refused": str(refusal) or "it takes too much memory to decide"}
-    return {"proved": str(verdict), "digest": bundle.digest}
+        if self._deciding is not None:
+            self._deciding.close()
 
 
 def _design(parts: Mapping[str, bytes], proof: bytes, wiring: Wiring | None) -> AnyDesign:
@@ -228,18 +214,3 @@ def _bytes(text: str) -> bytes:
 def _refuse_size(text: str) -> None:
     if len(text) > MAX_BYTES:
         raise DocumentError(f"bundle: {len(text)} characters; one has at most {MAX_BYTES}")
-
-
-def main() -> None:
-    """Decide the bundle on standard input."""
-    os.nice(NICE)
-    with contextlib.suppress(ImportError):  # other platforms have no such bounds
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
-        resource.setrlimit(resource.RLIMIT_CPU, (round(MAX_TIME), round(MAX_TIME)))
-    print(json.dumps(decide(sys.stdin.buffer.read().decode("utf-8", "replace"))))
-
-
-if __name__ == "__main__":
-    main()

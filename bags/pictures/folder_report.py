@@ -24,8 +24,9 @@ from bags.monitoring.replay import Replay
 from bags.pictures.equations_report import equations_chapter
 from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, report_available
 from bags.tools.info import GAP, BagInfo, TopicInfo
-from nlsid_core import files, kernel
-from nlsid_core.errors import DataError, DocumentError, NlsidError
+from nlsid_core import files, proofs
+from nlsid_core.errors import CertificateRejected, DataError, DocumentError, NlsidError
+from nlsid_core.kernel import Verdict
 
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -162,15 +163,15 @@ def _robot(report: Path) -> str:
     return found[1] if found else ""
 
 
-def _decided(path: Path) -> kernel.Verdict | str:
+def _decided(path: Path) -> Verdict | str:
     """A certificate, decided now: the verdict, or why it is none."""
     try:
-        return kernel.check(path)
-    except (kernel.Rejected, OSError) as refusal:
+        return proofs.check(path)
+    except (CertificateRejected, OSError) as refusal:
         return str(refusal)
 
 
-def _proof(name: str, found: kernel.Verdict | str) -> str:
+def _proof(name: str, found: Verdict | str) -> str:
     """What was decided of it, in words."""
     if isinstance(found, str):
         return f'<h3>{escape(name)}</h3><p class="not">{REJECTED}: {escape(found)}</p>'
@@ -314,7 +315,7 @@ def _replay(replay: Replay) -> str:
     )
 
 
-def _files(folder: Path, proofs: Mapping[str, kernel.Verdict | str]) -> str:
+def _files(folder: Path, proofs: Mapping[str, Verdict | str]) -> str:
     """Every file with its digest, and of which proofs it is a part, byte for byte."""
     parts: dict[str, list[str]] = {}
     for name, found in proofs.items():

@@ -1,6 +1,6 @@
 """metadata.yaml: what rosbag2 says of a bag beside its files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,6 +10,7 @@ import yaml
 from bags.recordings.quality import KEY, Profile
 from nlsid_core.files import write_atomically
 
+TYPE_HASH: Final = "topic_type_hash"  # of a channel's metadata, as rosbag2 writes it
 METADATA: Final = "metadata.yaml"
 METADATA_VERSION: Final = 9  # the rosbag2 metadata of ROS 2 Jazzy
 
@@ -25,26 +26,34 @@ class FileDescription:
 
 
 @dataclass(frozen=True)
-class TopicDescription:
-    """A topic's type, how its messages are serialised, its type's RIHS01 hash, what was offered."""
+class Topic:
+    """How a topic's messages are written; schema: its encoding and data. offered: see `quality`."""
 
+    name: str
     msgtype: str
     encoding: str
-    type_hash: str
+    schema: tuple[str, bytes]
+    metadata: Mapping[str, str]
     offered: tuple[Profile, ...] = ()
 
 
 def write_metadata(
     folder: Path,
     files: Sequence[FileDescription],
-    topics: Mapping[str, TopicDescription],
+    topics: Iterable[Topic],
     custom: Mapping[str, str],
 ) -> None:
-    """Make the folder a finished bag, as rosbag2 and rosbags read it."""
+    """Make the folder a finished bag, as rosbag2 and rosbags read it.
+
+    Of topics of one name the first is described.
+    """
+    named: dict[str, Topic] = {}
+    for topic in topics:
+        named.setdefault(topic.name, topic)
     starts = [file.first_ns for file in files if file.first_ns is not None]
     whole = FileDescription(
         "",
-        {topic: sum(file.counts.get(topic, 0) for file in files) for topic in topics},
+        {topic: sum(file.counts.get(topic, 0) for file in files) for topic in named},
         min(starts, default=None),
         max((file.last_ns for file in files), default=0),
     )
@@ -60,11 +69,11 @@ def write_metadata(
                     "type": topic.msgtype,
                     "serialization_format": topic.encoding,
                     KEY: [profile.document() for profile in topic.offered],
-                    "type_description_hash": topic.type_hash,
+                    "type_description_hash": topic.metadata.get(TYPE_HASH, ""),
                 },
                 "message_count": whole.counts[name],
             }
-            for name, topic in topics.items()
+            for name, topic in named.items()
         ],
         "compression_format": "",
         "compression_mode": "",

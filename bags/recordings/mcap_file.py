@@ -7,13 +7,14 @@ Every length is held against the bytes that are there before anything is allocat
 Source: the MCAP specification, https://mcap.dev/spec.
 """
 
+import os
 import re
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -21,6 +22,7 @@ from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema, 
 
 from bags.recordings.batch import Batch
 from bags.recordings.mcap_records import (
+    INDEX,
     INDEX_ENTRY,
     MAGIC,
     MESSAGE,
@@ -30,6 +32,7 @@ from bags.recordings.mcap_records import (
     Contents,
     add_channel,
     add_schema,
+    index_entries,
     messages_at,
     parse,
     uncompressed,
@@ -38,11 +41,11 @@ from bags.recordings.mcap_records import (
     walk_messages,
 )
 from bags.recordings.mcap_summary import ListedBlock, Prepared, summarised
-from bags.recordings.remote import RangeReader, RemotePath, place
-from nlsid_core.arrays import IntArray
+from bags.recordings.remote import RemotePath, place
 from nlsid_core.errors import BagError
 
 SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.FOOTER)
+ATTACHMENT_FIXED: Final = 8 + 8 + 4 + 4 + 8  # bytes of two times and three lengths
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
@@ -70,19 +73,21 @@ class McapFile:
         self.path = place(path)
         self._salvage = salvage
         self._size = self.path.stat().st_size
-        self._stream: BinaryIO | RangeReader = self.path.open("rb")
+        remote = isinstance(self.path, RemotePath)
+        self._stream = None if remote else self.path.open("rb", buffering=0)
         self._prepared: Prepared | None = None
         try:
             if not isinstance(self.path, RemotePath) or not self._read_summary(self.path):
                 self.contents = self._walk()
                 self._find_channels()
         except BaseException:
-            self._stream.close()
+            self.close()
             raise
 
     def close(self) -> None:
         """Close the file."""
-        self._stream.close()
+        if self._stream is not None:
+            self._stream.close()
 
     def __enter__(self) -> "McapFile":
         return self
@@ -131,13 +136,15 @@ class McapFile:
         where = f"the message index of the chunk at byte {block.offset}"
         buffer = self.content(block)
         if index is None:
-            offsets = {c: np.array(o, dtype=np.int64) for c, o in walk_messages(buffer).items()}
+            walked = walk_messages(buffer)
+            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
             where = f"the block at byte {block.offset}"
         else:
-            offsets = {c: self._indexed(*index[c]) for c in channels if c in index}
+            wanted = [c for c in channels if c in index]
+            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
         for channel in channels:
-            if len(found := offsets.get(channel, ())):
-                yield channel, messages_at(buffer, np.asarray(found), channel, where)
+            if channel in offsets and len(offsets[channel]):
+                yield channel, messages_at(buffer, offsets[channel], channel, where)
 
     def _prepared_batches(
         self, blocks: Sequence[ListedBlock], channels: Collection[int]
@@ -160,17 +167,29 @@ class McapFile:
             raise BagError(f"the chunk at byte {block.offset} is cut off")
         return uncompressed(block, raw)
 
-    def attachment_data(self, attachment: Attachment) -> bytes:
-        """The data of one of `contents.attachments`."""
-        offset, size = struct.unpack("<QQ", attachment.data)
-        return self._read(offset, size)
+    def attachments(self) -> Iterator[Attachment]:
+        """The attachments, whose data are read only now."""
+        for offset, length in self.contents.attachments:
+            content = self._read(offset, length)
+            try:
+                found = parse(Attachment.read, content)
+                names = len(found.name.encode()) + len(found.media_type.encode())
+                end = ATTACHMENT_FIXED + names + len(found.data)
+                crc = int.from_bytes(content[end : end + 4], "little")
+                if crc and crc != zlib.crc32(content[:end]):
+                    raise BagError(f"the attachment {found.name} is damaged: its checksum differs")
+            except BagError as error:
+                if not self._salvage:
+                    raise
+                self.contents.lost.append(str(error))
+                continue
+            yield found
 
     def _walk(self) -> Contents:
         found = Contents(ending="it stops without the end of an MCAP file")
         if self._read(0, len(MAGIC)) != MAGIC:
             raise BagError("not an MCAP file")
         at = found.good_bytes = len(MAGIC)
-        loose = _LooseRun()
         repeating = False
         while at + RECORD.size <= self._size:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
@@ -190,9 +209,8 @@ class McapFile:
                 if length < MESSAGE_FIXED:
                     raise BagError(f"the message at byte {at} has {length} bytes")
                 header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
-                loose.add(found, at, end, int(header["log"]))
+                _add_loose(found.blocks, at, end, int(header["log"]))
             else:
-                loose.close(found)
                 self._try_note(found, opcode, content, length)
             at = found.good_bytes = end
             repeating |= self._salvage and opcode == Opcode.DATA_END
@@ -200,7 +218,6 @@ class McapFile:
                 if self._read(at, len(MAGIC)) == MAGIC:
                     found.ending = None
                 break
-        loose.close(found)
         if repeating:
             found.ending = None
         if found.ending is not None and found.blocks:  # its index may be cut off
@@ -246,10 +263,16 @@ class McapFile:
         elif opcode == Opcode.METADATA:
             found.metadata.append(self._parse(Metadata.read, content, length))
         elif opcode == Opcode.ATTACHMENT:
-            found.attachments.append(self._attachment(content, length))
+            found.attachments.append((content, length))
         elif opcode == Opcode.STATISTICS:
             statistics = self._parse(Statistics.read, content, length)
             found.stated = dict(statistics.channel_message_counts)
+            for what, said, there in (
+                ("attachments", statistics.attachment_count, len(found.attachments)),
+                ("metadata records", statistics.metadata_count, len(found.metadata)),
+            ):
+                if said != there:
+                    found.lost.append(f"it has {there} {what}, its statistics say {said}")
         elif opcode == Opcode.FOOTER:
             self._check_summary(self._parse(Footer.read, content, length), content)
 
@@ -269,25 +292,12 @@ class McapFile:
         channel, size = unpack(_INDEX, self._read(content, _INDEX.size))
         if size % INDEX_ENTRY.itemsize or _INDEX.size + size > length:
             raise BagError(f"the message index at byte {content} is damaged")
+        start = content - RECORD.size
         block = blocks[-1]
         index = dict(block.index or {})
         if size:
-            index[channel] = (content + _INDEX.size, size // INDEX_ENTRY.itemsize)
+            index[channel] = start, INDEX.size + size
         blocks[-1] = replace(block, index=index)
-
-    def _attachment(self, content: int, length: int) -> Attachment:
-        """The attachment's header; `data` holds (offset, size) of its data, which stay on disk."""
-        head = self._read(content, min(length, 2**16))
-        log, create, letters = unpack(struct.Struct("<QQI"), head)
-        name = head[20 : 20 + letters].decode("utf-8", "replace")
-        at = 20 + letters
-        (letters,) = unpack(struct.Struct("<I"), head[at:])
-        media = head[at + 4 : at + 4 + letters].decode("utf-8", "replace")
-        at += 4 + letters
-        (size,) = unpack(struct.Struct("<Q"), head[at:])
-        if at + 8 + size > length:
-            raise BagError(f"the attachment at byte {content} is longer than its record")
-        return Attachment(create, log, name, media, struct.pack("<QQ", content + at + 8, size))
 
     def _check_summary(self, footer: Footer, content: int) -> None:
         start = footer.summary_start
@@ -308,7 +318,8 @@ class McapFile:
         damaged: list[Block] = []  # or without a message, so that it has no time
         for block in found.blocks:
             if block.index is not None and all(map(self._is_known, block.index)):
-                counts = {channel: count for channel, (_, count) in block.index.items()}
+                entries = {c: length - INDEX.size for c, (_, length) in block.index.items()}
+                counts = {c: length // INDEX_ENTRY.itemsize for c, length in entries.items()}
             else:
                 try:
                     counts = self._declared_in(block)
@@ -358,38 +369,25 @@ class McapFile:
                     f"channel {channel} has {there} messages, the file's statistics say {count}"
                 )
 
-    def _indexed(self, offset: int, count: int) -> IntArray:
-        raw = self._read(offset, count * INDEX_ENTRY.itemsize)
-        entries = np.frombuffer(raw, INDEX_ENTRY)
-        return entries["offset"].astype(np.int64)
-
     def _parse(self, read: Callable[[Any], Record], content: int, length: int) -> Record:
         if length > MAX_RECORD_BYTES:
             raise BagError(f"a record of {length} bytes at byte {content}; refused")
         return parse(read, self._read(content, length))
 
     def _read(self, offset: int, size: int) -> bytes:
-        self._stream.seek(offset)
-        return self._stream.read(min(size, max(0, self._size - offset)))
+        """Bytes of the file; fewer at its end."""
+        size = max(0, min(size, self._size - offset))
+        if isinstance(self.path, RemotePath):
+            return self.path.read_range(offset, offset + size)
+        assert self._stream is not None
+        return os.pread(self._stream.fileno(), size, offset)
 
 
-class _LooseRun:
-    """Messages outside chunks, gathered into blocks while the file is walked."""
-
-    def __init__(self) -> None:
-        self._start: int | None = None
-        self._end = 0
-        self._log_ns = 0
-
-    def add(self, found: Contents, at: int, end: int, log_ns: int) -> None:
-        if self._start is not None and end - self._start > LOOSE_RUN_BYTES:
-            self.close(found)
-        if self._start is None:
-            self._start, self._log_ns = at, log_ns
-        self._end, self._log_ns = end, min(self._log_ns, log_ns)
-
-    def close(self, found: Contents) -> None:
-        if self._start is not None:
-            size = self._end - self._start
-            found.blocks.append(Block(self._start, size, "", size, 0, self._log_ns))
-        self._start = None
+def _add_loose(blocks: list[Block], at: int, end: int, log_ns: int) -> None:
+    """A message outside chunks: with those before it a block that reads like a chunk."""
+    last = blocks[-1] if blocks else None
+    if last is None or last.end != at or last.size > LOOSE_RUN_BYTES:
+        blocks.append(Block(at, end - at, "", end - at, start_ns=log_ns))
+        return
+    size, start_ns = end - last.offset, min(last.start_ns, log_ns)
+    blocks[-1] = replace(last, size=size, uncompressed_size=size, start_ns=start_ns)

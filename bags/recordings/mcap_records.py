@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema
 
 from bags.recordings.batch import Batch
 from nlsid_core.arrays import IntArray
@@ -36,6 +36,7 @@ MESSAGE: Final = np.dtype(
         ("publish", "<u8"),
     ]
 )
+INDEX: Final = struct.Struct("<BQHI")  # a message index record before its entries
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE.itemsize - RECORD.size  # of a message's content, before its data
 
@@ -46,8 +47,8 @@ Record = TypeVar("Record")
 class Block:
     """A chunk, or a run of records outside chunks, which reads like an uncompressed one.
 
-    offset, size: bytes of its content in the file. index: channel -> (offset, count) of its message
-    index entries in the file; None if it has none.
+    offset, size: bytes of its content in the file. index: the channels that it has messages of, and
+    what finds them: in MCAP (offset, bytes) of the message index record in the file. None: unknown.
     """
 
     offset: int
@@ -75,7 +76,7 @@ class Contents:
     counts: dict[int, int] = field(default_factory=dict)
     blocks: list[Block] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)  # without their data
+    attachments: list[tuple[int, int]] = field(default_factory=list)  # offset, bytes of the content
     stated: dict[int, int] | None = None  # the statistics' count of messages per channel
     ending: str | None = None
     good_bytes: int = 0
@@ -176,6 +177,22 @@ def messages_at(
         _time(header["publish"], where),
         header["sequence"].astype(np.int64),
     )
+
+
+def index_entries(record: bytes, channel: int, where: str) -> IntArray:
+    """Offsets of a channel's messages in a chunk, from its message index record.
+
+    Raises BagError if that is damaged.
+    """
+    if len(record) < INDEX.size:
+        raise BagError(f"{where} is damaged")
+    opcode, length, of, size = INDEX.unpack_from(record)
+    fits = INDEX.size + size <= len(record) and INDEX.size + size <= RECORD.size + length
+    if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or size % INDEX_ENTRY.itemsize:
+        raise BagError(f"{where} is damaged")
+    listed: Any = np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
+    offsets: IntArray = listed["offset"].astype(np.int64)
+    return offsets
 
 
 def add_schema(schemas: dict[int, Schema], schema: Schema) -> None:

@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     Channel,
     ChunkIndex,
@@ -30,7 +29,6 @@ from mcap.records import (
 )
 
 from bags.recordings.mcap_records import (
-    INDEX_ENTRY,
     MAGIC,
     RECORD,
     Block,
@@ -38,6 +36,7 @@ from bags.recordings.mcap_records import (
     Record,
     add_channel,
     add_schema,
+    index_entries,
     parse,
     uncompressed,
     walk_records,
@@ -111,7 +110,11 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
         elif opcode == Opcode.METADATA_INDEX:
             metadata.append(parse(MetadataIndex.read, content))
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            found.attachments.append(_attachment(parse(AttachmentIndex.read, content), start))
+            attached = parse(AttachmentIndex.read, content)
+            if attached.offset + attached.length > start:
+                raise BagError(f"the attachment at byte {attached.offset} lies outside the file")
+            place = attached.offset + RECORD.size, attached.length - RECORD.size
+            found.attachments.append(place)
     if found.stated is None:
         return None
     found.blocks.sort(key=lambda block: block.offset)
@@ -167,16 +170,6 @@ def _listed(chunk: ChunkIndex, limit: int) -> ListedBlock:
         offset, chunk.compressed_size, chunk.compression, chunk.uncompressed_size, 0,
         chunk.message_start_time, index, record, end,
     )  # fmt: skip
-
-
-def _attachment(index: AttachmentIndex, limit: int) -> Attachment:
-    """The attachment's header; `data` holds (offset, size) of its data, which stay in place."""
-    names = len(index.name.encode()) + len(index.media_type.encode())
-    offset = index.offset + RECORD.size + 16 + 4 + 4 + names + 8
-    if offset + index.data_size > min(limit, index.offset + index.length):
-        raise BagError(f"the attachment at byte {index.offset} is longer than its record")
-    place = struct.pack("<QQ", offset, index.data_size)
-    return Attachment(index.create_time, index.log_time, index.name, index.media_type, place)
 
 
 class Prepared:
@@ -309,16 +302,10 @@ class Prepared:
         found = {}
         for channel, (at, length) in (block.index or {}).items():
             start, where = at - block.end, f"the message index at byte {at}"
-            if length < _INDEX.size:
-                raise BagError(f"{where} is damaged")
-            opcode, size, of, entries = _INDEX.unpack_from(records, start)
-            fits = RECORD.size + size <= length and 6 + entries == size
-            if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or entries % 16:
-                raise BagError(f"{where} is damaged")
-            listed: Any = np.frombuffer(records, INDEX_ENTRY, entries // 16, start + _INDEX.size)
-            if len(listed) and listed["offset"].max() >= block.uncompressed_size:
+            listed = index_entries(records[start : start + length], channel, where)
+            if len(listed) and listed.max() >= block.uncompressed_size:
                 raise BagError(f"{where} points outside its chunk")
-            found[channel] = listed["offset"].astype(np.int64)
+            found[channel] = listed
         return found
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,10 +10,10 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 
 from bags.recordings.definitions import standard_definition
-from bags.recordings.description import FileDescription
+from bags.recordings.description import FileDescription, Topic
 from bags.recordings.mcap_records import CUSTOM_DATA
 from bags.recordings.output import Output, Reserve
-from bags.recordings.quality import KEY, Profile, offered_text
+from bags.recordings.quality import KEY, offered_text
 from bags.recordings.storage import FORMATS, Channel
 from nlsid_core.errors import BagError
 
@@ -27,18 +26,6 @@ COMPRESSIONS: Final = {
     "lz4": CompressionType.LZ4,
     "none": CompressionType.NONE,
 }
-
-
-@dataclass(frozen=True)
-class Topic:
-    """How a topic's messages are written; schema: its encoding and data. offered: see `quality`."""
-
-    name: str
-    msgtype: str
-    encoding: str
-    schema: tuple[str, bytes]
-    metadata: Mapping[str, str]
-    offered: tuple[Profile, ...] = ()
 
 
 def topic_like(channel: Channel) -> Topic:

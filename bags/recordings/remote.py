@@ -178,12 +178,6 @@ class RemotePath(PosixPath):
                     child._entry = _entry(found)
                 yield child
 
-    def open(self, mode: str = "r", buffering: int = -1) -> "RangeReader":  # type: ignore[override]  # noqa: ARG002
-        """A stream of its bytes, for mode `rb`."""
-        if mode != "rb":
-            raise BagError(f"{self} can only be read; write to a folder of this machine")
-        return RangeReader(self)
-
     def read_bytes(self) -> bytes:
         """All of it."""
         return self.read_range(0, self.entry.size)
@@ -310,36 +304,6 @@ class RemotePath(PosixPath):
                     ) from error
                 time.sleep(wait * random.uniform(0.5, 1.0))
                 wait = min(2.0 * wait, LONGEST_WAIT)
-
-
-class RangeReader:
-    """A remote file as a binary stream whose reads are ranges."""
-
-    def __init__(self, path: RemotePath) -> None:
-        self.path = path
-        self._at = 0
-        self._size = path.entry.size
-
-    def seek(self, offset: int) -> int:
-        """Where the next read begins."""
-        self._at = offset
-        return offset
-
-    def read(self, size: int = -1) -> bytes:
-        """Up to `size` bytes from there; fewer at the end of the file."""
-        end = self._size if size < 0 else min(self._size, self._at + size)
-        content = self.path.read_range(self._at, end)
-        self._at += len(content)
-        return content
-
-    def close(self) -> None:
-        """Nothing stays open between requests."""
-
-    def __enter__(self) -> "RangeReader":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def place(given: Path | str, *, patience: float | None = None) -> Path:

@@ -11,11 +11,10 @@ from mcap.reader import make_reader
 from bags.recordings.description import (
     METADATA,
     FileDescription,
-    TopicDescription,
+    Topic,
     write_metadata,
 )
 from bags.recordings.part import Part, topic_like
-from bags.recordings.sqlite_file import TYPE_HASH
 from bags.recordings.storage import Storage
 from bags.recordings.writer import RESERVE
 from nlsid_core.errors import BagError
@@ -39,7 +38,7 @@ def repair(bag: Path) -> int:
     if not _is_unfinished(bag):
         raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
     files: list[FileDescription] = []
-    topics: dict[str, TopicDescription] = {}
+    topics: list[Topic] = []
     custom: dict[str, str] = {}
     scratch = Path(tempfile.mkdtemp(dir=bag.parent, prefix=f".{bag.name}.repair."))
     try:
@@ -51,11 +50,7 @@ def repair(bag: Path) -> int:
             finally:
                 storage.close()
             custom |= storage.custom
-            for channel in storage.channels:
-                type_hash = channel.metadata.get(TYPE_HASH, "")
-                topics[channel.topic] = TopicDescription(
-                    channel.msgtype, channel.encoding, type_hash, channel.offered
-                )
+            topics += map(topic_like, storage.channels)
             if finished is None:
                 (scratch / file.name).replace(file)
         write_metadata(bag, files, topics, custom)

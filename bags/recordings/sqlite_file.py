@@ -16,6 +16,7 @@ from urllib.parse import quote
 from mcap.records import Channel, Metadata, Schema
 
 from bags.recordings.batch import BATCH_BYTES, Batch, joined
+from bags.recordings.description import TYPE_HASH
 from bags.recordings.mcap_records import ROSBAG2, Block, Contents
 from bags.recordings.quality import KEY
 from nlsid_core.errors import BagError
@@ -23,7 +24,6 @@ from nlsid_core.errors import BagError
 BESIDE: Final = ("-wal", "-journal")
 COUNTED_TOGETHER: Final = 16  # messages: SQLite adds up what so many have
 OLD_RELEASE: Final = "galactic"  # which, like those before it, names no release in its files
-TYPE_HASH: Final = "topic_type_hash"
 
 
 class SqliteFile:

@@ -280,8 +280,7 @@ class Storage:
         """The attachments of MCAP files, with their data."""
         for file in self.files:
             if isinstance(file, McapFile):
-                for found in file.contents.attachments:
-                    yield replace(found, data=file.attachment_data(found))
+                yield from file.attachments()
 
     def parts(self, keys: Collection[int]) -> Iterator[tuple[int, Batch, int]]:
         """(channel key, messages, ns), in the order of the files.

@@ -11,11 +11,10 @@ from typing import Final
 from mcap.records import Attachment, Metadata
 
 from bags.recordings.definitions import Definition, standard_definition
-from bags.recordings.description import TopicDescription, write_metadata
+from bags.recordings.description import TYPE_HASH, Topic, write_metadata
 from bags.recordings.output import Reserve
-from bags.recordings.part import Part, Topic, topic_like
+from bags.recordings.part import Part, topic_like
 from bags.recordings.quality import Profile
-from bags.recordings.sqlite_file import TYPE_HASH
 from bags.recordings.storage import Channel, Raw
 from nlsid_core.errors import BagError
 
@@ -221,12 +220,8 @@ class BagWriter:
             for part in self._parts:
                 if not part.closed:
                     part.finish()
-            topics: dict[str, TopicDescription] = {}
-            for t in self._topics:
-                said = t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""), t.offered
-                topics.setdefault(t.name, TopicDescription(*said))
             files = [part.description for part in self._parts]
-            write_metadata(self._folder, files, topics, self._custom)
+            write_metadata(self._folder, files, self._topics, self._custom)
         except OSError:
             self.abandon()
             raise

@@ -1,4 +1,4 @@
-"""Tables (CSV, MAT, HDF5) to a bag of standard messages."""
+"""Tables (CSV, MAT) to a bag of standard messages."""
 
 import csv
 import math
@@ -121,7 +121,7 @@ def read_tables(files: Sequence[Path | str]) -> Tables:
 
     A CSV file without a header is one table by the file's name; with one, each column is a table by
     its own name, an empty cell is NaN, and a column without a number is left out. In MAT (up to
-    version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one, those in a struct by
+    version 7.2) files each numeric array is one, those in a struct by
     `struct.field`; nothing in them is evaluated. A file is called by its stem,
     with the folder before it where two have one stem. Raises DataError for a file that is none of
     these or holds no numbers.
@@ -131,8 +131,7 @@ def read_tables(files: Sequence[Path | str]) -> Tables:
     for path, label in _labels([Path(file) for file in files]):
         if path.stat().st_size > MAX_TABLE_BYTES:
             raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
-        readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat, ".h5": _hdf5}
-        readers |= {".hdf5": _hdf5}
+        readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat}
         reader = readers.get(path.suffix.lower())
         if reader is None:
             raise DataError(f"{path}: unknown kind; known are {', '.join(readers)}")
@@ -353,8 +352,8 @@ def _csv_by_cells(
 def _mat(path: Path) -> dict[str, FloatArray]:
     try:
         content = loadmat(path, squeeze_me=False)
-    except NotImplementedError:
-        return _hdf5(path)  # what SciPy says of version 7.3, which is HDF5
+    except NotImplementedError as error:
+        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
     except Exception as error:  # scipy raises what the bytes make it raise
         raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
     found: dict[str, FloatArray] = {}
@@ -371,27 +370,6 @@ def _collect(name: str, value: Any, found: dict[str, FloatArray], depth: int = 0
     elif isinstance(value, np.ndarray) and value.size == 1 and depth < MAX_STRUCT_DEPTH:
         for field in value.dtype.names or ():
             _collect(f"{name}.{field}", value.flat[0][field], found, depth + 1)
-
-
-def _hdf5(path: Path) -> dict[str, FloatArray]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise DataError(f"{path}: HDF5 needs h5py: pip install 'nlsid[export]'") from error
-    found: dict[str, FloatArray] = {}
-
-    def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim in (1, 2) and item.nbytes < MAX_TABLE_BYTES:
-            value = item[()]
-            if _is_table(value):
-                found[name] = _column(value)
-
-    try:
-        with h5py.File(path, "r") as content:
-            content.visititems(visit)
-    except OSError as error:
-        raise DataError(f"{path} is not an HDF5 file: {error}") from error
-    return found
 
 
 def _is_table(value: Any) -> bool:

@@ -10,7 +10,8 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.proofs.stability import prove_stability, storage_on
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import Node, parse
-from nlsid_core.kernel.matrix_polynomials import Box
+from nlsid_core.kernel.increments import Box
+from nlsid_core.kernel.models import read_model
 from nlsid_core.models import StableModel
 
 CORNERS = 16  # vertices whose Gramians balance a program
@@ -20,7 +21,7 @@ FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 def read_form(model: StableModel, bounds: Json | None) -> increments.Model:
     """As the kernel reads it; kernel.Rejected if it needs a box, or needs none."""
     node = None if bounds is None else parse(files.encode(bounds), "box")
-    return increments.read_model(parse(files.encode(model.document()), "model"), node)
+    return read_model(parse(files.encode(model.document()), "model"), node)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,8 @@ class Form:
         F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
         m = form.unknowns
         leaves: list[FloatArray] = [
-            np.array(form.vertices(part, ends), dtype=np.float64)
-            for part, ends in _parts(proof.multipliers, form.box)
+            np.array(form.E.vertices(part, ends), dtype=np.float64)
+            for part, ends in _parts(proof.multipliers, form.E.box)
         ]
         mean = np.mean([E.mean(axis=0) for E in leaves], axis=0) if m else np.zeros((0, len(F)))
         G = np.linalg.solve(mean[:, :m], mean[:, m:]) if m else mean
@@ -83,7 +84,7 @@ class Form:
             modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
         return cls(
             F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
-            H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
+            H[:, m:] - H[:, :m] @ G, form.E.ray, proof.rate, inputs,
             np.linalg.inv(proof.P),
         )  # fmt: skip
 

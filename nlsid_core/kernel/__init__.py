@@ -9,7 +9,7 @@ Read in this order: `files` (untrusted input), `exact` (definite matrices), `pol
 `positivity` (positive polynomials), then the claims, each a module with one `decide`.
 """
 
-from .checking import KINDS, Verdict, check, decide
-from .files import Mismatch, Rejected
+from .checking import KINDS, LEFT, Verdict, check, decide
+from .files import REASONS, Mismatch, Rejected
 
-__all__ = ["KINDS", "Mismatch", "Rejected", "Verdict", "check", "decide"]
+__all__ = ["KINDS", "LEFT", "REASONS", "Mismatch", "Rejected", "Verdict", "check", "decide"]

@@ -1,8 +1,14 @@
 """`python -I <this folder> FILE.proof.json ...`: PROVED or REJECTED for each; status 0, 1 or 2."""
 
+import argparse
 import importlib.util
+import json
+import signal
 import sys
+import time
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 if not __package__:  # run as a folder, by a Python that has no nlsid: be the package `kernel`
     _here = Path(__file__).resolve().parent
@@ -17,29 +23,61 @@ if not __package__:  # run as a folder, by a Python that has no nlsid: be the pa
 else:
     from . import checking as _kernel
 
-
-def _shown(path: str) -> str:
-    """A path on one line, as the terminal can print it."""
-    line = "".join(sign if sign.isprintable() else "?" for sign in path)
-    return line.encode("ascii", "replace").decode() if not path.isascii() else line
+SECONDS = 20  # of processor time for a proof; a large one takes 3
+MEMORY = 4096  # MB of address space
+AFTER = 5  # s that a proof has to end in when its time is up, before the system ends it
 
 
-def main(paths: list[str]) -> int:
+def limited(seconds: int, memory: int) -> None:
+    """Let the next proof take so much, from now on; says so where the system has no limits."""
+    try:
+        import resource
+    except ImportError:
+        print("no limits of time and memory on this system", file=sys.stderr)
+        return
+    until = int(time.process_time()) + 1 + seconds
+    resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, memory * 2**20))
+    resource.setrlimit(resource.RLIMIT_CPU, (until, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+    def too_long(_: int, __: FrameType | None) -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (until + AFTER, until + AFTER))
+        raise _kernel.Rejected(f"it takes more than {seconds} s of processor time", "too_long")
+
+    signal.signal(signal.SIGXCPU, too_long)
+
+
+def answer(path: str) -> dict[str, Any]:
+    """The verdict as JSON has it; `rejected` and its `reason`; or `unread`, why it was not read."""
+    try:
+        verdict = _kernel.check(path)
+    except OSError as error:
+        return {"unread": error.strerror}
+    except _kernel.Rejected as refusal:
+        return {"rejected": str(refusal), "reason": refusal.reason}
+    return {**vars(verdict), "margin": str(verdict.margin), "said": str(verdict)}
+
+
+def main(given: list[str]) -> int:
     """0 if every file is proved, 1 if one is rejected, 2 if one cannot be read."""
-    if not paths:
-        print("usage: python -I <kernel folder> FILE.proof.json ...", file=sys.stderr)
-        return 2
+    parser = argparse.ArgumentParser(prog="python -I <kernel folder>", description=__doc__)
+    parser.add_argument("files", nargs="+", metavar="FILE.proof.json")
+    parser.add_argument("--seconds", type=int, default=SECONDS, help="of processor time, each")
+    parser.add_argument("--memory", type=int, default=MEMORY, help="MB, of address space")
+    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    options = parser.parse_args(given)
     status = 0
-    for path in paths:
-        name = _shown(path)
-        try:
-            print(f"{name}: {_kernel.check(path)}")
-        except OSError as error:
-            print(f"{name}: cannot be read: {error.strerror}")
-            status = 2
-        except Exception as refusal:
-            print(f"{name}: REJECTED {refusal}")
-            status = max(status, 1)
+    for path in options.files:
+        limited(options.seconds, options.memory)
+        found = answer(path)
+        status = max(status, 2 if "unread" in found else 1 if "rejected" in found else 0)
+        if options.json:
+            print(json.dumps(found))
+            continue
+        line = "".join(sign if sign.isprintable() else "?" for sign in path)
+        name = line.encode("ascii", "replace").decode()
+        refused = f"REJECTED {found.get('rejected')} [{found.get('reason')}]"
+        said = found.get("said", refused)
+        print(f"{name}: " + (f"cannot be read: {found['unread']}" if "unread" in found else said))
     return status
 
 

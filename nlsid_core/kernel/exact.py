@@ -4,24 +4,14 @@ A matrix is a list of rows of Fractions or ints.
 """
 
 from collections.abc import Sequence
-from contextvars import ContextVar
 from fractions import Fraction
 from math import lcm
 
-from .files import Rejected, common_denominator
+from .files import common_denominator, refuse_if
 
 Matrix = list[list[Fraction]]
 Rows = Sequence[Sequence[Fraction | int]]
 MAX_ORDER = 200  # of a matrix whose definiteness is decided
-MAX_ELIMINATION = 10**8  # entries eliminated in one claim, long ones counted as several: 20 s
-LONG = 22  # an elimination whose longest numbers have b bits counts b^2 / 2^22 times
-
-_left: ContextVar[list[int] | None] = ContextVar("elimination", default=None)
-
-
-def allow_elimination() -> None:
-    """From here on all matrices of this context share MAX_ELIMINATION; otherwise each has it."""
-    _left.set([MAX_ELIMINATION])
 
 
 def definite(M: Rows, what: str) -> None:
@@ -42,24 +32,37 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
     entries are -(last pivot) g'M⁻¹g. Not strict, M ⪰ 0: a zero pivot is passed over if the rest of
     its row is zero, else M is indefinite.
     """
+    size = len(M)
+    refuse_if(
+        not 0 < size <= MAX_ORDER or any(len(row) != size for row in M),
+        f"{what} should be a square matrix of order 1 to {MAX_ORDER}",
+        "too_large",
+    )
+    refuse_if(
+        any(M[i][j] != M[j][i] for i in range(size) for j in range(i)),
+        f"{what} is not symmetric",
+        "not_definite",
+    )
+
     scales = [lcm(*(entry.denominator for entry in g)) for g in vectors]
     whole = [[int(e * scale) for e in g] for g, scale in zip(vectors, scales, strict=True)]
-    size = len(M)
-    if not 0 < size <= MAX_ORDER or any(len(row) != size for row in M):
-        raise Rejected(f"{what} should be a square matrix of order 1 to {MAX_ORDER}")
-    if any(M[i][j] != M[j][i] for i in range(size) for j in range(i)):
-        raise Rejected(f"{what} is not symmetric")
     common = common_denominator([entry for row in M for entry in row], what)
     rows = [[e.numerator * (common // e.denominator) for e in row] for row in M]
-    _spend(rows, whole, what)
     rows = [[*row, *(g[i] for g in whole)] for i, row in enumerate(rows)]
     corners, before = [0] * len(whole), 1
+
     for k, row in enumerate(rows):
         pivot = row[k]
-        if strict and pivot <= 0:
-            raise Rejected(f"{what} is not positive definite (leading minor {k + 1} of {size})")
-        if pivot < 0 or (pivot == 0 and any(row[k:])):
-            raise Rejected(f"{what} is not positive semidefinite")
+        refuse_if(
+            strict and pivot <= 0,
+            f"{what} is not positive definite (leading minor {k + 1} of {size})",
+            "not_definite",
+        )
+        refuse_if(
+            pivot < 0 or (pivot == 0 and any(row[k:])),
+            f"{what} is not positive semidefinite",
+            "not_definite",
+        )
         if pivot == 0:
             continue
         corners = [
@@ -70,6 +73,7 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
             head, pairs = row[i], zip(rows[i][i:], row[i:], strict=True)
             rows[i][i:] = [(a * pivot - head * b) // before for a, b in pairs]
         before = pivot
+
     return [
         Fraction(-corner * common, before * scale**2)
         for corner, scale in zip(corners, scales, strict=True)
@@ -78,20 +82,18 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
 
 def at_most(small: Fraction | int, large: Fraction | int, what: str) -> None:
     """Raise Rejected unless small <= large."""
-    if not small <= large:
-        raise Rejected(what)
+    refuse_if(not small <= large, what, "not_below")
+
+
+def dot(a: Sequence[Fraction | int], b: Sequence[Fraction | int]) -> Fraction:
+    """a'b."""
+    return Fraction(sum(p * q for p, q in zip(a, b, strict=True) if p and q))
 
 
 def product(A: Rows, B: Rows) -> Matrix:
     """A B."""
     columns = list(zip(*B, strict=True))
-    return [
-        [
-            sum((a * b for a, b in zip(row, column, strict=True) if a and b), Fraction(0))
-            for column in columns
-        ]
-        for row in A
-    ]
+    return [[dot(row, column) for column in columns] for row in A]
 
 
 def congruence(F: Rows, P: Rows) -> Matrix:
@@ -112,32 +114,22 @@ def combined(A: Rows, B: Rows, weight: Fraction | int = 1) -> Matrix:
     ]
 
 
-def _spend(rows: list[list[int]], more: list[list[int]], what: str) -> None:
-    """Take off what the elimination costs, `more` rows that are carried along included."""
-    size, bits = len(rows), max(abs(entry).bit_length() for row in rows for entry in row)
-    longest = size * bits + 2 * max((abs(e).bit_length() for row in more for e in row), default=0)
-    left = _left.get() or [MAX_ELIMINATION]
-    left[0] -= size**2 * (size + len(more)) * (1 + (longest**2 >> LONG))
-    if left[0] < 0:
-        raise Rejected(f"{what}: order {size} with entries of {bits} bits takes too long to decide")
-
-
-def block_diagonal(*blocks: Matrix) -> Matrix:
+def block_diagonal(*blocks: Rows) -> Matrix:
     """The blocks along the diagonal of a matrix that is zero elsewhere."""
     size, rows, start = sum(map(len, blocks)), [], 0
     for block in blocks:
         for row in block:
             end = size - start - len(block)
-            rows.append([Fraction(0)] * start + list(row) + [Fraction(0)] * end)
+            rows.append([Fraction(0)] * start + [Fraction(e) for e in row] + [Fraction(0)] * end)
         start += len(block)
     return rows
 
 
-def scaled(M: Matrix, weight: Fraction) -> Matrix:
+def scaled(M: Rows, weight: Fraction) -> Matrix:
     """Weight M."""
     return [[weight * entry for entry in row] for row in M]
 
 
-def zero(size: int) -> Matrix:
-    """A square matrix of zeros."""
-    return [[Fraction(0)] * size for _ in range(size)]
+def unit(i: int, size: int) -> list[Fraction]:
+    """Row i of the identity."""
+    return [Fraction(j == i) for j in range(size)]

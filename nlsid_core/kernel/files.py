@@ -30,18 +30,48 @@ MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a ma
 VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
-Terms = list[tuple[tuple[int, ...], Fraction]]  # of a polynomial: exponents and coefficients
+# Of a polynomial: exponents and coefficients. Exponents are bytes, whose hash no file can choose.
+Terms = list[tuple[bytes, Fraction]]
+
+# Why a proof is refused: the code of each "no".
+REASONS = {
+    "malformed": "a file is not as its page says",
+    "too_large": "a stated limit on sizes is exceeded, or memory",
+    "too_long": "it takes more processor time than is allowed",
+    "mismatch": "a file is not the one that the proof is about",
+    "unknown": "the kind of claim is not known",
+    "left": "the kind of claim, or the version of the file, is not decided any more",
+    "not_definite": "a matrix is not positive definite, or semidefinite",
+    "not_positive": "a polynomial is not shown to be positive",
+    "not_below": "a number exceeds its bound",
+    "not_covered": "a piece, a vertex or a mode is missing",
+    "not_valid": "the claim leaves where its model or equations hold",
+    "not_decided": "the kernel met what it did not expect",
+}
 
 
 class Rejected(Exception):  # noqa: N818 - a verdict
-    """The proof does not prove its claim; the message says why."""
+    """The proof does not prove its claim; the message says why, `reason` is one of REASONS."""
+
+    def __init__(self, message: str, reason: str = "malformed") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class Mismatch(Rejected):
     """A file is not the one that the proof is about."""
 
+    def __init__(self, message: str, reason: str = "mismatch") -> None:
+        super().__init__(message, reason)
 
-def by_degree(exponents: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+
+def refuse_if(wrong: object, message: str, reason: str = "malformed") -> None:
+    """Raise Rejected if something is wrong."""
+    if wrong:
+        raise Rejected(message, reason)
+
+
+def by_degree(exponents: bytes) -> tuple[int, bytes]:
     """The order of monomials: by total degree, then by their exponents."""
     return sum(exponents), exponents
 
@@ -80,11 +110,11 @@ class Node:
 
     def text(self) -> str:
         """A printable text of at most MAX_NAME characters."""
-        if type(self.value) is not str or len(self.value) > MAX_NAME:
-            raise Rejected(f"{self.where} should be a text of at most {MAX_NAME} characters")
-        if not self.value.isprintable():
-            raise Rejected(f"{self.where} should have no control characters")
-        return self.value
+        value = self.value
+        if type(value) is not str or len(value) > MAX_NAME or not value.isprintable():
+            wanted = f"at most {MAX_NAME} characters, none of them a control character"
+            raise Rejected(f"{self.where} should be a text of {wanted}")
+        return value
 
     def number(self) -> Fraction:
         """A float64, exactly."""
@@ -106,16 +136,19 @@ class Node:
         digits = above.removeprefix("-")
         parts = [digits] + ([below] if slash else [])
         for part in parts:
-            if not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS):
-                raise Rejected(f"{self.where} should be a number or a text p/q of whole numbers")
-        if slash and not int(below):
-            raise Rejected(f"{self.where} divides by zero")
+            refuse_if(
+                not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS),
+                f"{self.where} should be a number or a text p/q of whole numbers",
+            )
+        refuse_if(slash and not int(below), f"{self.where} divides by zero")
         return Fraction(int(above), int(below) if slash else 1)
 
     def integer(self) -> int:
         """A whole number; one beyond 2^53 is a text of digits."""
-        if type(self.value) is not int and (type(self.value) is not str or "/" in self.value):
-            raise Rejected(f"{self.where} should be a whole number")
+        refuse_if(
+            type(self.value) is not int and (type(self.value) is not str or "/" in self.value),
+            f"{self.where} should be a whole number",
+        )
         return self.rational().numerator
 
     def integers(self, least: int, most: int) -> tuple[int, ...]:
@@ -125,8 +158,10 @@ class Node:
             numbers: list[int] = entries
         else:
             numbers = [entry.integer() for entry in self.items(least, most)]
-        if not least <= len(numbers) <= most:
-            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
+        refuse_if(
+            not least <= len(numbers) <= most,
+            f"{self.where} should be a list of {least} to {most} entries",
+        )
         return tuple(numbers)
 
     def array(self, *shape: int | None) -> list:  # type: ignore[type-arg]
@@ -145,25 +180,28 @@ class Node:
             return [self._nested(entry, shape[1:], kind) for entry in value]
         for entry in value:
             if type(entry) is not int and (kind is int or type(entry) is not Fraction):
-                raise Rejected(
-                    f"{self.where} should hold {'whole ' if kind is int else ''}numbers only"
-                )
+                wanted = "whole numbers" if kind is int else "numbers"
+                raise Rejected(f"{self.where} should hold {wanted} only")
         return list(value) if kind is int else [Fraction(entry) for entry in value]
 
     def monomials(
-        self, count: int, degree: int = MAX_DEGREE, order: Callable[[Any], Any] | None = None
-    ) -> list[tuple[int, ...]]:
+        self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] | None = None
+    ) -> list[bytes]:
         """Distinct rows of `count` exponents, of `degree` together at most; sorted by `order`."""
-        rows = [tuple(row) for row in self.wholes(None, count)]
-        if len(rows) > MAX_STATED:
-            raise Rejected(f"{self.where}: {len(rows)} terms; at most {MAX_STATED} are taken")
-        if any(e < 0 for row in rows for e in row):
-            raise Rejected(f"{self.where}: an exponent is negative")
+        stated = self.wholes(None, count)
+        refuse_if(
+            len(stated) > MAX_STATED,
+            f"{self.where}: {len(stated)} terms; at most {MAX_STATED} are taken",
+            "too_large",
+        )
+        refuse_if(
+            any(min(row, default=0) < 0 or sum(row) > degree for row in stated),
+            f"{self.where}: exponents should be 0 or more, {degree} together at most",
+        )
+        rows = list(map(bytes, stated))
         if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
             wanted = "in increasing order" if order else "each once"
             raise Rejected(f"{self.where}: monomials should be distinct, {wanted}")
-        if any(sum(row) > degree for row in rows):
-            raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
         return rows
 
     def polynomial(self, count: int, degree: int = MAX_DEGREE, order: Any = by_degree) -> Terms:
@@ -206,17 +244,21 @@ class Node:
 def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
     """The least one; Rejected if it would make every number long."""
     common = 1
-    for denominator in {value.denominator for value in values}:
-        common = lcm(common, denominator)
-        if common.bit_length() > MAX_COMMON:
-            raise Rejected(f"{where}: denominators of more than {MAX_COMMON} bits together")
+    for value in values:
+        common = lcm(common, value.denominator)
+        refuse_if(
+            common.bit_length() > MAX_COMMON,
+            f"{where}: denominators of more than {MAX_COMMON} bits together",
+            "too_large",
+        )
     return common
 
 
 def parse(content: bytes, where: str) -> Node:
     """One JSON object."""
-    if len(content) > MAX_BYTES:
-        raise Rejected(f"{where}: {len(content)} bytes; at most {MAX_BYTES} are read")
+    refuse_if(
+        len(content) > MAX_BYTES, f"{where}: {len(content)} bytes; at most {MAX_BYTES}", "too_large"
+    )
     try:
         value = json.loads(
             content.decode("utf-8"),
@@ -227,8 +269,7 @@ def parse(content: bytes, where: str) -> Node:
         )
     except (ValueError, RecursionError, ArithmeticError) as error:
         raise Rejected(f"{where}: not a valid document: {plain(str(error))}") from error
-    if type(value) is not dict:
-        raise Rejected(f"{where}: expected a JSON object")
+    refuse_if(type(value) is not dict, f"{where}: expected a JSON object")
     return Node(value, where)
 
 
@@ -244,8 +285,10 @@ def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], d
     for role, binding in about.members(roles).items():
         entry = binding.members("file digest")
         name, stated = entry["file"].text(), entry["digest"].text()
-        if not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"):
-            raise Rejected(f"{role} file {name!r} is not a plain file name")
+        refuse_if(
+            not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"),
+            f"{role} file {name!r} is not a plain file name",
+        )
         try:
             content = read(name)
         except OSError as error:
@@ -268,8 +311,9 @@ def read_regular(path: Path) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise OSError(0, "not a regular file", str(path))
         content = stream.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise Rejected(f"{plain(path.name)}: more than {MAX_BYTES} bytes")
+    refuse_if(
+        len(content) > MAX_BYTES, f"{plain(path.name)}: more than {MAX_BYTES} bytes", "too_large"
+    )
     return content
 
 

@@ -1,4 +1,4 @@
-"""A level that follows the commands: g_r(k) = Σ_i w_ri G_i(k), read and put into words.
+"""A level that follows the commands: g(k) = Σ_i w_i G_i(k), read and put into words.
 
     G(k) = fading G(k-1) + v(k)²,   G = 0 before the run
 v = (s - centre)/scale, or the change of s since the last sample over scale, s a product of inputs.
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from . import text
-from .exact import Matrix
-from .files import Node, Rejected
+from .files import Node, Rejected, refuse_if
 from .signals import Signal
 
 MAX_TERMS = 200
@@ -33,55 +32,53 @@ class Term:
 
 @dataclass(frozen=True)
 class CommandLevel:
-    """weights: (rows, len(terms)), not negative, some positive in every row."""
+    """weights: one of each term, not negative, some positive."""
 
     terms: list[Term]
-    weights: Matrix
+    weights: list[Fraction]
 
 
-def read_level(node: Node, inputs: int, rows: int) -> CommandLevel:
+def read_level(node: Node, inputs: int) -> CommandLevel:
     """{terms, weights} for a model with so many inputs."""
     parts = node.members("terms weights")
     terms = [_term(entry, inputs) for entry in parts["terms"].items(1, MAX_TERMS)]
-    weights = parts["weights"].array(rows, len(terms))
-    if min(min(row) for row in weights) < 0 or not min(sum(row) for row in weights):
-        raise Rejected(f"{node.where}: weights should be 0 or more, some of each row positive")
+    (weights,) = parts["weights"].array(1, len(terms))
+    refuse_if(
+        min(weights) < 0 or not sum(weights),
+        f"{node.where}: weights should be 0 or more, some positive",
+        "not_below",
+    )
     return CommandLevel(terms, weights)
 
 
 def _term(node: Node, inputs: int) -> Term:
     parts = node.members("inputs of centre scale fading")
-    factors = tuple(parts["inputs"].wholes(None))
+    factors, of = tuple(parts["inputs"].wholes(None)), parts["of"].text()
     if len(factors) > MAX_FACTORS or any(not 0 <= i < inputs for i in factors):
-        raise Rejected(
-            f"{node.where}: inputs should be at most {MAX_FACTORS}, among the model's {inputs}"
-        )
-    of = parts["of"].text()
-    if of not in ("value", "change"):
-        raise Rejected(f"{node.where}: of should be value or change, not {of!r}")
-    term = Term(
-        factors, of == "change", parts["centre"].number(), parts["scale"].number(),
-        parts["fading"].number(),
-    )  # fmt: skip
-    if not term.scale > 0 or not 0 <= term.fading < 1:
-        raise Rejected(f"{node.where}: scale should be positive, fading in [0, 1)")
-    return term
+        wanted = f"at most {MAX_FACTORS}, among the model's {inputs}"
+        raise Rejected(f"{node.where}: inputs should be {wanted}")
+    refuse_if(
+        of not in ("value", "change"), f"{node.where}: of should be value or change, not {of!r}"
+    )
+    centre, scale, fading = (parts[name].number() for name in ("centre", "scale", "fading"))
+    if not scale > 0 or not 0 <= fading < 1:
+        wanted = "scale should be positive, fading in [0, 1)"
+        raise Rejected(f"{node.where}: {wanted}", "not_below")
+    return Term(factors, of == "change", centre, scale, fading)
 
 
-def formula(level: CommandLevel, row: int, u: tuple[Signal, ...]) -> str:
+def formula(level: CommandLevel, u: tuple[Signal, ...]) -> str:
     """g as a sum, every number exact."""
+    used = [pair for pair in zip(level.weights, level.terms, strict=True) if pair[0]]
     summands = []
-    for weight, term in zip(level.weights[row], level.terms, strict=True):
-        if not weight:
-            continue
+    for weight, term in used:
         square = _square(term, u)
         if term.fading:
             square = f"(sum {text.exact(term.fading)}^i {square or '1'})"
         summands.append(f"{text.exact(weight)} {square}".rstrip())
-    counted = any(
-        w and term.fading for w, term in zip(level.weights[row], level.terms, strict=True)
-    )
-    past = ", sums over the run's samples, each i samples ago" if counted else ""
+    past = ""
+    if any(term.fading for _, term in used):
+        past = ", sums over the run's samples, each i samples ago"
     return " + ".join(summands) + past
 
 
@@ -92,12 +89,10 @@ def _square(term: Term, u: tuple[Signal, ...]) -> str:
     product = " x ".join(_plain(u[i].name, "()+*^/-") for i in term.inputs) or "1"
     unit = Signal("", " ".join(_plain(u[i].unit, "()+*^") for i in term.inputs if u[i].unit))
     if term.change:
-        of = f"change of {product}"
+        product = f"change of {product}"
     elif term.centre:
-        of = f"({product} - {unit.quantity(text.exact(term.centre))})"
-    else:
-        of = product
-    return f"({of} / {unit.quantity(text.exact(term.scale))})^2"
+        product = f"({product} - {unit.quantity(text.exact(term.centre))})"
+    return f"({product} / {unit.quantity(text.exact(term.scale))})^2"
 
 
 def _plain(word: str, operators: str) -> str:

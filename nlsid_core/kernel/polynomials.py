@@ -1,54 +1,36 @@
 """Exact polynomials in s and x: dictionaries of packed integers over one denominator.
 
-A monomial of x is one integer, six bits an exponent; the total degree is tracked and kept below 64,
-so exponents never run into each other. A coefficient is a polynomial in s, packed into one integer
-by s = 2^width (Kronecker substitution). `norm` bounds the sum of the absolute values of all its
-integers, and below 2^(width - 1) the packing can be undone: `digits` refuses to otherwise, and
-`at_width` tries a larger width.
+A monomial of x is one integer, its key: six bits an exponent, the total degree being tracked and
+kept below 64, so that exponents never run into each other. Above them a key has a secret that is
+linear in the exponents, so that no file can choose keys whose hashes are equal. A coefficient is a
+polynomial in s, packed into one integer by s = 2^width (Kronecker substitution). `norm` bounds the
+sum of the absolute values of all its integers, and below 2^(width - 1) the packing can be undone:
+`digits` refuses to otherwise, and `at_width` tries a larger width.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from math import comb, lcm
+from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Rejected, Terms
+from .files import MAX_DEGREE, Rejected, Terms, refuse_if
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
-MAX_WORK = 10**8  # products of short coefficients in one claim: half a minute
-MAX_TERMS = 10**6  # of one polynomial: a few hundred MB
-MAX_HELD = 2**31  # bytes of the results of one ring, about
-TERM = 128  # bytes of a term without its digits
-LONG = 18  # a product of integers whose bits multiply to 2^18 counts twice
-CALL = 16  # products that a sum or a product of polynomials counts at the least
+SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
+MAX_TERMS = 10**6  # of one polynomial
 WIDTHS = (64, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 16384)
-
-MOST_WORK = 4 * 10**7  # the same of a claim without pieces: seconds
 FREE_OF_S = 1024  # a width for polynomials in x alone: nothing is packed, so it costs nothing
 
 Scalar = Union["Polynomial", Fraction, int]
-Built = TypeVar("Built")
+Case = TypeVar("Case")
 
 
 class TooNarrow(Exception):  # noqa: N818 - a signal to try again
     """The width of a ring does not hold a result."""
-
-
-@dataclass
-class Work:
-    """How many products of coefficients a claim may still take; the width of its last ring."""
-
-    left: int = MAX_WORK
-    width: int = WIDTHS[0]
-
-    def spend(self, amount: int, what: str = "") -> None:
-        """Raise Rejected when it is used up."""
-        self.left -= amount
-        if self.left < 0:
-            raise Rejected(what or "the claim takes more products to decide than are spent on one")
 
 
 @dataclass(frozen=True)
@@ -85,21 +67,30 @@ class Ring:
 
     count: int
     width: int
-    work: Work
-    held: list[int] = field(default_factory=lambda: [0], compare=False)
+
+    @cached_property
+    def keys(self) -> list[int]:
+        """The key of each variable."""
+        high = BITS * self.count
+        return [(1 << BITS * i) + (randbits(SECRET) << high) for i in range(self.count)]
 
     @property
     def variables(self) -> list[Polynomial]:
         """x0 … x(count - 1)."""
-        return [Polynomial(self, {1 << (BITS * i): 1}, 1, 1, 0, 1) for i in range(self.count)]
+        return [Polynomial(self, {key: 1}, 1, 1, 0, 1) for key in self.keys]
 
     def key(self, exponents: Sequence[int]) -> int:
         """The integer that stands for a monomial of x."""
-        if len(exponents) != self.count or min(exponents, default=0) < 0:
-            raise Rejected(f"a monomial should have {self.count} exponents of 0 or more")
-        if sum(exponents) > MAX_DEGREE:
-            raise Rejected(f"degree {sum(exponents)} is above {MAX_DEGREE}")
-        return sum(e << (BITS * i) for i, e in enumerate(exponents))
+        refuse_if(
+            len(exponents) != self.count or min(exponents, default=0) < 0,
+            f"a monomial should have {self.count} exponents of 0 or more",
+        )
+        refuse_if(
+            sum(exponents) > MAX_DEGREE,
+            f"degree {sum(exponents)} is above {MAX_DEGREE}",
+            "too_large",
+        )
+        return sum(e * key for e, key in zip(exponents, self.keys, strict=True) if e)
 
     def exponents(self, key: int) -> tuple[int, ...]:
         """The exponents of the monomial that `key` stands for."""
@@ -138,11 +129,8 @@ class Ring:
             if factor:
                 norm += abs(factor) * p.norm
                 degree, order = max(degree, p.degree), max(order, p.order)
-                self.work.spend(len(p.terms) * long(self.bits(p), factor.bit_length()))
                 for key, value in p.terms.items():
                     terms[key] = terms.get(key, 0) + value * factor
-        self.work.spend(CALL + len(parts))
-        self._hold(len(terms), self.width * order + norm.bit_length())
         return Polynomial(self, terms, common, degree, order, norm)
 
     def sum(self, parts: Sequence[Polynomial]) -> Polynomial:
@@ -167,50 +155,38 @@ class Ring:
         """y'M y."""
         return self.dot(y, self.product(M, y))
 
+    def substitution(self, values: Sequence[Polynomial]) -> Callable[[Terms], Polynomial]:
+        """What puts a polynomial in the place of each variable; powers are made once."""
+        powers: dict[bytes, Polynomial] = {bytes(len(values)): self.made(1)}
+
+        def power(exponents: bytes) -> Polynomial:
+            if exponents not in powers:
+                last = max(j for j, e in enumerate(exponents) if e)
+                lower = bytes([*exponents[:last], exponents[last] - 1, *exponents[last + 1 :]])
+                powers[exponents] = values[last] * power(lower)
+            return powers[exponents]
+
+        return lambda p: self.weighted([(c, power(bytes(e))) for e, c in p])
+
     def substituted(self, ps: Sequence[Terms], values: Sequence[Polynomial]) -> list[Polynomial]:
         """Each of ps with a polynomial in the place of each variable."""
-
-        @cache
-        def power(exponents: tuple[int, ...]) -> Polynomial:
-            last = max((j for j, e in enumerate(exponents) if e), default=None)
-            if last is None:
-                return self.made(1)
-            lower = (*exponents[:last], exponents[last] - 1, *exponents[last + 1 :])
-            return values[last] * power(lower)
-
-        return [self.weighted([(c, power(e)) for e, c in p]) for p in ps]
+        return list(map(self.substitution(values), ps))
 
     def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
         """p q."""
-        degree = p.degree + q.degree
-        if degree > MAX_DEGREE:
-            raise Rejected(f"degree {degree} is above {MAX_DEGREE}")
-        norm = p.norm * q.norm
-        if norm.bit_length() > WIDTHS[-1]:
-            raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits")
-        bits = self.bits(p), self.bits(q)
-        self.work.spend(CALL + len(p.terms) * len(q.terms) * long(*bits))
-        most = min(MAX_TERMS, (MAX_HELD - self.held[0]) // (TERM + sum(bits) // 7))
+        degree, norm = p.degree + q.degree, p.norm * q.norm
+        if degree > MAX_DEGREE or norm.bit_length() > WIDTHS[-1]:
+            most = f"degree {MAX_DEGREE} and coefficients of {WIDTHS[-1]} bits"
+            raise Rejected(f"a product beyond {most}", "too_large")
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
             for right, b in q.terms.items():
                 key = left + right
                 terms[key] = terms.get(key, 0) + a * b
-            if len(terms) > most:
-                raise Rejected(f"a polynomial of more than {most} terms")
-        self._hold(len(terms), sum(bits))
-        return Polynomial(
-            self, terms, p.denominator * q.denominator, degree, p.order + q.order, norm
-        )
-
-    def bits(self, p: Polynomial) -> int:
-        """How long its packed coefficients are at most."""
-        return self.width * p.order + p.norm.bit_length()
-
-    def _hold(self, terms: int, bits: int) -> None:
-        self.held[0] += terms * (TERM + bits // 7)
-        if self.held[0] > MAX_HELD or terms > MAX_TERMS:
-            raise Rejected("the claim takes too much memory to decide")
+            if len(terms) > MAX_TERMS:
+                raise Rejected(f"a polynomial of more than {MAX_TERMS} terms", "too_large")
+        denominator = p.denominator * q.denominator
+        return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
 
     def digits(self, p: Polynomial) -> dict[int, bytes]:
         """Each monomial's whole coefficients of s^0 … s^order, over p.denominator.
@@ -226,11 +202,6 @@ class Ring:
             for key, value in p.terms.items()
             if value
         }
-
-
-def long(a: int, b: int) -> int:
-    """How many products of short integers one of a and b bits counts as."""
-    return 1 + ((a + 64) * (b + 64) >> LONG)
 
 
 def packed(row: Sequence[int], width: int) -> int:
@@ -254,14 +225,23 @@ def _halves(width: int, count: int) -> int:
     return int.from_bytes((bytes(width - 1) + b"\x80") * count, "little")
 
 
-def at_width(count: int, work: Work, build: Callable[[Ring], Built]) -> Built:
-    """What `build` returns in the narrowest of WIDTHS, from the work's on, that holds it."""
-    for width in WIDTHS:
-        if width >= work.width:
+def at_width(
+    count: int,
+    cases: Iterable[Case],
+    decide: Callable[[Ring, Case], None],
+    least: int = WIDTHS[0],
+) -> None:
+    """Decide each case in a ring of `count` variables, wider from the first that needs it on."""
+    rings = (Ring(count, width) for width in WIDTHS if width >= least)
+    ring = next(rings)
+    for case in cases:
+        while True:
             try:
-                result = build(Ring(count, width, work))
-            except TooNarrow:
-                continue
-            work.width = width
-            return result
-    raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits")
+                decide(ring, case)
+                break
+            except TooNarrow as narrow:
+                wider = next(rings, None)
+                if wider is None:
+                    too_long = f"coefficients of more than {WIDTHS[-1]} bits"
+                    raise Rejected(too_long, "too_large") from narrow
+                ring = wider

@@ -8,8 +8,7 @@ each b_k has to be diagonally dominant in V v: a square of a monomial of v count
 any other monomial is charged, by halves of its size, to a pair of v whose product it is, the first
 of those with the largest powers of two.
 So c >= Σ_i left[i] v_i², left[i] >= 0 being the least that any b_k leaves on the diagonal: c > 0
-if something is left for the monomial 1, and c > 0 except at the origin if 1 is not in v and
-something is left for a pure power of every variable.
+if something is left for the monomial 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +16,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, lcm
 
-from .files import MAX_DEGREE, Node, Rejected
-from .polynomials import Polynomial, Ring, long, packed, unpacked
+from .files import MAX_DEGREE, Node, Rejected, refuse_if
+from .polynomials import Polynomial, Ring, packed, unpacked
 
 MAX_BASIS = 200
 MAX_FACTORS = 24
@@ -50,20 +49,24 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     where = parts["squares"].where
     rows = parts["basis"].monomials(ring.count, MAX_DEGREE // 2)
     size = len(rows)
-    if not 0 < size <= MAX_BASIS:
-        raise Rejected(f"{parts['basis'].where} should hold 1 to {MAX_BASIS} distinct monomials")
+    refuse_if(
+        not 0 < size <= MAX_BASIS,
+        f"{parts['basis'].where} should hold 1 to {MAX_BASIS} monomials",
+        "too_large",
+    )
     columns = powers_of_two(parts["columns"], size)
     stated = parts["squares"].members("unit factors", "scale weights")
     scale = stated["scale"].integer() if "scale" in stated else 1
-    if scale < 1:
-        raise Rejected(f"{where}: scale should be a positive whole number")
+    refuse_if(scale < 1, f"{where}: scale should be a positive whole number")
     weights = stated["weights"].integers(0, 4 * MAX_BASIS) if "weights" in stated else None
     factors = []
     for factor in stated["factors"].items(1, MAX_FACTORS):
         entries = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
         heights = (1,) * len(entries) if weights is None else weights
-        if len(heights) != len(entries) or min(heights, default=0) < 0:
-            raise Rejected(f"{where}: one weight of 0 or more for each row of each factor")
+        refuse_if(
+            len(heights) != len(entries) or min(heights, default=0) < 0,
+            f"{where}: one weight of 0 or more for each row of each factor",
+        )
         factors.append(list(zip(heights, entries, strict=True)))
     degree, unit = max(map(sum, rows)), stated["unit"].whole(0, MAX_SHIFT)
     return Squares(tuple(map(ring.key, rows)), columns, degree, Fraction(scale), unit, factors)
@@ -77,8 +80,10 @@ def read_witness(node: Node, ring: Ring) -> Squares:
 def powers_of_two(node: Node, size: int) -> list[int]:
     """So many exponents of two."""
     shifts: list[int] = node.wholes(size)
-    if any(abs(shift) > MAX_SHIFT for shift in shifts):
-        raise Rejected(f"{node.where}: powers of two beyond 2^{MAX_SHIFT}")
+    refuse_if(
+        any(abs(shift) > MAX_SHIFT for shift in shifts),
+        f"{node.where}: powers of two beyond 2^{MAX_SHIFT}",
+    )
     return shifts
 
 
@@ -87,7 +92,7 @@ def expanded(squares: Squares, ring: Ring) -> Polynomial:
     lowest, J = min(squares.columns), len(squares.factors) - 1
     weight = Fraction(2) ** (2 * lowest - 2 * squares.unit) / squares.scale
     parts = []
-    for j, gram in enumerate(_grams(squares, ring, lowest)):
+    for j, gram in enumerate(_grams(squares, lowest)):
         norm = sum(map(abs, gram.values()))
         constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, norm)
         parts.append((weight, ring.bernstein([Fraction(i == j) for i in range(J + 1)]) * constants))
@@ -99,31 +104,9 @@ def positive(
 ) -> Fraction:
     """A number that c is nowhere below; Rejected unless c > 0 (strict) or c >= 0 everywhere."""
     left = remainder(c, squares, ring, what)
-    if strict and 0 not in left:
-        raise Rejected(f"{what}: the basis needs the monomial 1")
-    if strict and not left[0]:
-        raise Rejected(f"{what}: not positive, only nonnegative")
+    refuse_if(strict and 0 not in left, f"{what}: the basis needs the monomial 1", "not_positive")
+    refuse_if(strict and not left[0], f"{what}: not positive, only nonnegative", "not_positive")
     return left.get(0, Fraction(0))
-
-
-def positive_except_origin(c: Polynomial, squares: Squares, ring: Ring, what: str) -> Fraction:
-    """Raise Rejected unless c = 0 at the origin, and c > 0 elsewhere and unbounded with |x|.
-
-    Returns the largest number with c >= number * Σ_i (a pure power of x_i)², as far as is known.
-    """
-    left = remainder(c, squares, ring, what)
-    if 0 in left:
-        raise Rejected(f"{what}: the basis should not hold the monomial 1")
-    best = [Fraction(0)] * ring.count
-    for key, room in left.items():
-        used = [i for i, e in enumerate(ring.exponents(key)) if e]
-        if len(used) == 1:
-            best[used[0]] = max(best[used[0]], room)
-    if not all(best):
-        raise Rejected(
-            f"{what}: nothing is left for a pure power of variable {best.index(Fraction(0))}"
-        )
-    return min(best)
 
 
 def positive_on(
@@ -156,10 +139,13 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             a, b = pair.setdefault(left_key + basis[j], (i, j))
             if columns[i] + columns[j] > columns[a] + columns[b]:
                 pair[left_key + basis[j]] = (i, j)
-    grams, digits = _grams(squares, ring, lowest), ring.digits(c)
+    grams, digits = _grams(squares, lowest), ring.digits(c)
     keys = list(set(digits).union(*grams))
-    if any(key not in square and key not in pair for key in keys):
-        raise Rejected(f"{what}: a monomial that no product of the basis could balance")
+    refuse_if(
+        any(key not in square and key not in pair for key in keys),
+        f"{what}: a monomial that no product of the basis could balance",
+        "not_positive",
+    )
     J, order = len(grams) - 1, c.order
     D = max(order, J)
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
@@ -169,7 +155,6 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     largest = max((abs(entry) for gram in grams for entry in gram.values()), default=0)
     bits = max(ring.width + below.bit_length(), (largest * above).bit_length())
     width = (bits + D + 2) // 8 + 1
-    ring.work.spend(len(keys) * (D + 1) * (1 + (width * (J + order + 2) >> 5)))
     size = ring.width // 8
     pad, zero = bytes(width - size), bytes(size - 1) + b"\x80"
     halves = int.from_bytes((zero + pad) * len(keys), "little")
@@ -197,7 +182,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             left[j] -= charge
         if min(left) < 0:
             i = next(i for i, room in enumerate(left) if room < 0)
-            raise Rejected(f"{what}: not positive (Bernstein coefficient {k} of {D}, monomial {i})")
+            at = f"Bernstein coefficient {k} of {D}, monomial {i}"
+            raise Rejected(f"{what}: not positive ({at})", "not_positive")
         left = [room * (common // comb(D, k)) for room in left]
         least = list(map(min, least, left)) if k else left
     return {
@@ -206,7 +192,7 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     }
 
 
-def _grams(squares: Squares, ring: Ring, lowest: int) -> list[dict[int, int]]:
+def _grams(squares: Squares, lowest: int) -> list[dict[int, int]]:
     """Σ_i weight_i (R_j[i] V v)² / 4^lowest by monomial, whole numbers, for each factor R_j.
 
     Rows are packed into one integer each, so that a row of R'R is a few products.
@@ -218,7 +204,6 @@ def _grams(squares: Squares, ring: Ring, lowest: int) -> list[dict[int, int]]:
         most = max((abs(entry) for _, row in factor for entry in row), default=0)
         heaviest = max((weight for weight, _ in factor), default=1)
         width = (most * most * max(1, heaviest) * (len(factor) + 1)).bit_length() // 8 + 1
-        ring.work.spend(size * (len(factor) + size) * long(size * 8 * width, most.bit_length()))
         lines = [
             (weight * packed(row, width) << 8 * width * (size - len(row)), row)
             for weight, row in factor

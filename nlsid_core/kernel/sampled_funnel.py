@@ -8,47 +8,50 @@ h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄�
 Why that is enough: docs/certificate_sampled_funnel.md.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import comb, factorial, prod
+from math import comb
 
+from . import text
 from .decision import Decision
-from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed
-from .files import Node, Read, Rejected, Terms, bound_files
-from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
+from .exact import Matrix, at_most, inverse_forms, product, transposed, unit
+from .files import Node, Read, bound_files, refuse_if
+from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .signals import Signal, apart, read_signals
-from .text import above, below
-from .trials import LONGEST, Recorded, read_trials, shared
+from .sampled_step import Link, Model, Sample, nonnegative, read_link, stretch, triangular
+from .signals import apart, ranges, read_signals
+from .text import above
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
-STEP = 5_000  # of the work that a claim may take: what a step costs at the least
-ENTRY = 10  # what one of a matrix of curvature costs
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
+PROVENANCE = "measured safety_factor measured_on"  # of the bound; no part of the claim
 
-
-@dataclass(frozen=True)
-class Model:
-    """A map (trapezoidal: of accelerations); signals and their box, states first."""
-
-    trapezoidal: bool
-    map: list[Terms]
-    period: Fraction
-    signals: list[Signal]
-    box: Matrix
-    states: int
-    bags: list[Recorded]
+SENTENCE = (
+    "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
+    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k]{bound}, at all {samples} samples "
+    "over {span:down} s and ends within {ends} of the nominal; one that starts with "
+    "|S[0] (xhat - x[0])| <= {inlet:down} ends within {goal} of it; at the samples both stay in "
+    "the box of the model's data, {box}"
+)
+DISTURBANCE = "disturbance {form} {kept} at every sample, d = xhat+ - f(xhat, u)"
+KEPT = {
+    "response": "|S r| <= {bound:down}, r+ = A r + d from r = 0,",
+    "peak": "|S d| <= {bound:down}",
+    "energy": "sqrt(E) <= {bound:down}, E+ = E + {gain:up} |S d|^2 from E = 0,",
+    "fading": "sqrt(E) <= {bound:down}, E+ = {rate:up} E + {gain:up} |S d|^2 from E = 0,",
+}
+APPLIED = "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
+ROOTS = (
+    "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1], {low:down} to "
+    "{high:down}; that there is one is not stated"
+)
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption.
-
-    widens: what the disturbance adds to a radius.
-    """
+    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption."""
 
     S: list[Matrix]
     A: list[Matrix]
@@ -59,32 +62,11 @@ class Funnel:
     bound: Fraction
     rate: Fraction
     gain: Fraction
-    measured: str
-    widens: Fraction
 
-
-@dataclass(frozen=True)
-class Sample:
-    """A sample of a policy and the next state, with the shapes of both and A of the response."""
-
-    x: list[Fraction]
-    u: list[Fraction]
-    K: Matrix
-    x_next: list[Fraction]
-    S: Matrix
-    S_next: Matrix
-    A: Matrix
-
-
-@dataclass(frozen=True)
-class Link:
-    """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
-
-    rows: list[Polynomial]
-    h: list[Polynomial]
-    size: Polynomial
-    bounds: dict[str, Fraction]
-    curvature: list[Fraction]
+    @property
+    def widens(self) -> Fraction:
+        """What the disturbance adds to a radius."""
+        return Fraction(0) if self.form == "peak" else self.bound
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -99,56 +81,16 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     names = "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
     bases = proof.members(names)
 
-    def prove(ring: Ring) -> Fraction:
-        rooms: list[Fraction] = []
-        for k, node in enumerate(bases["steps"].items(len(u), len(u))):
-            at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
-            ring.work.spend(STEP)
-            step = Ring(ring.count, ring.width, ring.work)  # what a step holds is not kept
-            stated, link = _link(node, model, at, funnel.form, step)
-            rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
-        return min(rooms)
+    steps, rooms = bases["steps"].items(len(u), len(u)), []
 
-    margin = at_width(_variables(model), Work(width=FREE_OF_S), prove)
-    return Decision(_sentence(model, funnel, len(u)), margin, _assumptions(model, funnel), digests)
+    def prove(ring: Ring, k: int) -> None:
+        at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
+        stated, link = read_link(steps[k], model, at, funnel.form, ring)
+        rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
 
-
-def _link(
-    node: Node, model: Model, at: Sample, form: str, ring: Ring
-) -> tuple[dict[str, Node], Link]:
-    """A step's members; its polynomials, and its stated bounds verified."""
-    norms = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
-    more = " T_next inverse" * model.trapezoidal
-    stated = node.members(f"T curvature tube inlet {norms}{more}")
-    bounds = {name: _nonnegative(stated[name]) for name in norms.split()}
-    curvature = [_nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
-    n, d, where = model.states, model.states // 2, stated["T"].where
-    T = _triangular(stated["T"].array(n, n), where)
-    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
-    z = ring.variables[:n]
-    scaled = ring.product(ST, z)
-    prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
-    h: list[Polynomial] = []
-    if not model.trapezoidal:
-        rows = moved = explicit_step(model.map, at, T, ring)
-        if form == "response":
-            moved = [p - q for p, q in zip(rows, ring.product(unit, z), strict=True)]
-    else:
-        T_next = stated["T_next"].array(d, d)
-        S_rates = [row[d:] for row in at.S_next[d:]]
-        prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
-        rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
-        moved = ring.product(stated["inverse"].array(d, d), h)
-        (B, C), (L_z, L_w) = (
-            ([row[:n] for row in M], [row[n:] for row in M])
-            for M in (linear_part(moved, ring), linear_part(rows, ring))
-        )
-        C = [[entry - (i == j) for j, entry in enumerate(row)] for i, row in enumerate(C)]
-        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
-        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w)):
-            prove_norm(M, bounds[name], f"{where}: the bound {name}")
-    prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
-    return stated, Link(rows, h, ring.dot(scaled, scaled), bounds, curvature)
+    at_width(_variables(model), range(len(u)), prove, FREE_OF_S)
+    said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
+    return Decision(said, min(rooms), assumptions, digests)
 
 
 def _prove_step(
@@ -159,7 +101,7 @@ def _prove_step(
     names = "reach columns squares ball" + " roots equations" * bool(d)
     names += " spread extents" * (bool(d) and funnel.form == "response")
     stated = node.members(names)
-    reach, (radius, following) = _nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
+    reach, (radius, following) = nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
     parts = [reach**2 - ring.dot(link.rows, link.rows)]
     parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size))
     if d:
@@ -169,11 +111,8 @@ def _prove_step(
         parts += _equations(stated["equations"], bases["equation_basis"], link)
     else:
         added = _explicit_addition(link, funnel, radius, what)
-    at_most(
-        reach + added,
-        following,
-        f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius",
-    )
+    exceeds = f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius"
+    at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
     return (following - reach - added) / following
@@ -203,8 +142,8 @@ def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) 
     mu = kappa * stretch(link.curvature, kappa * radius, kappa * funnel.bound, least=1)
     if funnel.form == "response":
         return mu * funnel.bound
-    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, too "
-            f"much for rate {above(rate)} and gain {above(gain)}")  # fmt: skip
+    much = f"too much for rate {above(rate)} and gain {above(gain)}"
+    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, {much}")
     return Fraction(0)
 
 
@@ -217,15 +156,18 @@ def _implicit_addition(
     far = b["kappa_next"] * funnel.roots[k + 1]
     if funnel.form == "peak":
         return far, funnel.bound
-    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, _nonnegative(stated["spread"])
-    wide, near = (_nonnegative(entry) for entry in stated["extents"].items(2, 2))
+    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, nonnegative(stated["spread"])
+    wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
     # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
     far += spread * r
     at_most(z**2 + far**2, wide**2, f"{what}: the first extent is too small")
     mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
     mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
-    if b["rates"] >= 1 or mapped_to > spread:
-        raise Rejected(f"{what}: two roots may differ by more than the stated spread")
+    refuse_if(
+        b["rates"] >= 1 or mapped_to > spread,
+        f"{what}: two roots may differ by more than the stated spread",
+        "not_below",
+    )
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
     own = b["kappa_next"] * reach
     at_most(z**2 + own**2, near**2, f"{what}: the second extent is too small")
@@ -236,90 +178,6 @@ def _implicit_addition(
     return far, (b["direct"] + b["through"] * (b["rates"] * spread + mu * (1 + spread))) * r
 
 
-def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
-    """S⁺(f(x + Tz, u - K T z) - x⁺)."""
-    moved = ring.substituted(f, _state_and_input(at, T, ring))
-    return ring.product(at.S_next, [p - c for p, c in zip(moved, at.x_next, strict=True)])
-
-
-def implicit_step(
-    a: Sequence[Terms], at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
-) -> tuple[list[Polynomial], list[Polynomial]]:
-    """S⁺x̄⁺ and h = v⁺ - v - period/2 (a(q, v, u) + a(q⁺, v⁺, u)), in z, then w.
-
-    v⁺ = v_{k+1} + T⁺w and q⁺ = q + period/2 (v + v⁺).
-    """
-    d, half = len(T_next), period / 2
-    here = _state_and_input(at, T, ring)
-    q, v, u = here[:d], here[d : 2 * d], here[2 * d :]
-    moved = ring.product(T_next, ring.variables[2 * d :])
-    rate = [p + c for p, c in zip(moved, at.x_next[d:], strict=True)]
-    place = [p + half * (s + r) for p, s, r in zip(q, v, rate, strict=True)]
-    pulls = ring.substituted(a, here), ring.substituted(a, [*place, *rate, *u])
-    h = [r - s - half * (b + c) for r, s, b, c in zip(rate, v, *pulls, strict=True)]
-    after = [p - c for p, c in zip([*place, *rate], at.x_next, strict=True)]
-    return ring.product(at.S_next, after), h
-
-
-def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
-    """The coefficients of degree 1: a row for each polynomial."""
-    keys = [1 << (BITS * i) for i in range(ring.count)]
-    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in keys] for q in p]
-
-
-def prove_curvature(
-    p: Sequence[Polynomial], gammas: Sequence[Fraction], ring: Ring, least: int
-) -> None:
-    """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
-    sizes: dict[int, Matrix] = {}
-    keys = set().union(*(q.terms for q in p))
-    ring.work.spend(ENTRY * len(keys) * len(p) ** 2)
-    for key in keys:
-        e = ring.exponents(key)
-        c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
-        outer = [[a * b for b in c] for a in c]
-        share = Fraction(prod(map(factorial, e)), factorial(m))
-        sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
-    if max(sizes, default=0) >= least + len(gammas):
-        raise Rejected("curvature: a bound for every degree is needed")
-    for m, gamma in enumerate(gammas, start=least):
-        if m in sizes:
-            _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
-
-
-def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: int) -> Fraction:
-    """μ with |p(z + w) - p(z)| <= μ|w| for |z| <= size, |w| <= step; degrees from `least` on."""
-    far, total = size + step, Fraction(0)
-    for m, gamma in enumerate(gammas, start=least):
-        total += gamma * sum((far**i * size ** (m - 1 - i) for i in range(m)), Fraction(0))
-    return total
-
-
-def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
-    """Raise Rejected unless |M v| <= bound |v| for every v."""
-    _at_most_square(product(M, transposed(M)), bound, what)
-
-
-def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
-    """Raise Rejected unless |z| <= bound |M z| for every z."""
-    MM = product(transposed(M), M)
-    scaled = [[bound**2 * e - (i == j) for j, e in enumerate(row)] for i, row in enumerate(MM)]
-    semidefinite(scaled, what)
-
-
-def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
-    semidefinite(
-        [[bound**2 * (i == j) - e for j, e in enumerate(row)] for i, row in enumerate(MM)], what
-    )
-
-
-def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
-    """x + T z and u - K T z."""
-    feedback = [[-entry for entry in row] for row in product(at.K, T)]
-    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
-    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
-
-
 def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K: Matrix) -> None:
     """At sample k both chains stay in the box of the data, inputs included; and the half-widths.
 
@@ -327,7 +185,7 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
     """
     n = model.states
     tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
-    rows = [[Fraction(i == j) for j in range(n)] for i in range(n)] + K
+    rows = [unit(i, n) for i in range(n)] + K
     forms = inverse_forms(product(transposed(funnel.S[k]), funnel.S[k]), rows, "S'S")
     names, stays = [signal.name for signal in model.signals], "the box of the model's data"
     rooms = [(tube, width, "its stated half-width") for width in funnel.half_widths[k]]
@@ -335,8 +193,11 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
         rooms.append((max(tube, inlet), min(high - centre, centre - low), stays))
     named = zip(rooms, [*forms[:n], *forms], [*names[:n], *names], strict=False)
     for (radius, room, kept), form, name in named:
-        if room < 0 or radius**2 * form > room**2:
-            raise Rejected(f"sample {k}: {name} can leave {kept}")
+        refuse_if(
+            room < 0 or radius**2 * form > room**2,
+            f"sample {k}: {name} can leave {kept}",
+            "not_valid",
+        )
 
 
 def _read_model(node: Node) -> Model:
@@ -351,16 +212,20 @@ def _read_model(node: Node) -> Model:
     box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
     signals = [*x, *apart(u, x)]
     exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
-    if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
-        raise Rejected("a model needs a positive period, monomials, and a rate for each position")
+    refuse_if(
+        (trapezoidal and len(x) % 2) or period <= 0 or not exponents,
+        "a model needs a positive period, monomials, and a rate for each position",
+    )
     outputs = len(x) // 2 if trapezoidal else len(x)
     columns = transposed(parts["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
-    bags = read_trials(parts["bags"])
-    model = Model(trapezoidal, polynomials, period, signals, box, len(x), bags)
+    model = Model(trapezoidal, polynomials, period, signals, box, len(x))
     degree, variables = max(map(sum, exponents)), _variables(model)
-    if comb(variables + degree, degree) > MAX_MONOMIALS:
-        raise Rejected(f"degree {degree} in {variables} variables is too large to decide")
+    refuse_if(
+        comb(variables + degree, degree) > MAX_MONOMIALS,
+        f"degree {degree} in {variables} variables is too large to decide",
+        "too_large",
+    )
     return model
 
 
@@ -371,12 +236,17 @@ def _variables(model: Model) -> int:
 
 def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matrix, list[Matrix]]:
     parts = node.document("policy", "law period L u x K", "sampled", made_for={"model": made_for})
-    if parts["period"].number() != model.period:
-        raise Rejected("the policy has another sample time than the model")
+    refuse_if(
+        parts["period"].number() != model.period,
+        "the policy has another sample time than the model",
+    )
     n, p = model.states, len(model.signals) - model.states
     u = parts["u"].array(None, p)
-    if not 0 < len(u) * n**3 <= MAX_SAMPLES:
-        raise Rejected(f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps")
+    refuse_if(
+        not 0 < len(u) * n**3 <= MAX_SAMPLES,
+        f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps",
+        "too_large",
+    )
     parts["L"].array(n, n)
     return parts["x"].array(len(u) + 1, n), u, parts["K"].array(len(u), p, n)
 
@@ -387,86 +257,57 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
     parts, n = node.document("funnel", names, "sampled", made_for=made_for), model.states
     radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
     roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
-    if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
-        raise Rejected("radii and roots should be positive, and the tube start in the inlet")
-    stated = parts["assumption"].members("form bound rate gain measured safety_factor measured_on")
-    form, runs = stated["form"].text(), read_trials(stated["measured_on"])
-    bound, rate, gain, measured, factor = (
-        _nonnegative(stated[key]) for key in ("bound", "rate", "gain", "measured", "safety_factor")
+    refuse_if(
+        min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0],
+        "radii and roots should be positive, and the tube start in the inlet",
+        "not_below",
     )
-    if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
-        raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
-    if any(run.end < LONGEST for run in runs):
-        raise Rejected("commissioning runs are whole recordings, and windows of one are none")
-    if not runs or shared(runs, model.bags):
-        raise Rejected("the assumption needs commissioning runs that the model was not fitted on")
-    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
-    if rate > 1 or gain < 1 or plain:
-        raise Rejected(f"rate {above(rate)} or gain {above(gain)} is none of form {form}")
-    at_most(1, factor, "the safety factor is below 1")
-    at_most(factor * measured, bound, "the bound is below safety_factor x measured")
-    runs_and_factor = (
-        f"largest of {len(set(runs))} distinct commissioning runs {above(measured)}, safety factor "
-        f"{below(factor)}"
-    )
-    S = [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
+    S = [triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
     A, widths = parts["A"].array(steps, n, n), parts["half_widths"].array(steps + 1, n)
-    widens = Fraction(0) if form == "peak" else bound
-    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain, runs_and_factor, widens)
+
+    stated = parts["assumption"].members(f"form bound rate gain {PROVENANCE}")
+    form = stated["form"].text()
+    bound, rate, gain = (nonnegative(stated[key]) for key in ("bound", "rate", "gain"))
+    refuse_if(
+        form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal),
+        f"form {form!r} is not for this kind of model; use response or peak",
+    )
+    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
+    refuse_if(
+        rate > 1 or gain < 1 or plain,
+        f"rate {above(rate)} or gain {above(gain)} is none of form {form}",
+        "not_below",
+    )
+    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain)
 
 
 def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
     """What is proved, its numbers rounded outward."""
     tube, inlet = (funnel.radii[chain] for chain in CHAINS)
+    wider = (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens)
     ends, goal = (
         ", ".join(
-            signal.quantity(f"{signal.name} {above(width * wider)}")
+            signal.quantity(f"{signal.name} {above(width * factor)}")
             for signal, width in zip(model.signals, funnel.half_widths[-1], strict=False)
         )
-        for wider in (Fraction(1), (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens))
+        for factor in (1, wider)
     )
-    box = ", ".join(
-        signal.quantity(f"{signal.name} in [{below(low)}, {above(high)}]")
-        for signal, (low, high) in zip(model.signals, model.box, strict=True)
-    )
-    start, size = "starts with |S[0] (xhat - x[0])| <=", "|S[k] (xhat - x[k])| <= tube[k]"
-    return (
-        f"funnel: a state estimate that {start} {below(tube[0])} stays in the tube, {size}"
-        f"{' + bound' * bool(funnel.widens)}, at all {steps + 1} samples over "
-        f"{below(steps * model.period)} s and ends within {ends} of the nominal; one that {start} "
-        f"{below(inlet[0])} ends within {goal} of it; at the samples both stay in the box of the "
-        f"model's data, {box}"
+    return text.say(
+        SENTENCE,
+        tube=tube[0],
+        bound=" + bound" if funnel.widens else "",
+        samples=steps + 1,
+        span=steps * model.period,
+        ends=ends,
+        inlet=inlet[0],
+        goal=goal,
+        box=ranges(model.signals, list(map(text.PRINTED["outer_range"], model.box))),
     )
 
 
 def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
-    bound, rate, gain = below(funnel.bound), above(funnel.rate), above(funnel.gain)
-    kept = {
-        "response": f"|S r| <= {bound}, r+ = A r + d from r = 0,",
-        "peak": f"|S d| <= {bound}",
-        "energy": f"sqrt(E) <= {bound}, E+ = E + {gain} |S d|^2 from E = 0,",
-        "fading": f"sqrt(E) <= {bound}, E+ = {rate} E + {gain} |S d|^2 from E = 0,",
-    }[funnel.form]
-    assumptions = (
-        f"disturbance {funnel.form} {kept} at every sample, d = xhat+ - f(xhat, u) "
-        f"({funnel.measured})",
-        "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])",
-    )
+    kept = text.say(KEPT[funnel.form], bound=funnel.bound, rate=funnel.rate, gain=funnel.gain)
+    said = (text.say(DISTURBANCE, form=funnel.form, kept=kept), APPLIED)
     if not model.trapezoidal:
-        return assumptions
-    low, high = min(funnel.roots[1:]), max(funnel.roots[1:])
-    near = "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1]"
-    return (*assumptions, f"{near}, {below(low)} to {above(high)}")
-
-
-def _nonnegative(node: Node) -> Fraction:
-    value = node.number()
-    at_most(0, value, f"{node.where} should not be negative")
-    return value
-
-
-def _triangular(M: Matrix, what: str) -> Matrix:
-    size = range(len(M))
-    if not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)):
-        raise Rejected(f"{what} should be upper triangular with a nonzero diagonal")
-    return M
+        return said
+    return (*said, text.say(ROOTS, low=min(funnel.roots[1:]), high=max(funnel.roots[1:])))

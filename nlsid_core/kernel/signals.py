@@ -4,10 +4,8 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 
-from . import text
-from .files import Node, Rejected
+from .files import Node, refuse_if
 
 MAX_SIGNALS = 50
 
@@ -48,7 +46,6 @@ def unit_label(unit: str) -> str:
 def read_signal(node: Node) -> Signal:
     """One {name, unit, path}."""
     parts = node.members("name unit path")
-    parts["path"].text()
     return Signal(name_label(parts["name"].text()), unit_label(parts["unit"].text()))
 
 
@@ -57,8 +54,10 @@ def read_signals(
 ) -> tuple[Signal, ...]:
     """A list of `least` to `most` of `what`, each with a name of its own."""
     signals = tuple(read_signal(entry) for entry in node.items(least, most))
-    if len({signal.name for signal in signals}) < len(signals):
-        raise Rejected(f"{node.where}: two {what} have the same name")
+    refuse_if(
+        len({signal.name for signal in signals}) < len(signals),
+        f"{node.where}: two {what} have the same name",
+    )
     return signals
 
 
@@ -71,11 +70,7 @@ def apart(inputs: Sequence[Signal], outputs: Sequence[Signal]) -> list[Signal]:
     ]
 
 
-def within(signal: Signal, ends: Sequence[Fraction]) -> str:
-    """`NAME in [LOW, HIGH] UNIT` for low < high, rounded inward, to digits that leave a range."""
-    low, high = ends
-    digits = text.DIGITS
-    while Fraction(text.above(low, digits)) >= Fraction(text.below(high, digits)):
-        digits += 1
-    shown = f"[{text.above(low, digits)}, {text.below(high, digits)}]"
-    return signal.quantity(f"{signal.name} in {shown}")
+def ranges(signals: Sequence[Signal], shown: Sequence[str]) -> str:
+    """`NAME in [LOW, HIGH] UNIT, ...` for ranges that are printed already."""
+    pairs = zip(signals, shown, strict=True)
+    return ", ".join(signal.quantity(f"{signal.name} in {ends}") for signal, ends in pairs)

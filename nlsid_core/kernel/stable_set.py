@@ -14,19 +14,27 @@ which is a next state; and in 2.11 M has to be constant: then straight lines joi
 stay inside. The inequalities: docs/certificate_stable_set.md.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
 from . import text
 from .decision import Decision
+from .equations import ImplicitModel, derivative, read_implicit_model
 from .exact import definite
-from .files import Node, Read, Rejected, Terms, bound_files
-from .implicit_models import ImplicitModel, read_implicit_model
-from .polynomials import FREE_OF_S, MOST_WORK, Polynomial, Ring, Work, at_width
+from .files import Node, Read, Terms, bound_files, refuse_if
+from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import WITNESS, positive_on
-from .terms import MAX_VARIABLES, along, derivative, read_symmetric
 
+MAX_VARIABLES = 100
 STORAGE = {"2.10": " V", "2.11": " M", "2.12": " P", "2.13": " P", "2.19": "", "": ""}
+SENTENCE = "the implicit model with {size} has exactly one next state for {where}{stable}"
+STABLE = (
+    "; two of its solutions with the same input have differences whose squares have a finite sum "
+    "(set {kind}: a storage falls by {delta:down} times the squared difference or more a sample)"
+)
+STAY = "both solutions stay in this box of states and inputs; that any do is not stated"
+
 Vector = list[Polynomial]
 Inequality = tuple[Polynomial, Vector]  # >= 0 where each of the domain is >= 0
 
@@ -38,44 +46,51 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     model = read_implicit_model(documents["model"])
     n, m = model.states, model.inputs
     kind = parts["set"].text() if "set" in parts else ""
-    if kind not in STORAGE:
-        raise Rejected(f"the set {kind!r} is unknown; known: {', '.join(filter(None, STORAGE))}")
-    if ("delta" in parts) != bool(kind):
-        raise Rejected("a set needs a delta, and a delta needs a set")
+    refuse_if(
+        kind not in STORAGE,
+        f"the set {kind!r} is unknown; known: {', '.join(filter(None, STORAGE))}",
+    )
+    refuse_if(("delta" in parts) != bool(kind), "a set needs a delta, and a delta needs a set")
     delta = parts["delta"].number() if kind else Fraction(0)
-    if kind and delta <= 0:
-        raise Rejected("delta should be positive")
+    refuse_if(kind and delta <= 0, "delta should be positive", "not_below")
     box = parts["box"].array(n + m, 2) if "box" in parts else []
-    if any(not low < high for low, high in box):
-        raise Rejected("an interval of the box is empty")
+    refuse_if(
+        any(not low < high for low, high in box), "an interval of the box is empty", "not_valid"
+    )
     given = proof.members("inequalities" + STORAGE[kind])
     storage = _read_storage(kind, given, n, local=bool(box))
     count = 2 * model.unknowns + 2 * n + m + 2 * n + 1  # v, x, w, v~, x~, and y
-    if count > MAX_VARIABLES:
-        raise Rejected(f"{count} variables; at most {MAX_VARIABLES} are taken")
+    refuse_if(
+        count > MAX_VARIABLES, f"{count} variables; at most {MAX_VARIABLES} are taken", "too_large"
+    )
 
-    def build(ring: Ring) -> None:
+    def prove(ring: Ring, _: None) -> None:
         wanted = _inequalities(model, kind, storage, delta, box, ring)
         witnesses = given["inequalities"].members(" ".join(wanted))
         for name, (c, domain) in wanted.items():
             witness = witnesses[name].members(WITNESS, "multipliers")
             positive_on(c, domain, witness, ring, f"inequality {name}")
 
-    at_width(count, Work(MOST_WORK, FREE_OF_S), build)
-    shown = [f"[{text.exact(low)}, {text.exact(high)}]" for low, high in box]
-    inputs = f" and every input in {' x '.join(shown[n:])}" if m else ""
-    where = f"every state in {' x '.join(shown[:n])}{inputs}" if box else "every state and input"
+    at_width(count, [None], prove, FREE_OF_S)
+    stable = text.say(STABLE, kind=kind, delta=delta) if kind else ""
     size = f"{n} state{'s' if n > 1 else ''}"
-    posed = f"the implicit model with {size} has exactly one next state for {where}"
-    if not kind:
-        return Decision(posed, model.monotonicity, (), digests)
-    sentence = (
-        f"{posed}; two of its solutions with the same input have differences whose squares have a "
-        f"finite sum (set {kind}: a storage falls by {text.below(delta)} times the squared "
-        "difference or more a sample)"
-    )
-    stay = ("both solutions stay in this box of states and inputs",) if box else ()
-    return Decision(sentence, delta, stay, digests)
+    said = text.say(SENTENCE, size=size, where=_where(box, n), stable=stable)
+    stay = (STAY,) if box and kind else ()
+    return Decision(said, delta if kind else model.monotonicity, stay, digests)
+
+
+def _where(box: list[Any], n: int) -> str:
+    if not box:
+        return "every state and input"
+    shown = [text.PRINTED["exact_range"](ends) for ends in box]
+    inputs = f" and every input in {' x '.join(shown[n:])}" if shown[n:] else ""
+    return f"every state in {' x '.join(shown[:n])}{inputs}"
+
+
+def _along(ps: Sequence[Terms], at: Vector, direction: Vector, ring: Ring) -> Vector:
+    """Σ_j ∂p/∂(variable j) direction[j] of each p, with `at` in the variables' place."""
+    put, size = ring.substitution(at), len(direction)
+    return [ring.dot([put(derivative(p, j)) for j in range(size)], direction) for p in ps]
 
 
 def _inequalities(
@@ -105,8 +120,8 @@ def _inequalities(
     elif kind == "2.11":
         nu, gap = y[:k], y[k : k + n]
         M, M_next = ([at(row, point) for row in storage] for point in (x, [*v, *shift]))
-        moved = along(model.h, here, [*nu, *gap], ring)
-        gap_next = [*nu, *along(model.shift, known, gap, ring)]
+        moved = _along(model.h, here, [*nu, *gap], ring)
+        gap_next = [*nu, *_along(model.shift, known, gap, ring)]
         c = 2 * dot(nu, moved) + form(M, gap) - delta * dot(gap, gap) - form(M_next, gap_next)
         found["stable"] = c, [*at_known, *at_next]
         found["storage"] = form(M, y[:n]), []
@@ -120,12 +135,12 @@ def _inequalities(
     elif kind:
         e, f = model.separated()
         gap, y = y[:n], y[n : 2 * n]
-        slope, turned = dot(gap, along(e, x, gap, ring)), dot(y, along(f, known, gap, ring))
+        slope, turned = dot(gap, _along(e, x, gap, ring)), dot(y, _along(f, known, gap, ring))
         if kind == "2.13":
             c = 2 * slope - form(storage, gap) + form(storage, y)
         else:
             _check_linear(e, f, box)
-            c = slope + dot(y, along(e, x, y, ring))
+            c = slope + dot(y, _along(e, x, y, ring))
         found["stable"] = c + 2 * turned - delta * dot(gap, gap), at_known
     return found
 
@@ -133,10 +148,10 @@ def _inequalities(
 def _well_posed(model: ImplicitModel, here: Vector, y: Vector, ring: Ring) -> dict[str, Polynomial]:
     """`monotone`, or `centre` (everywhere) and `centred`."""
     m, dot, v = model.monotonicity, ring.dot, here[: model.unknowns]
-    slope = along(model.h, here, y, ring)
+    slope = _along(model.h, here, y, ring)
     if not model.centre:
         return {"monotone": 2 * (dot(y, slope) - m * dot(y, y))}
-    inner = along(model.centre, v, y, ring)
+    inner = _along(model.centre, v, y, ring)
     square = dot(inner, inner)
     if all(sum(e) <= 1 for p in model.centre for e, _ in p):
         regular = square - m**2 * dot(y, y)
@@ -147,12 +162,15 @@ def _well_posed(model: ImplicitModel, here: Vector, y: Vector, ring: Ring) -> di
 
 def _check_linear(e: list[Terms], f: list[Terms], box: list[Any]) -> None:
     n = len(e)
-    if box:
-        raise Rejected("a linear model is stable everywhere: the claim has no box")
-    if any(sum(a[:n]) > 1 or (any(a[:n]) and any(a[n:])) for p in (*e, *f) for a, _ in p):
-        raise Rejected("the model is not linear in its states")
-    if any(derivative(e[i], j) != derivative(e[j], i) for i in range(n) for j in range(i)):
-        raise Rejected("E is not symmetric; multiply the model's equation by E' first")
+    refuse_if(box, "a linear model is stable everywhere: the claim has no box")
+    refuse_if(
+        any(sum(a[:n]) > 1 or (any(a[:n]) and any(a[n:])) for p in (*e, *f) for a, _ in p),
+        "the model is not linear in its states",
+    )
+    refuse_if(
+        any(derivative(e[i], j) != derivative(e[j], i) for i in range(n) for j in range(i)),
+        "E is not symmetric; multiply the model's equation by E' first",
+    )
 
 
 def _minus(a: Vector, b: Vector) -> Vector:
@@ -169,13 +187,16 @@ def _read_storage(kind: str, given: dict[str, Node], n: int, *, local: bool) -> 
     """V as terms in (x, x~), M as rows of terms in x, P as numbers; None for other claims."""
     if kind == "2.10":
         V = given["V"].polynomial(2 * n)
-        if any(c and not any(e[n:]) for e, c in V):
-            raise Rejected("V(x, x) is not zero")
+        refuse_if(any(c and not any(e[n:]) for e, c in V), "V(x, x) is not zero")
         return V
     if kind == "2.11":
-        M = read_symmetric(given["M"], n, n, n)
-        if local and any(any(e) for row in M for entry in row for e, _ in entry):
-            raise Rejected("on a box M should be constant: curved paths can leave the box")
+        rows = given["M"].items(n, n)
+        M = [[entry.polynomial(n) for entry in row.items(n, n)] for row in rows]
+        refuse_if(any(M[i][j] != M[j][i] for i in range(n) for j in range(i)), "M is not symmetric")
+        refuse_if(
+            local and any(any(e) for row in M for entry in row for e, _ in entry),
+            "on a box M should be constant: curved paths can leave the box",
+        )
         return M
     if "P" in given:
         P = given["P"].array(n, n)

@@ -1,10 +1,20 @@
-"""Numbers in sentences, rounded outward: no printed bound is better than the proved one."""
+"""Numbers in sentences, and the one printer of sentences.
 
+A sentence is a template with slots, `{name:how}`, and `how` is one of PRINTED. A bound is printed
+exactly where its shortest decimal form is short, else rounded outward: no printed bound is better
+than the proved one. As in the files, a decimal stands for the float64 nearest to it.
+"""
+
+import json
+from collections.abc import Callable
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from math import isqrt
+from string import Formatter
+from typing import Any
 
-DIGITS = 4  # significant
+DIGITS = 4  # significant, of a number that is rounded
+SHORT = 6  # significant digits of a number that is not
 
 
 def above(value: Fraction, digits: int = DIGITS) -> str:
@@ -21,13 +31,13 @@ def exact(value: Fraction) -> str:
     """`value` itself: the shortest decimal form of a float64, or p/q."""
     if value.denominator == 1:
         return str(value.numerator)
-    try:
-        nearest = float(value)
-        if Fraction(*nearest.as_integer_ratio()) == value:
-            return repr(nearest)
-    except OverflowError:
-        pass
-    return str(value)
+    nearest = _nearest(value)
+    return str(value) if nearest is None else repr(nearest)
+
+
+def quoted(value: str) -> str:
+    """A text in quotation marks, which can end no sentence."""
+    return json.dumps(value)
 
 
 def root_above(value: Fraction, bits: int = 64) -> Fraction:
@@ -41,10 +51,53 @@ def root_above(value: Fraction, bits: int = 64) -> Fraction:
     return Fraction(root if root * root == scaled else root + 1, 1 << (shift // 2))
 
 
+PRINTED: dict[str, Callable[[Any], str]] = {
+    "": str,
+    "up": above,
+    "down": below,
+    "exact": exact,
+    "quoted": quoted,
+    "exact_range": lambda ends: f"[{exact(ends[0])}, {exact(ends[1])}]",
+    "outer_range": lambda ends: f"[{below(ends[0])}, {above(ends[1])}]",
+    "inner_range": lambda ends: _inner(*ends),
+}
+
+
+class _Printer(Formatter):
+    def format_field(self, value: Any, how: str) -> str:
+        """A slot's value, printed as its template says."""
+        return PRINTED[how](value)
+
+
+say = _Printer().format
+
+
+def _nearest(value: Fraction) -> float | None:
+    """The float64 that `value` is, if it is one."""
+    try:
+        nearest = value.numerator / value.denominator
+    except OverflowError:
+        return None
+    return nearest if Fraction(*nearest.as_integer_ratio()) == value else None
+
+
 def _decimal(value: Fraction, digits: int, rounding: str) -> str:
-    context = Context(prec=digits, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN)
-    shown = context.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize()
+    nearest = _nearest(value)
+    own = None if nearest is None else Decimal(repr(nearest)).normalize()
+    if own is not None and len(own.as_tuple().digits) <= SHORT:
+        shown = own
+    else:
+        context = Context(prec=digits, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN)
+        shown = context.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize()
     exponent = shown.adjusted()
     if not shown or -4 <= exponent < digits + 3:
         return f"{shown:f}"
     return f"{shown.scaleb(-exponent):f}e{exponent:+03d}"
+
+
+def _inner(low: Fraction, high: Fraction) -> str:
+    """[low, high] rounded inward, to as many digits as leave a range."""
+    digits = DIGITS
+    while Fraction(above(low, digits)) >= Fraction(below(high, digits)):
+        digits += 1
+    return f"[{above(low, digits)}, {below(high, digits)}]"

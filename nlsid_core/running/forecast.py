@@ -15,8 +15,9 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.funnels.factor import STEPS, UNIT
 from nlsid_core.funnels.tube import Tube
-from nlsid_core.kernel import Rejected, increments
+from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import parse
+from nlsid_core.kernel.models import read_model
 from nlsid_core.models import DifferenceEquation, ImplicitModel, StableModel, StateAffineModel
 
 OUTWARD = 1e-8  # relative: more than float64 can hide of a reach, a level or an output
@@ -49,16 +50,16 @@ def linear_form(model: StableModel) -> Linear | None:
     if varies or not isinstance(model, DifferenceEquation | ImplicitModel | StateAffineModel):
         return None
     try:
-        form = increments.read_model(parse(files.encode(model.document()), "model"))
+        form = read_model(parse(files.encode(model.document()), "model"))
     except Rejected:  # an implicit one that needs a box
         return None
-    if form.ray:
+    if form.E.ray:
         return None
     F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
     m = form.unknowns
     if not m:
         return Linear(F, H, UNIT)
-    E = np.array(form.vertices(form.box, None)[0], dtype=np.float64)
+    E = np.array(form.E.vertices(form.E.box, None)[0], dtype=np.float64)
     back = np.linalg.solve(E[:, :m], E[:, m:])
     A, C = F[:, m:] - F[:, :m] @ back, H[:, m:] - H[:, :m] @ back
     return Linear(A, C, (m + STEPS) * UNIT * float(np.linalg.cond(E[:, :m])))

@@ -23,7 +23,6 @@ from nlsid_core.funnels.factor import MOST_ROUNDING, STEPS, UNIT, refuse_coarse
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.kernel.signals import name_label
-from nlsid_core.kernel.tube import BESIDE
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
@@ -40,7 +39,7 @@ STARTING = "waiting for the first"
 PACE = 0.01  # of a stamp's drift by which the mean follows: over some 100 samples
 OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
 COARSE = "float64 cannot tell where the simulation is"
-WATCHED = BESIDE.replace("this", "the tube's")  # in the words of `check`
+WATCHED = "watched as well, not needed for the tube's sentence"
 
 
 class TubeRun:

@@ -1,7 +1,6 @@
 """Bundles of a design: what is true is decided as from its files, everything else is refused."""
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,11 +8,12 @@ import pytest
 
 from bags.designs import bundle as bundles
 from bags.designs import documents
-from bags.designs.bundle import Bundle, Check, decide
+from bags.designs.bundle import Bundle, Check
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.proofs import check
+from tests.bags.deciding import decide
 
 
 @pytest.fixture
@@ -36,7 +36,8 @@ def test_a_bundle_is_the_files_byte_for_byte_and_decided_like_them(
         assert read.contents[role] == funnel.with_name(name).read_bytes()
     assert read.decided() == check(funnel.with_name(documents.FUNNEL_PROOF))
     assert read.design().digest == read.digest == files.digest(funnel.read_bytes())
-    assert decide(bundle.text()) == {"proved": str(read.decided()), "digest": read.digest}
+    answer = decide(bundle.text())
+    assert (answer["proved"], answer["digest"]) == (str(read.decided()), read.digest)
 
 
 def with_digit_changed(text: str) -> str:
@@ -122,19 +123,27 @@ def test_a_bundle_too_large_to_be_taken_is_not_made(
         Bundle.load(funnel)
 
 
-def answered(check: Check) -> Json:
-    while (answer := check.poll()) is None:
-        time.sleep(0.01)
-    check.close()
-    return answer
-
-
-def test_a_check_in_a_process_of_its_own_says_the_same_and_can_be_called_off(
-    bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+def test_what_was_decided_is_remembered_and_no_other_user_can_write_it(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert answered(Check(bundle.text())) == decide(bundle.text())
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    kept = tmp_path / "nlsid" / "decided"
+    assert not decide(bundle.text())["before"]
+    assert decide(bundle.text())["before"]
+    (entry,) = kept.iterdir()
+    assert kept.stat().st_mode & 0o777 == 0o700
     forged = Bundle({**bundle.contents, "policy": b"{}"})
-    assert answered(Check(forged.text())) == decide(forged.text())
-    Check(bundle.text()).close()
-    monkeypatch.setattr(bundles, "MAX_TIME", 0.0)
-    assert answered(Check(bundle.text())) == {"refused": "not decided within 0 s"}
+    assert "refused" in decide(forged.text())  # the same proof, about another file
+    lie = json.loads(entry.read_text()) | {"statement": "all is well"}
+    entry.write_text(json.dumps(lie))
+    for path, mode in ((entry, 0o622), (kept, 0o770)):
+        path.chmod(mode)
+        answer = decide(bundle.text())
+        assert (answer["before"], "all is well" in answer["proved"]) == (False, False)
+        entry.chmod(0o600)
+
+
+def test_a_check_can_be_called_off(bundle: Bundle) -> None:
+    check = Check(bundle.text())
+    check.close()
+    assert check.seconds >= 0.0

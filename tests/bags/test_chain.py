@@ -21,6 +21,7 @@ from bags.chain.training import load_training
 from bags.commands.cli import app
 from bags.commands.show import paced_lines, replay_lines
 from bags.designs import documents
+from bags.designs.provenance import of_proof
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
@@ -110,7 +111,8 @@ def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
         assert {name for name, _ in tube.measured_on} == set(config.split.calibration)
         assert set(tube.designed_on) == set(model.bags)
         assert not {d for _, d in tube.measured_on} & {d for _, d in model.bags}
-    assert "exceeds their largest with probability at most 1/17)" in proved.verdict.assumptions[1]
+    said = of_proof(chain / documents.FUNNEL_PROOF).said[0]
+    assert "exceeds their largest with probability at most 1/17" in said
 
 
 def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
@@ -197,9 +199,9 @@ def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_
     assert made.exit_code == 0, made.output
     assert "of 1 held-back trial," in made.output
     proved = documents.load_proved_funnel(tmp_path / documents.FUNNEL)
-    said = proved.verdict.assumptions[1]
-    assert "largest of 1 distinct window, taken whole, " in said
-    assert said.endswith("as windows of one recording are hardly exchangeable)")
+    said = of_proof(tmp_path / documents.FUNNEL_PROOF).said[0]
+    assert "largest of 1 distinct window " in said
+    assert said.endswith("as windows of one recording are hardly exchangeable")
     (digest,) = {digest for _, digest in proved.design.model.bags}
     for tube in proved.design.funnel.tubes:
         assert tube.designed_on == (("trial_41[0:44]", f"{digest}[0:44]"),)

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
-from bags.designs.bundle import Bundle, decide
+from bags.designs.bundle import Bundle
 from bags.designs.design import Wiring
 from bags.designs.documents import load_proved
 from bags.monitoring.replay import replay_messages
@@ -23,6 +23,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Limits
 from nlsid_core.running.reading import Reading, Status
+from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
 
 RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"

@@ -71,8 +71,8 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
                 (m["name"], m["metadata"]) for m in wanted.get("Metadata", [])
             ]
             assert [
-                (a.name, a.media_type, str(a.log_time), str(a.create_time), file.attachment_data(a))
-                for a in found.attachments
+                (a.name, a.media_type, str(a.log_time), str(a.create_time), a.data)
+                for a in file.attachments()
             ] == [
                 (a["name"], a["media_type"], a["log_time"], a["create_time"], data_of(a["data"]))
                 for a in wanted.get("Attachment", [])

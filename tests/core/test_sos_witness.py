@@ -9,8 +9,8 @@ import pytest
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
-from nlsid_core.kernel.polynomials import Ring, Work, at_width
-from nlsid_core.kernel.positivity import positive, read_witness
+from nlsid_core.kernel.polynomials import Ring, at_width
+from nlsid_core.kernel.positivity import positive, read_squares
 from nlsid_core.polynomial import monomials
 from nlsid_core.sos.witness import expanded, multiplier, witness
 
@@ -21,11 +21,12 @@ def decide(c: Coefficients, squares: Any, *, strict: bool = True) -> None:
     """`positive` of Σ_j B_j(s) c_j(x), given by Bernstein control points."""
     count = len(squares["basis"][0])
 
-    def build(ring: Ring) -> None:
+    def build(ring: Ring, _: None) -> None:
         parts = [ring.bernstein(control) * ring.monomial(e) for e, control in c.items()]
-        positive(ring.sum(parts), read_witness(Node(squares, "c"), ring), ring, "c", strict=strict)
+        members = Node(squares, "c").members("basis columns squares")
+        positive(ring.sum(parts), read_squares(members, ring), ring, "c", strict=strict)
 
-    at_width(count, Work(), build)
+    at_width(count, [None], build)
 
 
 def of_grams(basis: Any, grams: Any) -> Coefficients:

@@ -12,7 +12,7 @@ from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.states import identify_states
-from nlsid_core.kernel.sampled_funnel import Sample, implicit_step
+from nlsid_core.kernel.sampled_step import Sample, implicit_step
 from nlsid_core.models.measured_state import read_measured_state
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from tests.implicit_pendulum import EXPONENTS, PERIOD, PHYSICS, truth

@@ -16,8 +16,8 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import text
 from nlsid_core.kernel.files import Terms
-from nlsid_core.kernel.polynomials import Polynomial, Ring, Work
-from nlsid_core.kernel.sampled_funnel import Sample
+from nlsid_core.kernel.polynomials import Polynomial, Ring
+from nlsid_core.kernel.sampled_step import Sample
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.sos.witness import expanded, multiplier, witness
@@ -59,13 +59,13 @@ def floats(M: Sequence[Sequence[Fraction]]) -> FloatArray:
 
 def map_of(model: MeasuredState) -> list[Terms]:
     """The model's map, exactly."""
-    exponents = [tuple(row) for row in model.exponents.tolist()]
+    exponents = [bytes(row) for row in model.exponents.tolist()]
     return [list(zip(exponents, column, strict=True)) for column in exact(model.coefficients.T)]
 
 
 def ring_of(variables: int) -> Ring:
     """The kernel's polynomials in so many variables."""
-    return Ring(variables, WIDTH, Work())
+    return Ring(variables, WIDTH)
 
 
 def terms(p: Polynomial, ring: Ring) -> dict[tuple[int, ...], Fraction]:

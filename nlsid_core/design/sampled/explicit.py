@@ -12,7 +12,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.kernel.exact import Matrix, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
-from nlsid_core.kernel.sampled_funnel import explicit_step
+from nlsid_core.kernel.sampled_step import explicit_step
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 

@@ -14,7 +14,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.kernel.exact import Matrix, combined, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
-from nlsid_core.kernel.sampled_funnel import implicit_step, linear_part
+from nlsid_core.kernel.sampled_step import implicit_step, linear_part
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.sampled import SampledPolicy
 

@@ -24,7 +24,8 @@ from nlsid_core.errors import CertificateRejected, SolverError
 from nlsid_core.identification.proofs.leading_bounds import leading_bounds
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import parse
-from nlsid_core.kernel.matrix_polynomials import Box
+from nlsid_core.kernel.increments import Box
+from nlsid_core.kernel.models import read_model
 from nlsid_core.models import StateAffineModel
 
 RATE_ROOM = 0.05  # of 1 - the fastest rate found, given up for a well conditioned P
@@ -98,7 +99,7 @@ class _Search:
         object.__setattr__(self, "m", self.F.shape[1] - len(self.F))
 
     def leaf(self, box: Box) -> Leaf:
-        return Leaf(box, np.array(self.form.vertices(box, None), dtype=np.float64))
+        return Leaf(box, np.array(self.form.E.vertices(box, None), dtype=np.float64))
 
 
 def prove_stability(model: Any) -> StabilityProof | None:
@@ -107,15 +108,15 @@ def prove_stability(model: Any) -> StabilityProof | None:
     model: of a class that the kernel knows the increment form of.
     """
     try:
-        form = increments.read_model(parse(files.encode(model.document()), "model"))
+        form = read_model(parse(files.encode(model.document()), "model"))
         search = _Search(form, np.array(form.F, dtype=np.float64))
         if not search.m:
             return _decided(model, _linear(search, None))
-        root = search.leaf(form.box)
-        if len(root.E) == 1 and not form.ray:
+        root = search.leaf(form.E.box)
+        if len(root.E) == 1 and not form.E.ray:
             return _decided(model, _linear(search, root))
         layer = _layers(search, root)
-        if layer is not None and not search.form.ray and not form.box:
+        if layer is not None and not search.form.E.ray and not form.E.box:
             return _by_weights(model, search, root, layer)
         if isinstance(model, StateAffineModel) and _is_bounded(model):
             return _decided(model, _by_programs(search, _between_ends(model, root)))
@@ -131,7 +132,7 @@ def storage_on(form: increments.Model) -> StabilityProof | None:
     """
     search = _Search(form, np.array(form.F, dtype=np.float64))
     try:
-        return _by_programs(search, search.leaf(form.box))
+        return _by_programs(search, search.leaf(form.E.box))
     except (kernel.Rejected, LinAlgError, SolverError):
         return None
 
@@ -302,7 +303,7 @@ def _by_programs(search: _Search, root: Leaf) -> StabilityProof | None:
             if found.proved:
                 return _with_room(search, *_fastest(search, room, alone, found))
             tree = found.tree
-        if search.form.whole == len(search.form.box) or len(leaves) > MOST_LEAVES // 2:
+        if search.form.E.whole == len(search.form.E.box) or len(leaves) > MOST_LEAVES // 2:
             return None
         tree = _refined(search, tree, None if found is None else found.P)
     return None
@@ -381,7 +382,7 @@ def _at_rate(
         gaps = _gap(F, P, rate, m) + N @ Es + (N @ Es).transpose(0, 2, 1)
         least = float(np.linalg.eigvalsh(gaps)[:, 0].min())
         N_outside = outside @ N @ D / size
-        if search.form.ray:
+        if search.form.E.ray:
             N_outside[1:, 0] = 0.0
         proved[id(leaf)] = replace(leaf, N=N_outside, margin=least)
     P_outside = (P_outside + P_outside.T) / (2.0 * size)
@@ -434,7 +435,7 @@ def _program(
     bounded[-1, -1] = 1.0
     limits = np.full(len(bounded), LARGEST)
     limits[-1] = 1.0
-    if search.form.ray:  # N = (T, 0, ..., 0), T >= 0
+    if search.form.E.ray:  # N = (T, 0, ..., 0), T >= 0
         fixed = np.arange(count) % len(entries) > 0
         limits[:count][fixed] = limits[count:-1][fixed] = 0.0
         limits[count:-1][~fixed] = 0.0
@@ -470,7 +471,7 @@ def _refined(search: _Search, tree: Tree, P: FloatArray | None) -> Tree:
         if leaf.margin >= FEASIBLE:
             continue
         halves = []
-        for i, (low, high) in list(enumerate(leaf.box))[search.form.whole :]:
+        for i, (low, high) in list(enumerate(leaf.box))[search.form.E.whole :]:
             middle = (low + high) / 2
             ends = ((low, middle), (middle, high))
             parts = [search.leaf([*leaf.box[:i], end, *leaf.box[i + 1 :]]) for end in ends]

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType
 from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
 from bags.recordings.mcap_file import McapFile
-from bags.recordings.mcap_records import walk_records
+from bags.recordings.mcap_records import index_entries, walk_records
 from bags.recordings.remote import Entry, RemotePath, is_url, place
 from bags.samples import f1tenth
 from bags.signals.reader import bag_origin, read_signals
@@ -321,7 +321,7 @@ def test_damage_anywhere_is_an_error_that_names_the_file(
         block = file.contents.blocks[1]
     channel, (index, _) = next(iter((block.index or {}).items()))
     summary = int.from_bytes(content[-28:-20], "little")
-    at = {"summary": summary + 30, "index": index - 6, "chunk": block.offset + 1000}[part]
+    at = {"summary": summary + 30, "index": index + 9, "chunk": block.offset + 1000}[part]
     assert part != "index" or content[at] == channel
     content[at] ^= 0x55
     local.write_bytes(content)
@@ -422,7 +422,8 @@ def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: P
     with McapFile(local) as file:
         block = file.contents.blocks[0]
         command = next(c.id for c in file.contents.channels.values() if c.topic == CMD)
-        at = block.offset + int(file._indexed(*(block.index or {})[command])[0])
+        record = file._read(*(block.index or {})[command])
+        at = block.offset + int(index_entries(record, command, "")[0])
     content = bytearray(local.read_bytes())
     length = int.from_bytes(content[at + 1 : at + 9], "little")
     content[at + 1 : at + 9] = (length + 1).to_bytes(8, "little")

@@ -245,8 +245,7 @@ class Oracle:
         for i in range(self.m):
             gains = [bernstein([gain[i][j] for gain in K], s) for j in range(n)]
             u.append(bernstein([p[i] for p in u0], s) - dot(gains, e))
-        held, decay = Fraction(0), self.claim.get("decay")
-        own = 2 if decay else 0
+        held = Fraction(0)
         for place, (number, low, high) in enumerate(numbers(self.policy["limits"])):
             i, mode = int(number), piece["mode"][place]
             wanted = u[i]
@@ -255,7 +254,7 @@ class Oracle:
             else:
                 q = low - wanted if mode < 0 else wanted - high
                 u[i] = low if mode < 0 else high
-            tau = piece["tau"][own + place]
+            tau = piece["tau"][place]
             held += q * squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
         w = self.vertex(piece["vertex"])
         count = 1 if "kappa" in self.proof else 2 ** len(w)
@@ -264,19 +263,6 @@ class Oracle:
         Pe = [dot(row, e) for row in P]
         W, W_bend = dot(e, Pe), dot(e, [dot(row, e) for row in bend])
         growth = 2 * dot(Pe, [h * a - b for a, b in zip(f, motion, strict=True)]) + W_bend
-        if decay:
-            assert len(piece["tau"]) == 2 + len(self.policy["limits"])
-            assert "mu" not in piece
-            assert not {"margin", "multiplier"} & set(self.proof)
-            rate, floor = Fraction(decay["rate"]), Fraction(decay["floor"])
-            first, second = (
-                squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
-                for tau in piece["tau"][:2]
-            )
-            falls: Fraction = W * (rho1 - rho0) - rho * (growth + self.pushed(k, t0, Pe, u, w))
-            room = h * rate * rho * (floor * rho - W)
-            falls += room - first * (rho - W) - second * (W - floor * rho) - held
-            return falls
         mu = Fraction(0)
         lists = (piece["mu"][key] for key in ("shifts", "start", "end"))
         for row, shift, start, end in zip(self.proof["multiplier"], *lists, strict=True):
@@ -381,12 +367,9 @@ def makes_sense(oracle: "Oracle") -> bool:
         and len(limited) <= 3
         and len(set(limited)) == len(limited)
         and all(row[0] in range(m) and row[1] < row[2] for row in policy["limits"])
-        and set(claim) <= {"kind", "about", "goal", "hold", "error", "decay"}
-        and 0 <= Fraction(claim.get("decay", {}).get("floor", 0)) < 1
-        and Fraction(claim.get("decay", {}).get("rate", 1)) > 0
-        and set(claim.get("decay", {"rate", "floor"})) == {"rate", "floor"}
+        and set(claim) <= {"kind", "about", "goal", "hold", "error"}
         and (("kappa" not in proof) or (alone and w > 0))
-        and ("decay" in claim or Fraction(proof["margin"]) > 0)
+        and Fraction(proof["margin"]) > 0
         and ("hold" not in claim or claim["hold"] > 0)
         and min(claim.get("error", [0])) >= 0
         and (affine or not {"hold", "error"} & set(claim))
@@ -497,7 +480,7 @@ def stays_valid(oracle: "Oracle", k: int) -> bool:
         for knot, g in product((k, k + 1), rows):
             P, rho = numbers(funnel["P"][knot]), Fraction(funnel["rho"][knot])
             form = dot(g, [row[0] for row in solved(P, [[e] for e in g])])
-            if rho * form > min(room) ** 2:
+            if rho * form > min(room) ** 2 or (j < n and rho * form == min(room) ** 2):
                 return False
     return True
 

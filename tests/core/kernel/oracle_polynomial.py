@@ -5,7 +5,7 @@ Fractions, nothing is packed, rounded or scaled to integers. `left_over` decides
 `positive`; `agrees` decides a whole proof document.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from math import comb
 from typing import Any
@@ -210,41 +210,6 @@ def on_domain(c: P, domain: Sequence[P], witness: Any) -> dict[Key, Fraction] | 
     return left_over([c], witness)
 
 
-def bound_inequality(claim: Any, proof: Any) -> tuple[P, list[P]]:
-    """φ·(p - bound) - Σ μ h, and the domain. Source: docs/certificate_polynomials.md."""
-    x = len(claim["variables"])
-    n = x + len(claim.get("matrix", []))
-    v = [P.variable(n, i) for i in range(n)]
-    if "matrix" in claim:
-        c = P(n)
-        for i, row in enumerate(claim["matrix"]):
-            for j, entry in enumerate(row):
-                c = c + put(stated(entry), v[:x]) * v[x + i] * v[x + j]
-    else:
-        c = put(stated(claim["polynomial"]), v) - P.constant(n, number(claim["bound"]))
-    if "factor" in proof:
-        phi = P.constant(n, number(proof["factor"]["constant"])) + squares(proof["factor"], n)[0]
-        c = phi * c
-    for mu, h in zip(
-        proof.get("equality_multipliers", []), claim.get("equalities", []), strict=True
-    ):
-        c = c - put(stated(mu), v) * put(stated(h), v[:x])
-    return c, [put(stated(g), v[:x]) for g in claim.get("domain", [])]
-
-
-def attraction_inequalities(claim: Any, proof: Any) -> dict[str, P]:
-    """V, and -dV/dt - σ (level - V). Source: docs/certificate_polynomials.md."""
-    n = len(claim["variables"])
-    v = [P.variable(n, i) for i in range(n)]
-    V, decrease = put(stated(claim["V"]), v), P(n)
-    for j, f in enumerate(claim["field"]):
-        decrease = decrease - put(slope(stated(claim["V"]), j), v) * put(stated(f), v)
-    if "level" in claim:
-        sigma = squares(proof["multiplier"], n)[0]
-        decrease = decrease - sigma * (P.constant(n, number(claim["level"])) - V)
-    return {"V": V, "decrease": decrease}
-
-
 def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P, list[P]]]:
     """Each inequality and its domain. Source: docs/certificate_stable_set.md."""
     nx, nw = len(model["states"]), len(model["inputs"])
@@ -357,29 +322,15 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
 def agrees(document: Any, files: Mapping[str, Any]) -> bool:
     """True if every obligation of the proof holds, by this file's arithmetic."""
     claim, proof = document["claim"], document["proof"]
-    documents = files
-    decide: Callable[[], bool] = {
-        "polynomial_bound": lambda: (
-            number(proof.get("factor", {"constant": 1})["constant"]) > 0
-            and on_domain(*bound_inequality(claim, proof), proof) is not None
-        ),
-        "region_of_attraction": lambda: _attraction_agrees(claim, proof),
-        "stable_set": lambda: (
-            _side_conditions(claim, proof, documents)
-            and all(
-                on_domain(c, domain, proof["inequalities"][name]) is not None
-                for name, (c, domain) in stable_inequalities(
-                    claim, proof, files[claim["about"]["model"]["file"]]
-                ).items()
-            )
-        ),
-    }[claim["kind"]]
-    return decide()
-
-
-def _side_conditions(claim: Any, proof: Any, files: Mapping[str, Any]) -> bool:
-    """δ and m positive, a box that is not empty, and a storage that is one."""
     model = files[claim["about"]["model"]["file"]]
+    return _side_conditions(claim, proof, model) and all(
+        on_domain(c, domain, proof["inequalities"][name]) is not None
+        for name, (c, domain) in stable_inequalities(claim, proof, model).items()
+    )
+
+
+def _side_conditions(claim: Any, proof: Any, model: Any) -> bool:
+    """δ and m positive, a box that is not empty, and a storage that is one."""
     kind, n = claim.get("set"), len(model["states"])
     if number(model["monotonicity"]) <= 0 or (kind and number(claim["delta"]) <= 0):
         return False
@@ -410,16 +361,3 @@ def definite(M: list[list[Fraction]]) -> bool:
             share = rows[i][k] / rows[k][k]
             rows[i] = [a - share * b for a, b in zip(rows[i], rows[k], strict=True)]
     return True
-
-
-def _attraction_agrees(claim: Any, proof: Any) -> bool:
-    for name, c in attraction_inequalities(claim, proof).items():
-        left = left_over([c], proof[name])
-        if left is None or any(not any(k) for k in left):
-            return False
-        pure = [k for k, room in left.items() if room > 0 and sum(1 for e in k if e) == 1]
-        if {next(i for i, e in enumerate(k) if e) for k in pure} != set(range(c.n)):
-            return False
-    return all(not c or any(k) for f in claim["field"] for k, c in stated(f)) and (
-        "level" not in claim or number(claim["level"]) > 0
-    )

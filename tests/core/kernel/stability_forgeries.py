@@ -57,7 +57,6 @@ CHANGES: dict[str, tuple[str, Callable[[Json, Json], None], str]] = {
     "one knot": ("network", lambda m, _: m["maps"][2].update(knots=[0.0], values=[0.0]),
                  "2 knots"),
     "fewer maps": ("network", lambda m, _: m["maps"].pop(), "shape"),
-    "no start": ("network", lambda m, _: m.update(start_samples=0), "from 1"),
     "no spacing": ("cascade", lambda m, _: m["f"].update(spacing=0.0), "spacing"),
     "stronger": ("cascade", lambda m, _: m["b1"][1].__setitem__(0, 50.0), "decrease"),
     "ragged": ("cascade", lambda m, _: m["b1"][1].append(0.0), "equal lengths"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -28,11 +29,9 @@ from nlsid_core.kernel.files import (
     plain,
     read_regular,
 )
-from nlsid_core.kernel.implicit_models import read_stack
-from nlsid_core.kernel.polynomials import Polynomial, Ring, Work
+from nlsid_core.kernel.polynomials import Ring
 from nlsid_core.kernel.positivity import read_squares
-from nlsid_core.kernel.terms import read_names
-from tests.marks import slow_among
+from tests.core.kernel.mutations import CORPUS
 
 SECONDS = 20.0  # of processor time that any one refusal may take, on a slow machine
 json_values = st.recursive(
@@ -46,7 +45,7 @@ json_values = st.recursive(
 
 
 def ring(count: int = 2) -> Ring:
-    return Ring(count, 64, Work())
+    return Ring(count, 64)
 
 
 WITNESS = {
@@ -66,8 +65,6 @@ READERS: dict[str, Callable[[Node], Any]] = {
     "columns": lambda node: read_squares(WITNESS | {"columns": node}, ring()),
     "squares": lambda node: read_squares(WITNESS | {"squares": node}, ring()),
     "polynomial": lambda node: node.polynomial(2),
-    "stack": lambda node: read_stack(node, 2, 1),
-    "names": read_names,
     "bindings": lambda node: bound_files(node, lambda _: b"{}", "model"),
 }
 
@@ -181,119 +178,7 @@ def proof(claim: Any, parts: Any) -> bytes:
     return json.dumps(document).encode()
 
 
-def refused(content: bytes, reason: str = r"\w") -> None:
-    """Refused with this reason, within the promised time."""
-    started = time.process_time()
-    with pytest.raises(Rejected, match=reason):
-        kernel.decide(content, lambda _: b"")
-    assert time.process_time() - started < SECONDS
-
-
-def bound_claim(exponents: Any, coefficients: Any, bound: Any = 0) -> Any:
-    return {
-        "kind": "polynomial_bound", "about": {}, "variables": ["x", "y"],
-        "polynomial": {"exponents": exponents, "coefficients": coefficients}, "bound": bound,
-    }  # fmt: skip
-
-
-SQUARES = {
-    "basis": [[0, 0], [1, 0], [0, 1]], "columns": [0, 0, 0],
-    "squares": {"unit": 0, "factors": [[]]},
-}  # fmt: skip
-
-
-@settings(max_examples=100, deadline=None)
-@given(json_values, st.sampled_from(["claim", "proof", "polynomial", "squares", "bound", "about"]))
-def test_any_value_in_the_place_of_a_part_is_refused_or_harmless(value: Any, place: str) -> None:
-    claim, parts = bound_claim([[0, 0]], [1.0], 1), json.loads(json.dumps(SQUARES))
-    if place in ("claim", "proof"):
-        claim, parts = (value, parts) if place == "claim" else (claim, value)
-    elif place == "squares":
-        parts["squares"] = value
-    else:
-        claim[place] = value
-    try:
-        content = proof(claim, parts)
-        verdict = kernel.decide(content, lambda _: b"")
-    except (Rejected, ValueError) as refusal:
-        message = str(refusal)
-    else:
-        message = ""
-    if message:
-        assert "Traceback" not in message
-        assert not message.startswith("not decided")
-        return
-    shown = json.loads(content)["claim"]
-    stated = Fraction(shown["bound"])
-    total = sum((Fraction(c) for c in shown["polynomial"]["coefficients"]), Fraction(0))
-    assert stated <= total, verdict  # a constant, at the most, can still be proved
-
-
-def test_repeated_monomials_cannot_cancel() -> None:
-    """-1e16 - 1 + 1e16 - 0.5 is -1.5 exactly, 0.5 below what floats make of it."""
-    refused(proof(bound_claim([[0, 0]] * 4, [-1e16, -1.0, 1e16, -0.5], -1.0), SQUARES), "distinct")
-    one = proof(bound_claim([[0, 0], [2, 0]], ["-3/2", 1.0], -1.0), SQUARES)
-    refused(one, "not positive")
-
-
-def test_odd_denominators_beyond_any_machine_word_are_exact() -> None:
-    tiny = f"1/{3**200}"
-    kernel.decide(proof(bound_claim([[0, 0]], [tiny], tiny), SQUARES), lambda _: b"")
-    less = f"{2**300}/{2**300 * 3**200 + 1}"  # below 1/3^200
-    refused(proof(bound_claim([[0, 0]], [less], tiny), SQUARES), "not positive")
-
-
-@pytest.mark.slow
-def test_what_would_take_long_is_refused_early() -> None:
-    many = [[i, j] for i in range(14) for j in range(14)]
-    dense = {"basis": many, "columns": [0] * len(many)}
-    long = [str(7**4000)] * 4000  # 3 400 digits each
-    rows = [[str(10**3900 + k)] * 190 for k in range(20)]
-    refused(
-        proof(bound_claim([[0, 0]], [1.0]), dense | {"squares": {"unit": 0, "factors": [rows]}})
-    )
-    odd = [f"1/{10**300 + 2 * k + 1}" for k in range(2000)]
-    spread = [[k // 60, k % 60] for k in range(2000)]
-    order = sorted(range(2000), key=lambda k: (sum(spread[k]), spread[k]))
-    sorted_rows = [spread[k] for k in order]
-    keep = [row for row in sorted_rows if sum(row) <= 63]
-    refused(proof(bound_claim(keep, odd[: len(keep)]), SQUARES), "denominators")
-    refused(proof(bound_claim(keep, long[: len(keep)]), SQUARES))
-    claim = bound_claim([[60, 0]], [1.0])
-    claim["domain"] = [{"exponents": keep, "coefficients": [1.0] * len(keep)}] * 100
-    multipliers = [
-        {"of": k, "basis": many[:100], "columns": [0] * 100,
-         "squares": {"unit": 0, "factors": [[[1] * 100]]}}
-        for k in range(100)
-    ]  # fmt: skip
-    refused(proof(claim, SQUARES | {"multipliers": multipliers}))
-
-
-@pytest.mark.parametrize(
-    "name", ["x\n  PROVED all is well", "x\x1b[2J", "", "x y", "ｘ", "x" * 500]
-)
-def test_a_name_cannot_print_anything_else(name: str) -> None:
-    claim = bound_claim([[0, 0]], [1.0])
-    claim["variables"] = [name, "y"]
-    refused(proof(claim, SQUARES))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"version": 1}, {"version": 3}, {"version": True}, {"version": 2.0}, {"format": "nlsid/model"},
-     {"digest": "sha256:0"}, {"claim": {"kind": "everything_is_fine"}}, {"claim": {"kind": []}},
-     {"claim": {}}],
-)  # fmt: skip
-def test_another_header_is_refused(change: Any) -> None:
-    document = json.loads(proof(bound_claim([[0, 0]], [1.0]), SQUARES))
-    kernel.decide(json.dumps(document).encode(), lambda _: b"")
-    refused(json.dumps(document | change).encode())
-
-
 def test_only_regular_files_beside_the_proof_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.proof.json"
-    path.write_bytes(proof(bound_claim([[0, 0]], [1.0]), SQUARES))
-    assert kernel.check(path).kind == "polynomial_bound"
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "large").touch()
     os.truncate(tmp_path / "large", 100 * 2**20)
@@ -368,10 +253,6 @@ def test_matrices_that_floats_cannot_tell_and_matrices_that_take_too_long() -> N
     with pytest.raises(Rejected, match="not symmetric"):
         definite([[1, 0], [Fraction(1, 10**90), 1]], "M")
     started = time.process_time()
-    for entry in (3**900, Fraction(1, 3**900)):
-        with pytest.raises(Rejected, match="too long"):
-            semidefinite([[(i * j + 1) * entry + (i == j) for j in range(120)]
-                          for i in range(120)], "M")  # fmt: skip
     with pytest.raises(Rejected, match="denominators"):
         definite([[Fraction(int(i == j), 10**200 + i + 1) for j in range(100)]
                   for i in range(100)], "M")  # fmt: skip
@@ -386,8 +267,12 @@ def test_matrices_that_floats_cannot_tell_and_matrices_that_take_too_long() -> N
 @example(-9.9996, 4)
 def test_a_printed_bound_is_on_its_side_and_near(value: Any, digits: int) -> None:
     value = Fraction(value)
-    low, high = (Fraction(shown(value, digits)) for shown in (text.below, text.above))
-    assert low <= value <= high
+    shown = text.below(value, digits), text.above(value, digits)
+    if shown[0] == shown[1]:  # short: it stands for the float64 that it is nearest to
+        assert value == Fraction(float(shown[0]))
+        return
+    low, high = map(Fraction, shown)
+    assert low < value < high
     assert high - low <= abs(value) * Fraction(10) ** (1 - digits)
 
 
@@ -426,39 +311,23 @@ def test_monomials_whose_exponents_would_run_into_each_other_are_refused() -> No
             ring().key(exponents)
     for exponents in ([64, 0], [2**52, 0], [-1, 2]):
         node = Node({"exponents": [exponents], "coefficients": [1]}, "p")
-        with pytest.raises(Rejected, match=r"degree|negative"):
+        with pytest.raises(Rejected, match="exponents should be"):
             node.polynomial(2)
-        with pytest.raises(Rejected, match=r"degree|negative"):
-            read_stack(node, 2, 1)
-    wide = Ring(2, 64, Work())
+    wide = Ring(2, 64)
     p = wide.variables[0]
     for _ in range(5):
         p = p * p
-    with pytest.raises(Rejected, match="degree 64"):
+    with pytest.raises(Rejected, match="degree 63"):
         p * p
-
-
-@pytest.mark.parametrize("bits", slow_among([30, 500, 2000, 8000], {8000}))
-def test_the_work_that_is_counted_bounds_the_time_it_takes(bits: int) -> None:
-    """10^8 counted products take half a minute, 0.3 µs each; 1.5 µs leave room for a slow core."""
-    work = Work(10**9)
-    wide = Ring(3, 1024, work)
-    terms = {wide.key([i, j, k]): 3**i + (7 << bits) for i in range(6) for j in range(6)
-             for k in range(4)}  # fmt: skip
-    p = Polynomial(wide, terms, 1, 13, 0, 10 << bits)
-    ratio = Fraction((1 << bits) + 1, 3)
-    for how in (lambda: p * p, lambda: [p + p for _ in range(200)],
-                lambda: [ratio * p for _ in range(200)]):  # fmt: skip
-        before, started = work.left, time.process_time()
-        how()
-        assert time.process_time() - started < 1.5e-6 * (before - work.left)
 
 
 def test_the_kernel_imports_the_standard_library_only_and_runs_alone(tmp_path: Path) -> None:
     folder = Path(kernel.__file__).parent
-    path = tmp_path / "a.proof.json"
-    path.write_bytes(proof(bound_claim([[0, 0]], [1.0]), SQUARES))
-    (tmp_path / "false.proof.json").write_bytes(proof(bound_claim([[0, 0]], [1.0], 2), SQUARES))
+    shutil.copytree(CORPUS / "stability" / "linear", tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "claim.proof.json"
+    forged = json.loads(path.read_text())
+    forged["claim"]["rate"] = 0.6
+    (tmp_path / "false.proof.json").write_text(json.dumps(forged))
     program = (
         "import runpy, sys\n"
         f"sys.argv = ['kernel', {str(path)!r}]\n"
@@ -474,7 +343,11 @@ def test_the_kernel_imports_the_standard_library_only_and_runs_alone(tmp_path: P
     loaded = {name for name in eval(ran.stdout.splitlines()[-1]) if not name.startswith("_")}
     assert loaded - set(sys.stdlib_module_names) <= {"kernel"}
     alone = [sys.executable, "-I", str(folder)]
-    for name, status, word in (("a", 0, "PROVED"), ("false", 1, "REJECTED"), ("no", 2, "read")):
+    for name, status, word in (
+        ("claim", 0, "PROVED"),
+        ("false", 1, "not_definite"),
+        ("no", 2, "read"),
+    ):
         file = str(tmp_path / f"{name}.proof.json")
         ran = subprocess.run([*alone, file], capture_output=True, text=True, check=False)
         assert (ran.returncode, word in ran.stdout) == (status, True)

@@ -87,17 +87,12 @@ def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) 
         f"the plan's, as [{exactly(low)}, {exactly(high)}] m/s does"
     )
     inlets = " and ".join(down(tube["inlet"]) for tube in (lasting, energy))
-    trials = "no probability is stated of a next trial, as the model was fitted to 3 of them"
-    measured = [tube["assumption"]["measured"] for tube in (lasting, energy)]
     assert verdict.assumptions == (
         f"after 2 samples ({up(0.2)} s) the simulation starts at the observer's state, or where V "
         f"= xbar'P xbar <= {inlets}, xbar the observer's state minus its own, as the plan does",
         f"(1) innovation energy: E <= {down(lasting['level'])} (m/s)^2 after every sample, E+ = "
-        f"{lasting['rho']} E + e^2 from 0 (largest of 3 distinct trials, each taken whole, "
-        f"{up(measured[0])}, safety factor 1.5 in amplitude; {trials})",
-        f"(2) innovation energy: sum of e^2 <= {down(energy['level'])} (m/s)^2 over 70 samples "
-        f"(largest of 3 distinct trials, each taken whole, {up(measured[1])}, safety factor 1.5 in "
-        f"amplitude; {trials})",
+        f"{lasting['rho']} E + e^2 from 0",
+        f"(2) innovation energy: sum of e^2 <= {down(energy['level'])} (m/s)^2 over 70 samples",
     )
     assert 0.0 < verdict.margin < 0.01
 
@@ -149,18 +144,6 @@ def test_the_half_width_bounds_the_output_in_the_tube(
         assert np.abs(outputs).max() <= tube.half_widths[0]
 
 
-def test_repeated_trials_count_once_and_no_trial_measures_nothing(
-    documents: dict[str, Json],
-) -> None:
-    once = first(documents["funnel"])["assumption"]["measured_on"][0]
-    again = {"name": "the same under another name", "digest": once["digest"]}
-    documents["funnel"] = assuming(documents["funnel"], measured_on=[once, again, once])
-    assert "largest of 1 distinct trial, taken whole, " in decide(documents).assumptions[1]
-    documents["funnel"] = assuming(documents["funnel"], measured_on=[])
-    with pytest.raises(CertificateRejected, match="measured on no trial"):
-        decide(documents)
-
-
 def trials(*digests: str) -> list[Json]:
     """Of recordings that are named by a letter, before a window if there is one."""
     return [
@@ -169,93 +152,17 @@ def trials(*digests: str) -> list[Json]:
     ]
 
 
-@pytest.mark.parametrize(
-    "digest",
-    ["", "a", "sha256:" + 64 * "A", "SHA256:" + 64 * "a", "sha256:" + 63 * "a",
-     "sha256:" + 64 * "g",
-     "sha256:" + 65 * "a", " sha256:" + 64 * "a", "sha256:" + 64 * "a" + " ", "sha512:" + 64 * "a"],
-)  # fmt: skip
-@pytest.mark.parametrize("of", ["measured_on", "designed_on"])
-def test_a_recording_has_one_spelling(documents: dict[str, Json], digest: str, of: str) -> None:
-    """In capitals the same recording would be another one, and count twice."""
-    again = [{"name": "run", "digest": digest}]
-    documents["funnel"] = assuming(documents["funnel"], **{of: again})
-    with pytest.raises(CertificateRejected, match="sha256: and 64 digits or letters a-f"):
-        decide(documents)
-
-
 def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
     return bound(documents | {"model": documents["model"] | {"bags": trials(*digests)}})
 
 
 @pytest.mark.parametrize(
-    ("measured_on", "fitted", "said"),
-    [
-        (("a", "b", "c"), ("d",), "exceeds their largest with probability at most 1/4)"),
-        (("a", "a", "b", "b"), ("d",), "exceeds their largest with probability at most 1/3)"),
-        (("a", "b", "c"), ("b", "a", "d", "b"), "as the model was fitted to 2 of them)"),
-        (("a", "b"), ("b[3:4]",), "as the model was fitted to 1 of them)"),
-        (("a[0:9]", "b"), (), "as windows of one recording are hardly exchangeable)"),
-    ],
-)
-def test_a_probability_is_stated_only_of_trials_that_made_nothing(
-    documents: dict[str, Json], measured_on: tuple[str, ...], fitted: tuple[str, ...], said: str
-) -> None:
-    changed = assuming(
-        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials("e", "a[9:10]")
-        if measured_on[0] == "a[0:9]" else trials("e"),
-    )  # fmt: skip
-    verdict = decide(fitted_to(documents | {"funnel": changed}, *fitted))
-    assert verdict.assumptions[1].endswith(said)
-
-
-@pytest.mark.parametrize(
-    ("measured_on", "designed_on", "allowed"),
-    [
-        (("a", "b"), ("c", "d"), True),
-        (("a", "b"), ("c", "b"), False),
-        (("a",), ("a[5:6]",), False),
-        (("a[5:6]",), ("b", "a"), False),
-        (("a[0:10]",), ("a[10:20]", "a[30:31]"), True),
-        (("a[10:20]",), ("a[0:11]", "a[2:3]"), False),
-        (("a[10:20]",), ("a[0:30]", "a[1:2]", "a[3:5]"), False),
-        (("a[10:20]", "a[40:50]"), ("a[49:60]",), False),
-    ],
-)
-def test_no_sample_designs_a_tube_and_scales_it(
-    documents: dict[str, Json],
-    measured_on: tuple[str, ...],
-    designed_on: tuple[str, ...],
-    allowed: bool,
-) -> None:
-    documents["funnel"] = assuming(
-        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials(*designed_on)
-    )
-    assert is_proved(documents) is allowed
-    if allowed:
-        decide(documents)
-    else:
-        with pytest.raises(CertificateRejected, match="was designed on cannot measure"):
-            decide(documents)
-
-
-@pytest.mark.parametrize("window", ["[", "[]", "[1:1]", "[2:1]", "[-1:2]", "[0:1", "[0:1]x",
-                                    "[0:9999999999999]", "[0:1000000000000]x",
-                                    "[٠:١]"])  # fmt: skip
-def test_a_window_that_is_none_is_rejected(documents: dict[str, Json], window: str) -> None:
-    documents["funnel"] = assuming(documents["funnel"], measured_on=trials("a" + window))
-    with pytest.raises(CertificateRejected, match="a window should be"):
-        decide(documents)
-
-
-@pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda f: changing(f, level=first(f)["level"] * 0.999), "the level is below"),
         (lambda f: changing(f, level=first(f)["level"] * 1.03), "half-width"),
         (lambda f: changing(f, inlet=first(f)["inlet"] + 0.05 * first(f)["level"]), "half-width"),
         (lambda f: changing(f, inlet=-1.0), "0 or more"),
-        (lambda f: changing(f, level=-1.0), "the level is below"),
+        (lambda f: changing(f, level=-1.0), "0 or more"),
         (lambda f: changing(f, P=(1.01 * np.array(first(f)["P"])).tolist()), "the decrease of V"),
         (lambda f: changing(f, P=(-np.array(first(f)["P"])).tolist()), "P is not positive"),
         (lambda f: changing(f, P=[[1.0, 2.0], [0.0, 1.0]]), "not symmetric"),
@@ -273,14 +180,12 @@ def test_a_window_that_is_none_is_rejected(documents: dict[str, Json], window: s
         (lambda f: changing(f, rho=1), "rho should be 1"),
         (lambda f: assuming(f, kind="energy"), "for a number of samples"),
         (lambda f: assuming(f, kind="energy", samples=9), "rho should be 1"),
-        (lambda f: assuming(f, safety_factor=0.99), "safety factor 1 or more"),
         (lambda f: assuming(f, samples=9), "for a number of samples"),
         (lambda f: lasting(f, 0), "whole number from 1"),
         (lambda f: lasting(f, 2.5), "whole number"),
         (lambda f: assuming(f, kind="peak"), "known: fading, energy"),
         (lambda f: f | {"note": 1}, "unknown member 'note'"),
         (lambda f: f | {"kind": "sampled"}, "expected 'tube'"),
-        (lambda f: f | {"kind": "linear"}, "is now a tube: run `nlsid funnel` again"),
         (lambda f: changing(f, level=2**53 + 2), "whole number beyond"),
         (lambda f: changing(f, L=[[0.0], [0.0]]), "the observer of a tube is not the policy's"),
     ],

@@ -18,7 +18,7 @@ from nlsid_core.designs import PROOF, AnyDesign
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel import Rejected, Verdict, positivity, sampled_funnel
 from nlsid_core.kernel.polynomials import BITS, Polynomial, Ring
-from nlsid_core.kernel.sampled_funnel import prove_curvature, stretch
+from nlsid_core.kernel.sampled_step import prove_curvature, stretch
 from tests.core.kernel import oracle_sampled as oracle
 from tests.implicit_funnels import designed as implicit
 from tests.implicit_funnels import two_joints

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Callable
-from decimal import Context, Decimal
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,8 +26,6 @@ from tests.marks import slow_among
 
 EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 Change = Callable[[SimpleNamespace], Any]
-
-BESIDE = "watched as well, not needed for this sentence"
 
 
 @EVERY
@@ -57,18 +54,9 @@ def test_the_sentences_are_those_of_the_page() -> None:
         "observers, one for each tube"
     )
     rho = funnel["tubes"][0]["rho"]
-    assert f"E+ = {rho} E + e^2 from 0 (largest of 5 distinct trials, each " in said[2]
-    assert said[2].endswith("exceeds their largest with probability at most 1/6)")
-    peak = rounded(tubes(funnel)["peak"]["level"], "ROUND_FLOOR")
-    largest = rounded(tubes(funnel)["peak"]["measured"], "ROUND_CEILING")
-    assert said[3] == (
-        f"  assuming (1) innovation peak of its own observer, {BESIDE}: "
-        f"e^2 <= {peak} (m/s)^2 at every "
-        f"sample (largest of 5 distinct trials, each taken whole, {largest}, safety factor 1.5 in "
-        "amplitude; a next trial that is exchangeable with them exceeds their largest with "
-        "probability at most 1/6)"
-    )
-    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[4]
+    assert said[2].endswith(f"E+ = {rho} E + e^2 from 0")
+    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[3]
+    assert len(said) == 4  # what was measured, and on what, is no part of the claim
 
 
 def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
@@ -79,46 +67,16 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
         {"inputs": [0], "of": "change", "centre": 0.0, "scale": 1.5, "fading": 0.9},
     ]
     tubes(funnel)["follows"] = {"terms": terms, "weights": [[0.25, 3.0, 7.5]]}
-    funnel["response"]["follows"] = {"terms": terms, "weights": [[1.0, 0.0, 2.0]]}
     u = model["u"]
     said = str(decide(model, funnel, proof)).splitlines()
     name = u["name"] if u["name"].isidentifier() else f'"{u["name"]}"'
     unit = f" {u['unit']}".rstrip()
     assert " sqrt(g) for ever" in said[0]
     assert " g after every sample, E+ = " in said[2]
-    assert (
+    assert said[2].endswith(
         f", g = 0.25 + 3 (({name} - 0.5{unit}) / 2{unit})^2 + 7.5 (sum 0.9^i "
-        f"(change of {name} / 1.5{unit})^2), sums over the run's samples, each i samples ago "
-        f"(largest of 5 distinct trials" in said[2]
+        f"(change of {name} / 1.5{unit})^2), sums over the run's samples, each i samples ago"
     )
-    assert said[3].startswith(f"  assuming innovation peak, {BESIDE}: e^2 <= ")
-    assert said[4].startswith(f"  assuming output error, {BESIDE}: |speed - simulated| / (")
-    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 (sum 0.9^i (change of {name}" in said[4]
-    assert "probability at most 1/6)" in said[4]
-
-
-def test_windows_that_share_samples_count_once() -> None:
-    """[0:20] and [5:30] of one recording are no two trials; [20:30] beside [0:20] is another."""
-    for ends, count in (
-        (("0:20", "5:30", "10:40"), 1), (("0:20", "20:30", "5:25"), 2), (("0:9", "0:9"), 1)
-    ):  # fmt: skip
-        model, funnel, proof = claim("linear")
-        given, one = first_assumption(funnel), "sha256:" + 64 * "7"
-        given["measured_on"] = [{"name": end, "digest": f"{one}[{end}]"} for end in ends]
-        level = rounded(tubes(funnel)["level"], "ROUND_FLOOR")
-        measured = rounded(given["measured"], "ROUND_CEILING")
-        several = f"{count} distinct windows, each" if count > 1 else "1 distinct window,"
-        assert decide(model, funnel, proof).assumptions[1] == (
-            f"(1) innovation energy of its own observer: E <= {level} (m/s)^2 after every sample, "
-            f"E+ = {tubes(funnel)['rho']} E + e^2 from 0 (largest of {several} taken whole, "
-            f"{measured}, safety factor 1.5 in amplitude; no probability is stated of a next "
-            "trial, as windows of one recording are hardly exchangeable)"
-        )
-
-
-def rounded(value: float, mode: str) -> str:
-    number = Context(prec=4, rounding=mode).create_decimal(Decimal(value)).normalize()
-    return f"{number:f}"
 
 
 def test_one_observer_of_all_tubes_is_called_so() -> None:
@@ -134,18 +92,6 @@ def test_two_outputs_of_one_name_are_refused() -> None:
     model["y"][1]["name"] = model["y"][0]["name"]
     with pytest.raises(CertificateRejected, match="two outputs have the same name"):
         decide(model, funnel, proof)
-
-
-def test_trials_that_the_model_was_fitted_on_and_windows_are_said() -> None:
-    model, funnel, proof = claim("linear")
-    trials = [tube["assumption"]["measured_on"] for tube in funnel["tubes"]]
-    model["bags"] = [{"name": "a", "digest": trials[0][0]["digest"]}]
-    said = decide(model, funnel, proof).assumptions[1]
-    assert said.endswith("as the model was fitted to 1 of them)")
-    trials[0][1]["digest"] = f"sha256:{64 * '1'}[0:40]"
-    said = decide(model, funnel, proof).assumptions[1]
-    assert "largest of 5 distinct windows" in said
-    assert said.endswith("as windows of one recording are hardly exchangeable)")
 
 
 # -- what is refused -------------------------------------------------------------------------
@@ -176,7 +122,6 @@ FALSE: dict[str, Change] = {
     "half-width": lambda c: scaled(tubes(c.funnel), "half_widths", 0.98),
     "level": lambda c: scaled(tubes(c.funnel), "level", 1.03),
     "inlet": lambda c: tubes(c.funnel).update(inlet=0.05 * tubes(c.funnel)["level"]),
-    "measured": lambda c: scaled(first_assumption(c.funnel), "measured", 1.001),
     "no multiplier": lambda c: c.proof.clear() if c.proof else c.proof.update(multipliers=[]),
 }
 
@@ -228,7 +173,7 @@ def term(funnel: Json, i: int = 0) -> Json:
     [
         (lambda f: tubes(f)["follows"]["weights"][0].__setitem__(0, -1e-9), "0 or more"),
         (lambda f: tubes(f)["follows"].update(weights=[[0.0] * len(tubes(f)["follows"]["terms"])]),
-         "some of each row positive"),
+         "some positive"),
         (lambda f: tubes(f)["follows"].update(weights=[]), "should have shape"),
         (lambda f: tubes(f)["follows"].update(terms=[]), "list of 1 to 200"),
         (lambda f: term(f).update(fading=1.0), "fading in"),
@@ -239,19 +184,6 @@ def term(funnel: Json, i: int = 0) -> Json:
         (lambda f: term(f).update(of="square"), "value or change"),
         (lambda f: term(f).update(future=1), "unknown member 'future'"),
         (lambda f: tubes(f).update(inlet=1e-12), "without an inlet"),
-        (lambda f: scaled(tubes(f), "level", 0.999), "below safety_factor"),
-        (lambda f: scaled(tubes(f)["peak"], "level", 0.999), "level of the peak is below"),
-        (lambda f: tubes(f)["peak"].update(measured=-1e-9), "measured peak should be 0 or more"),
-        (lambda f: tubes(f)["peak"].update(samples=2), "unknown member 'samples'"),
-        (lambda f: scaled(f["response"]["assumption"], "measured", 1.01), "below safety_factor"),
-        (lambda f: f["response"]["assumption"].update(safety_factor=0.9), "1 or more"),
-        (lambda f: f["response"]["assumption"].update(measured_on=[]), "on no trial"),
-        (lambda f: f["response"]["assumption"].update(
-            measured_on=f["response"]["assumption"]["designed_on"]), "cannot measure it"),
-        (lambda f: f["response"].update(half_widths=[0.0]), "half-widths should be positive"),
-        (lambda f: f["cusum"].update(deviation=[0.0]), "should be positive"),
-        (lambda f: f["cusum"].update(drift=-1.0), "drift 0 or more"),
-        (lambda f: f["cusum"].update(deviation=[1.0, 1.0]), "should have shape"),
     ],
 )  # fmt: skip
 def test_a_level_by_commands_that_makes_no_sense_is_refused(
@@ -301,7 +233,6 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "reason"),
     [
-        ("linear", lambda c: c.funnel.update(kind="linear"), "is now a tube: run"),
         ("linear", lambda c: c.funnel.update(tubes=[]), "list of 1 to 8"),
         ("linear", lambda c: c.funnel.update(box={"y": [], "u": []}), "needs no box"),
         ("linear", lambda c: c.funnel.update(settling=-1), "whole number from 0"),
@@ -311,14 +242,10 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
         ("linear", lambda c: c.funnel["tubes"][1].update(rho=0.5), "rho should be 1 for"),
         ("linear", lambda c: first_assumption(c.funnel).update(kind="peak"), "known: fading"),
         ("linear", lambda c: first_assumption(c.funnel).update(samples=9), "for a number of"),
-        ("linear", lambda c: first_assumption(c.funnel).update(measured_on=[]), "on no trial"),
-        ("linear", lambda c: first_assumption(c.funnel).update(safety_factor=0.99), "1 or more"),
         ("linear", lambda c: tubes(c.funnel).update(inlet=-1e-9), "0 or more"),
         ("linear", lambda c: tubes(c.funnel).update(tau=[-1.0]), "should be positive"),
         ("linear", lambda c: scaled(tubes(c.funnel), "P", -1.0), "P is not positive"),
         ("linear", lambda c: tubes(c.funnel).update(R=[[-1.0]]), "R is not positive definite"),
-        ("linear", lambda c: first_assumption(c.funnel).update(
-            measured_on=first_assumption(c.funnel)["designed_on"][:1]), "cannot measure"),
         ("monotone", lambda c: c.proof["multipliers"][0]["N"][0][1].__setitem__(0, 1e-9),
          "unbounded slope"),
         ("monotone", lambda c: c.proof["multipliers"][0]["N"].pop(), "should have shape"),

@@ -1,0 +1,153 @@
+"""What an assumption was measured on: printed beside a verdict, and no part of what is proved.
+
+The numbers are the file's word. What is looked at here is whether they agree with each other: a
+level is not below what was measured, and no sample both chose a tube and scaled it. The largest of
+m + 1 exchangeable numbers is the last with probability at most 1/(m + 1), if model and tube were
+fixed before they were seen. Source: V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a
+Random World, Section 2.2.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from nlsid_core.errors import DocumentError
+from nlsid_core.kernel import text
+
+Json = dict[str, Any]
+LONGEST = 10**12  # samples of a recording
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A trial: the digest of its recording, and which samples of it: [0, LONGEST) is all."""
+
+    recording: str
+    first: int = 0
+    end: int = LONGEST
+
+    @classmethod
+    def of(cls, digest: str) -> "Recorded":
+        """`sha256:...`, perhaps with `[first:end]`."""
+        recording, cut, window = digest.partition("[")
+        if not cut:
+            return cls(recording)
+        first, _, end = window.removesuffix("]").partition(":")
+        if not (first.isdigit() and end.isdigit() and int(first) < int(end) < LONGEST):
+            raise DocumentError(f"{digest[:40]}: a window should be [first:end] with first < end")
+        return cls(recording, int(first), int(end))
+
+    def shares(self, other: "Recorded") -> bool:
+        """Whether they have a sample in common."""
+        apart = self.end <= other.first or other.end <= self.first
+        return self.recording == other.recording and not apart
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What is said of the trials behind a proved funnel, and what of it contradicts itself."""
+
+    said: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()
+
+
+def of_proof(proof: Path) -> Provenance:
+    """Of the funnel of a proof that was decided; nothing where no bound was measured."""
+    about = json.loads(proof.read_bytes())["claim"]["about"]
+    if not {"model", "funnel"} <= set(about):
+        return Provenance()
+    model, funnel = (
+        json.loads((proof.parent / about[role]["file"]).read_bytes())
+        for role in ("model", "funnel")
+    )
+    return of_funnel(model, funnel)
+
+
+def of_funnel(model: Json, funnel: Json) -> Provenance:
+    """Of a funnel's document and that of its model."""
+    fitted = model.get("bags")
+    found = []
+    if funnel["kind"] == "sampled":
+        given = funnel["assumption"]
+        most = Fraction(given["safety_factor"]) * Fraction(given["measured"])
+        bounds = [("its bound", Fraction(given["bound"]), most)]
+        found.append(_judged("disturbance", {"designed_on": fitted, **given}, fitted, bounds))
+    for i, tube in enumerate(funnel.get("tubes", ()), 1):
+        given = tube["assumption"]
+        factor = Fraction(given["safety_factor"]) ** 2
+        bounds = [("its level", Fraction(tube["level"]), factor * Fraction(given["measured"]))]
+        if peak := tube.get("peak"):
+            most = factor * Fraction(peak["measured"])
+            bounds.append(("its peak", Fraction(peak["level"]), most))
+        found.append(_judged(f"innovation energy of tube {i}", given, fitted, bounds))
+    if response := funnel.get("response"):
+        given = response["assumption"]
+        most = Fraction(given["safety_factor"]) * Fraction(given["measured"])
+        bounds = [("its half-widths' part 1", Fraction(1), most)]
+        found.append(_judged("output error, watched as well", given, fitted, bounds))
+    said = [line for line, _ in found]
+    return Provenance(tuple(said), tuple(line for _, lines in found for line in lines))
+
+
+def _judged(
+    what: str,
+    given: Mapping[str, Any],
+    fitted: list[Json] | None,
+    bounds: Iterable[tuple[str, Fraction, Fraction]],
+) -> tuple[str, list[str]]:
+    """One line, and what contradicts it."""
+    trials, before = (
+        [Recorded.of(trial["digest"]) for trial in given.get(key) or ()]
+        for key in ("measured_on", "designed_on")
+    )
+    wrong = [
+        f"{what}: {name} is below what was measured times the safety factor"
+        for name, bound, needed in bounds
+        if bound < needed
+    ]
+    if given["safety_factor"] < 1:
+        wrong.append(f"{what}: the safety factor is below 1")
+    if not trials:
+        wrong.append(f"{what}: it was measured on no trial")
+    if any(trial.shares(other) for trial in trials for other in before):
+        wrong.append(f"{what}: a trial that chose it cannot measure it")
+    measured, factor = Fraction(given["measured"]), Fraction(given["safety_factor"])
+    count = distinct(trials)
+    kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
+    those = f"{count} distinct {kind}{'s' if count != 1 else ''}"
+    line = (
+        f"{what}: largest of {those} {text.above(measured)}, safety factor {text.below(factor)}; "
+        f"{_worth(trials, count, fitted)}"
+    )
+    return line, wrong
+
+
+def distinct(trials: Iterable[Recorded]) -> int:
+    """How many share no sample with another that is counted: the most there can be."""
+    reached: dict[str, int] = {}
+    count = 0
+    for trial in sorted(set(trials), key=lambda t: t.end):
+        if trial.first >= reached.get(trial.recording, 0):
+            reached[trial.recording] = trial.end
+            count += 1
+    return count
+
+
+def _worth(trials: list[Recorded], count: int, fitted: list[Json] | None) -> str:
+    """How often a next trial exceeds the largest, if that can be said."""
+    none = "no probability is stated of a next trial, as "
+    if any(trial.end < LONGEST for trial in trials):
+        return none + "windows of one recording are hardly exchangeable"
+    if fitted is None:
+        return none + "the model does not name what it was fitted to"
+    bags = [Recorded.of(bag["digest"]) for bag in fitted]
+    seen = sum(any(trial.shares(bag) for bag in bags) for trial in set(trials))
+    if seen:
+        return f"{none}the model was fitted to {seen} of them"
+    return (
+        "a next trial that is exchangeable with them exceeds their largest with probability at "
+        f"most 1/{count + 1}"
+    )

@@ -1,0 +1,191 @@
+"""One step of an identified model around a motion, in the coordinates that a proof states.
+
+x̄ = T z and, of a trapezoidal model, v̄⁺ = T⁺w: f̄_k, h and the stated bounds of norms and curvature,
+which are verified here. What they prove: `sampled_funnel`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import factorial, prod
+
+from .exact import Matrix, at_most, combined, product, semidefinite, transposed
+from .files import Node, Terms, refuse_if
+from .polynomials import Polynomial, Ring
+from .signals import Signal
+
+
+@dataclass(frozen=True)
+class Model:
+    """A map (trapezoidal: of accelerations); signals and their box, states first."""
+
+    trapezoidal: bool
+    map: list[Terms]
+    period: Fraction
+    signals: list[Signal]
+    box: Matrix
+    states: int
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A sample of a policy and the next state, with the shapes of both and A of the response."""
+
+    x: list[Fraction]
+    u: list[Fraction]
+    K: Matrix
+    x_next: list[Fraction]
+    S: Matrix
+    S_next: Matrix
+    A: Matrix
+
+
+@dataclass(frozen=True)
+class Link:
+    """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
+
+    rows: list[Polynomial]
+    h: list[Polynomial]
+    size: Polynomial
+    bounds: dict[str, Fraction]
+    curvature: list[Fraction]
+
+
+def read_link(
+    node: Node, model: Model, at: Sample, form: str, ring: Ring
+) -> tuple[dict[str, Node], Link]:
+    """A step's members; its polynomials, and its stated bounds verified."""
+    norms = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
+    more = " T_next inverse" * model.trapezoidal
+    stated = node.members(f"T curvature tube inlet {norms}{more}")
+    bounds = {name: nonnegative(stated[name]) for name in norms.split()}
+    curvature = [nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
+    n, d, where = model.states, model.states // 2, stated["T"].where
+    T = triangular(stated["T"].array(n, n), where)
+    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
+    z = ring.variables[:n]
+    scaled = ring.product(ST, z)
+    prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
+    h: list[Polynomial] = []
+    if not model.trapezoidal:
+        rows = moved = explicit_step(model.map, at, T, ring)
+        if form == "response":
+            moved = [p - q for p, q in zip(rows, ring.product(unit, z), strict=True)]
+    else:
+        T_next = stated["T_next"].array(d, d)
+        S_rates = [row[d:] for row in at.S_next[d:]]
+        prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
+        rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
+        moved = ring.product(stated["inverse"].array(d, d), h)
+        (B, C), (L_z, L_w) = (
+            ([row[:n] for row in M], [row[n:] for row in M])
+            for M in (linear_part(moved, ring), linear_part(rows, ring))
+        )
+        C = [[entry - (i == j) for j, entry in enumerate(row)] for i, row in enumerate(C)]
+        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
+        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w)):
+            prove_norm(M, bounds[name], f"{where}: the bound {name}")
+    prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
+    return stated, Link(rows, h, ring.dot(scaled, scaled), bounds, curvature)
+
+
+def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+    """S⁺(f(x + Tz, u - K T z) - x⁺)."""
+    moved = ring.substituted(f, _state_and_input(at, T, ring))
+    return ring.product(at.S_next, [p - c for p, c in zip(moved, at.x_next, strict=True)])
+
+
+def implicit_step(
+    a: Sequence[Terms], at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
+) -> tuple[list[Polynomial], list[Polynomial]]:
+    """S⁺x̄⁺ and h = v⁺ - v - period/2 (a(q, v, u) + a(q⁺, v⁺, u)), in z, then w.
+
+    v⁺ = v_{k+1} + T⁺w and q⁺ = q + period/2 (v + v⁺).
+    """
+    d, half = len(T_next), period / 2
+    here = _state_and_input(at, T, ring)
+    q, v, u = here[:d], here[d : 2 * d], here[2 * d :]
+    moved = ring.product(T_next, ring.variables[2 * d :])
+    rate = [p + c for p, c in zip(moved, at.x_next[d:], strict=True)]
+    place = [p + half * (s + r) for p, s, r in zip(q, v, rate, strict=True)]
+    pulls = ring.substituted(a, here), ring.substituted(a, [*place, *rate, *u])
+    h = [r - s - half * (b + c) for r, s, b, c in zip(rate, v, *pulls, strict=True)]
+    after = [p - c for p, c in zip([*place, *rate], at.x_next, strict=True)]
+    return ring.product(at.S_next, after), h
+
+
+def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
+    """The coefficients of degree 1: a row for each polynomial."""
+    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in ring.keys] for q in p]
+
+
+def prove_curvature(
+    p: Sequence[Polynomial], gammas: Sequence[Fraction], ring: Ring, least: int
+) -> None:
+    """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
+    sizes: dict[int, Matrix] = {}
+    keys = set().union(*(q.terms for q in p))
+    for key in keys:
+        e = ring.exponents(key)
+        c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
+        outer = [[a * b for b in c] for a in c]
+        share = Fraction(prod(map(factorial, e)), factorial(m))
+        sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
+    refuse_if(
+        max(sizes, default=0) >= least + len(gammas),
+        "curvature: a bound for every degree is needed",
+        "not_covered",
+    )
+    for m, gamma in enumerate(gammas, start=least):
+        if m in sizes:
+            _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
+
+
+def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: int) -> Fraction:
+    """μ with |p(z + w) - p(z)| <= μ|w| for |z| <= size, |w| <= step; degrees from `least` on."""
+    far, total = size + step, Fraction(0)
+    for m, gamma in enumerate(gammas, start=least):
+        total += gamma * sum((far**i * size ** (m - 1 - i) for i in range(m)), Fraction(0))
+    return total
+
+
+def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
+    """Raise Rejected unless |M v| <= bound |v| for every v."""
+    _at_most_square(product(M, transposed(M)), bound, what)
+
+
+def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
+    """Raise Rejected unless |z| <= bound |M z| for every z."""
+    MM = product(transposed(M), M)
+    scaled = [[bound**2 * e - (i == j) for j, e in enumerate(row)] for i, row in enumerate(MM)]
+    semidefinite(scaled, what)
+
+
+def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
+    semidefinite(
+        [[bound**2 * (i == j) - e for j, e in enumerate(row)] for i, row in enumerate(MM)], what
+    )
+
+
+def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+    """x + T z and u - K T z."""
+    feedback = [[-entry for entry in row] for row in product(at.K, T)]
+    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
+    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
+
+
+def nonnegative(node: Node) -> Fraction:
+    """A number of 0 or more."""
+    value = node.number()
+    at_most(0, value, f"{node.where} should not be negative")
+    return value
+
+
+def triangular(M: Matrix, what: str) -> Matrix:
+    """M, if it is upper triangular with a nonzero diagonal."""
+    size = range(len(M))
+    refuse_if(
+        not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)),
+        f"{what} should be upper triangular with a nonzero diagonal",
+    )
+    return M

@@ -1,0 +1,81 @@
+"""What is said of the trials behind a proof: counted once, and contradicted where they are."""
+
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from bags.commands.cli import app
+from bags.designs.provenance import of_funnel
+from nlsid_core import files
+from nlsid_core.arrays import Json
+from tests.core.kernel.mutations import CORPUS
+
+FOLDER = CORPUS / "tube" / "following"
+
+
+@pytest.fixture
+def documents() -> tuple[Json, Json]:
+    """A model, and a funnel with a peak, a response and a level that follows the commands."""
+    model, funnel = (files.load_document(FOLDER / f"{name}.json") for name in ("model", "funnel"))
+    return model, funnel
+
+
+def trial(letter: str, window: str = "") -> Json:
+    return {"name": letter, "digest": f"sha256:{letter * 64}{window}"}
+
+
+def test_what_was_measured_is_printed_below_the_verdict_and_not_called_proved() -> None:
+    said = CliRunner().invoke(app, ["check", str(FOLDER / "claim.proof.json")])
+    assert said.exit_code == 0, said.output
+    proved, *below = said.output.splitlines()
+    assert proved.startswith("PROVED tube: ")
+    assert "probability" not in proved
+    assert any(
+        line.startswith("  measured, not proved: innovation energy of tube 1: largest of 5 ")
+        for line in below
+    )
+
+
+@pytest.mark.parametrize(
+    ("trials", "fitted", "says"),
+    [
+        ([trial("a"), trial("b")], [], "2 distinct trials"),
+        ([trial("a"), trial("a")], [], "largest of 1 distinct trial "),
+        ([trial("a"), trial("b")], [], "with probability at most 1/3"),
+        ([trial("a"), trial("b")], [trial("b")], "as the model was fitted to 1 of them"),
+        ([trial("a")], None, "the model does not name what it was fitted to"),
+        ([trial("a", "[0:9]"), trial("a", "[8:20]")], [], "1 distinct window "),
+        ([trial("a", "[0:9]"), trial("a", "[9:20]")], [], "2 distinct windows "),
+        ([trial("a", "[0:9]")], [], "windows of one recording are hardly exchangeable"),
+    ],
+)
+def test_trials_are_counted_once_and_said_to_be_worth_what_they_are(
+    documents: tuple[Json, Json], trials: list[Json], fitted: list[Json] | None, says: str
+) -> None:
+    model, funnel = documents
+    funnel["tubes"][0]["assumption"] |= {"measured_on": trials, "designed_on": []}
+    model = {key: value for key, value in model.items() if key != "bags"}
+    found = of_funnel(model if fitted is None else model | {"bags": fitted}, funnel)
+    assert says in found.said[0]
+    assert not found.wrong
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "says"),
+    [
+        ("level", {"level": 0.02}, "its level is below"),
+        ("peak", {"peak": {"level": 0.01, "measured": 0.007}}, "its peak is below"),
+        ("assumption", {"safety_factor": 0.5}, "the safety factor is below 1"),
+        ("assumption", {"measured_on": []}, "measured on no trial"),
+        ("assumption", {"designed_on": [trial("a")], "measured_on": [trial("a", "[0:5]")]},
+         "a trial that chose it cannot measure it"),
+    ],
+)  # fmt: skip
+def test_what_contradicts_itself_is_said(
+    documents: tuple[Json, Json], place: str, change: Any, says: str
+) -> None:
+    model, funnel = documents
+    tube = funnel["tubes"][0]
+    tube |= {"assumption": tube["assumption"] | change} if place == "assumption" else change
+    assert any(says in line for line in of_funnel(model, funnel).wrong)

@@ -1,0 +1,50 @@
+"""Time and memory end by the operating system, with a reason; no file chooses equal hashes."""
+
+import time
+
+import pytest
+
+from nlsid_core import files, kernel
+from nlsid_core.deciding import Deciding
+from nlsid_core.errors import CertificateRejected
+from nlsid_core.kernel.polynomials import Ring
+from tests.core.kernel.hostile_claims import Claim, equal_hashes, network
+
+
+def deciding(claim: Claim, **limits: int) -> Deciding:
+    document, about = claim
+    contents = {name: files.encode(content) for name, content in about.items()}
+    return Deciding.of(files.encode(document), contents, **limits)
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [({"seconds": 1}, "more than 1 s of processor time"), ({"memory": 60}, "memory")],
+)
+def test_a_claim_that_takes_too_much_is_ended_with_the_reason(
+    limits: dict[str, int], reason: str
+) -> None:
+    with pytest.raises(CertificateRejected, match=reason):
+        deciding(network(100), **limits).wait()
+
+
+def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:
+    """2^14 of them took 27 s, as all were in one place of a dictionary."""
+    document, about = equal_hashes(9)
+    started = time.process_time()
+    with pytest.raises(kernel.Rejected) as refused:
+        kernel.decide(files.encode(document), lambda name: files.encode(about[name]))
+    assert refused.value.reason in kernel.REASONS
+    assert time.process_time() >= started  # how long it took is `benchmarks.kernel`'s to say
+    ring = Ring(11, 64)
+    packed = {ring.key([1] + [0] * 10), ring.key([0] * 10 + [2])}
+    assert len({hash(key) for key in packed}) == 2
+    assert {ring.exponents(key) for key in packed} == {(1, *[0] * 10), (*[0] * 10, 2)}
+
+
+@pytest.mark.parametrize("kind", kernel.LEFT)
+def test_a_kind_that_left_is_refused_by_name(kind: str) -> None:
+    document = {"format": "nlsid/proof", "version": 2, "proof": {}, "claim": {"kind": kind}}
+    with pytest.raises(kernel.Rejected, match=f"kind {kind} left with version 0.3") as refused:
+        kernel.decide(files.encode(document), lambda _: b"")
+    assert refused.value.reason == "left"
