@@ -337,7 +337,7 @@ def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
         lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
     )
     found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
-    assert found.found.tried.startswith("found with 0.25 R: with R as it is by default")
+    assert found.found.tried.startswith("found with a quarter of R; as it is: none at")
 
 
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:

@@ -71,8 +71,8 @@ def attempts(setting: Setting, again: Again | None, *, other_weights: bool) -> l
     return listed
 
 
-def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, list[Tried]]:
-    """The funnel of the first attempt that has one, and what was tried before.
+def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, str]:
+    """The funnel of the first attempt that has one, and in words what was tried before.
 
     Raises Infeasible with the reason of the attempt that came farthest, and what each other gave.
     """
@@ -86,9 +86,11 @@ def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, l
         if setting is None:
             continue
         try:
-            return search(setting, progress), tried
+            found = search(setting, progress)
         except Infeasible as refusal:
             tried.append(Tried(name, setting, refusal))
+        else:
+            return found, "; ".join((f"found {name}", *map(str, tried))) if tried else ""
     farthest = min(reversed(tried), key=lambda one: one.t)
     others = "; ".join(str(one) for one in tried if one is not farthest)
     said = f". Tried as well: {others}" if others else ""

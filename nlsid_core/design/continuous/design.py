@@ -94,7 +94,7 @@ def design_funnel(
         seconds["P"] = time.perf_counter() - started
     search = ContinuousSearch(
         setting.goal, proved, setting.first_guess(), tuple(history), seconds,
-        _cost(setting, funnel), "; ".join(map(str, tried)),
+        _cost(setting, funnel), tried,
     )  # fmt: skip
     return decided(setting, funnel, search)
 
