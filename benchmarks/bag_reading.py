@@ -14,8 +14,6 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import argparse
-import json
 import multiprocessing
 import resource
 import statistics
@@ -31,7 +29,7 @@ from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
 from benchmarks.cache import cache_folder
-from benchmarks.machine import describe, peers
+from benchmarks.machine import parser, peers, tell
 
 MESSAGES: Final = 2_000_000
 SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
@@ -222,31 +220,15 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print the table, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
-    parser.add_argument("--messages", type=int, default=MESSAGES)
-    parser.add_argument("--data", type=Path, help="folder that may hold the bag; only read")
-    arguments = parser.parse_args()
+    """Print the figures, and with --json one JSON object as the last line."""
+    options = parser(__doc__)
+    options.add_argument("--messages", type=int, default=MESSAGES)
+    options.add_argument("--data", type=Path, help="folder that may hold the bag; only read")
+    arguments = options.parse_args()
     bag = generated_bag(arguments.data, arguments.messages)
-    print(f"reading {bag}")
+    print(f"reading {len(SIGNALS)} numbers of {arguments.messages} messages in {bag}")
     keys = measure(bag, arguments.messages)
-    print(
-        f"{arguments.messages} messages (JointState, Odometry, Imu), {len(SIGNALS)} numbers, "
-        f"{keys['bag_mb']:.0f} MB, {describe()}\n"
-    )
-    print(f"{'':44s}{'measured':>12s}{'wanted':>10s}")
-    for label, key, wanted in (
-        ("nlsid [messages/s]", "messages_per_s", "-"),
-        ("mcap-ros2-support [messages/s]", "mcap_ros2_per_s", "60000"),
-        ("rosbags, deserialise all [messages/s]", "rosbags_per_s", "90000"),
-        ("ratio to mcap-ros2-support", "ratio_mcap_ros2", ">= 30"),
-        ("ratio to rosbags", "ratio_rosbags", ">= 12"),
-        ("peak memory [MB]", "peak_mb", "<= 300"),
-    ):
-        print(f"{label:44s}{keys[key]:12.1f}{wanted:>10s}")
-    if arguments.json:
-        print(json.dumps(keys | peers("mcap-ros2-support", "rosbags")))
+    tell(keys | peers("mcap-ros2-support", "rosbags"), as_json=arguments.json)
 
 
 if __name__ == "__main__":

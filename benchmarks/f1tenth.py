@@ -6,12 +6,6 @@ Beside these is what was measured first on these trials (four lags, all but the 
 least squares 11.7 %, simulation-error minimum about 8.5 %.
 """
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import argparse
-import json
 import statistics
 import tempfile
 import time
@@ -25,21 +19,19 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.samples import f1tenth
-from benchmarks.machine import describe
+from benchmarks.machine import parser, tell
+from benchmarks.recorded import is_proved
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import CertificateRejected
-from nlsid_core.identification import (
-    simulation_percent,
-)
+from nlsid_core.identification import simulation_percent
 from nlsid_core.identification.polynomial.moment_rie import minimise_moment_rie
 from nlsid_core.identification.polynomial.moments import MonotoneClass, offsets_of, plain_moments
 from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
 from nlsid_core.progress import silent
-from nlsid_core.proofs import check
 from nlsid_core.running.reading import Status
 
 CHECKS = 11  # repetitions of the check; the median is reported
+BEFORE = {"ls": 11.7, "final": 9.5, "sem": 8.5, "test_trials_inside": 8, "sabotaged_caught": 16}
 
 
 def measure() -> dict[str, float | int | bool]:
@@ -98,15 +90,6 @@ def bias_removed(train: Dataset, test: Dataset, lags: int) -> dict[str, float | 
     }
 
 
-def is_proved(path: Path) -> bool:
-    """What the exact checker says of a proof file."""
-    try:
-        check(path)
-    except CertificateRejected:
-        return False
-    return True
-
-
 def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay], list[Replay]]:
     """Replays of the test trials, and of each with each sensor fault."""
     proved = documents.load_proved_funnel(out / documents.FUNNEL)
@@ -123,31 +106,8 @@ def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay]
 
 
 def main() -> None:
-    """Print the table, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
-    arguments = parser.parse_args()
-    keys = measure()
-    print(f"F1TENTH speed, 4 lags, 17 training, 16 calibration and 8 test trials, {describe()}\n")
-    print(f"{'':42s}{'ours':>9s}{'before':>12s}")
-    for label, key, before in (
-        ("least squares, test error [%]", "ls", "11.7"),
-        ("robust simulation error, first [%]", "first", "-"),
-        ("robust simulation error, final [%]", "final", "<= 9.5"),
-        ("simulation error minimisation [%]", "sem", "8.5"),
-        ("robust identification error [%]", "rie_naive", "-"),
-        ("  without the bias of noise [%]", "rie_moments", "-"),
-        ("bags to model, proof and report [s]", "identify_seconds", "-"),
-        ("both proofs checked exactly [s]", "check_seconds", "-"),
-    ):
-        print(f"{label:42s}{keys[key]:9.3f}{before:>12s}")
-    print(f"{'proved':42s}{keys['proved']!s:>9s}")
-    refused = f"{keys['rie_pairs_refused']}/{keys['rie_pairs']}"
-    print(f"{'pairs of repeats that differ beyond noise':42s}{refused:>9s}")
-    print(f"{'test trials inside':42s}{keys['test_trials_inside']:>9d}{'8':>12s}")
-    print(f"{'sabotaged trials caught':42s}{keys['sabotaged_caught']:>9d}{'16':>12s}")
-    if arguments.json:
-        print(json.dumps(keys))
+    """Print the figures, and with --json one JSON object as the last line."""
+    tell(measure(), BEFORE, as_json=parser(__doc__).parse_args().json)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ python -m benchmarks.faults [--json] [--only TEXT]
 The F1TENTH car's funnel; this process is the robot where a fault is in its messages, the simulated
 plant is where nodes are killed or held. `silent_inside` counts the faults after which the monitor
 went on saying inside, `moved_unproved` those after which the controller moved the robot on a design
-that is not proved, or that it had refused.
+that is not proved, that it had refused, or that nobody watched although it was to be watched.
+`hung`: those after which a node that was not killed said nothing more, or did not end.
 """
 
 import argparse
@@ -22,9 +23,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
@@ -33,6 +36,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -41,18 +45,23 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs.bundle import MAX_BYTES, Bundle
 from bags.designs.documents import FUNNEL, MODEL
+from bags.monitoring.announcement import UNANNOUNCED, WAITING
 from bags.samples import f1tenth
 from benchmarks.machine import describe
 from benchmarks.processes import isolate, node, python
 from nlsid_core import files
+from nlsid_core.design import ContinuousTracking, design, integrate_nominal
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import NlsidError
 from nlsid_core.progress import silent
 from nlsid_ros import qos
 
 PERIOD_NS = 25_000_000
-GOOD, BAD = 12, 60  # samples before a fault, and at most under it
-STALE = 0.5  # s of patience of the nodes, on a busy machine
-PATIENCE = 30.0  # s for nodes to come up
+GOOD, BAD = 12, 90  # samples before a fault, and at most under it
+STALE = 0.5  # s of patience of the nodes in a loop,
+PATIENT = 2.0  # and where this process is the robot, on a busy machine
+TRIES = 5  # of a fault before which a machine that does other things left the robot unjudged
+PATIENCE = 120.0  # s for nodes to come up, on a machine that does other things too
 VERDICT = 6.0  # s for a verdict
 MONITOR, CONTROLLER = "funnel_monitor", "tracking_controller"
 
@@ -68,6 +77,7 @@ class Seen:
     as_expected: bool
     silent_inside: bool = False
     moved_unproved: bool = False
+    hung: bool = False
 
 
 @dataclass
@@ -130,6 +140,11 @@ class Rig:
             (t for t, _, text in lines if t >= since and re.search(pattern, text)), math.nan
         )
 
+    def is_silent(self, name: str) -> bool:
+        """Whether a node says nothing more, not even what it repeats every second."""
+        now = time.monotonic()
+        return not self.until(lambda: self.has_said(name, "", now) >= 0)
+
     def call(self, service: str) -> Trigger.Response:
         """The answer of a std_srvs/Trigger."""
         client = self.node.create_client(Trigger, service)
@@ -148,11 +163,13 @@ class Rig:
         command: float | None = 0.0,
         frame: str = "odom",
         clock_ns: int | None = None,
+        command_ns: int | None = None,
     ) -> None:
-        """One command and one state."""
+        """One command, with the state's stamp or its own, and one state."""
         state, sent = Odometry(), TwistStamped()
-        for message in (state, sent):
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        for message, of_ns in ((state, None), (sent, command_ns)):
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(stamp_ns if of_ns is None else of_ns, 10**9)
         state.header.frame_id, state.twist.twist.linear.x = frame, speed
         if clock_ns is not None:
             now = Clock()
@@ -221,6 +238,16 @@ def shifted(seconds: float) -> Act:
     return lambda rig, _k, stamp_ns: rig.sample(stamp_ns + round(seconds * 1e9))
 
 
+def commanded(seconds: float) -> Act:
+    """Commands are stamped so much from now; without a number, with 0."""
+
+    def act(rig: Rig, _k: int, stamp_ns: int) -> None:
+        of_ns = 0 if math.isnan(seconds) else stamp_ns + round(seconds * 1e9)
+        rig.sample(stamp_ns, command_ns=of_ns)
+
+    return act
+
+
 def stretched(factor: float) -> Act:
     """Stamps go on at another rate."""
     return lambda rig, k, stamp_ns: rig.sample(
@@ -231,14 +258,14 @@ def stretched(factor: float) -> Act:
 INSIDE = "^inside$"
 MESSAGES: list[tuple[str, Act, str]] = [
     ("no fault", every(), INSIDE),
-    ("state NaN", every(speed=math.nan), r"unknown: no speed at .* \(it is nan\)"),
+    ("state NaN", every(speed=math.nan), r"unknown: no speed at .* \(missing, or not a number\)"),
     ("state infinite", every(speed=math.inf), r"unknown: no speed at .* \(it is inf\)"),
     ("state minus infinite", every(speed=-math.inf), r"unknown: no speed at .* \(it is -inf\)"),
     ("state 1e300", every(speed=1e300), "^outside"),
     ("state 1 m/s", every(speed=1.0), "^outside"),
     ("command NaN", every(command=math.nan), "^unknown"),
     ("silence", silence, "unknown: no speed for"),
-    ("one sample dropped", drop, "unknown: .* 1 sample is missing before"),
+    ("one sample dropped", drop, "unknown: the sample is lost"),
     ("pairs reordered", swap, "^unknown"),
     ("duplicates", duplicate, INSIDE),
     ("conflicting duplicates", contradict, "unknown: speed has two values"),
@@ -254,19 +281,33 @@ MESSAGES: list[tuple[str, Act, str]] = [
     ("stamps jump ahead 1 h", shifted(3600.0), "^unknown"),
     ("33 Hz", stretched(40.0 / 33.0), "^unknown"),
     ("50 Hz", stretched(40.0 / 50.0), "^unknown"),
+    ("a clock 2.4 % slow", stretched(1.024), "unknown: samples come every 0.0"),
+    ("a clock 2.4 % fast", stretched(0.976), "unknown: samples come every 0.0"),
+    ("commands stamped 0", commanded(math.nan), "^unknown"),
+    ("commands stamped an hour ahead", commanded(3600.0), "^unknown"),
+    ("commands stamped an hour ago", commanded(-3600.0), "^unknown"),
 ]
 
 
 def message_faults(rig: Rig, only: str) -> Iterator[Seen]:
     """Faults in what the robot sends, to one monitor that is restarted."""
-    with python(*node(MONITOR, stale_after=STALE, command_wait=0.1)):
+    if not any(only in name for name, *_ in MESSAGES):
+        return
+    with python(*node(MONITOR, stale_after=PATIENT, command_wait=0.1)):
         rig.need("the monitor", lambda: rig.odom.get_subscription_count() >= 1)
         rig.need("its commands", lambda: rig.command.get_subscription_count() >= 2)
         for name, act, expected in MESSAGES:
             if only not in name:
                 continue
-            rig.call(f"/{MONITOR}/restart")
-            yield _fed(rig, name, act, expected)
+            for left in reversed(range(TRIES)):
+                rig.call(f"/{MONITOR}/restart")
+                try:
+                    seen = _fed(rig, name, act, expected)
+                    break
+                except NlsidError:
+                    if not left:
+                        raise
+            yield seen
 
 
 def _fed(rig: Rig, name: str, act: Act, expected: str) -> Seen:
@@ -288,17 +329,168 @@ def _fed(rig: Rig, name: str, act: Act, expected: str) -> Seen:
 
 
 def _judged(rig: Rig, name: str, expected: str, since: float) -> Seen:
+    """What the monitor said of it."""
     if expected == INSIDE:
         rig.spin(0.1)
         lines = [text for t, _, text in rig.said[MONITOR].lines if t >= since]
         same = all(re.search(INSIDE, text) for text in lines)
-        return Seen(name, expected, (lines or ["inside"])[-1], 0.0, same)
+        hung = rig.is_silent(MONITOR)
+        return Seen(name, expected, (lines or ["inside"])[-1], 0.0, same, hung=hung)
     rig.until(lambda: rig.has_said(MONITOR, expected, since) >= 0, VERDICT)
     at = rig.has_said(MONITOR, expected, since)
     said = rig.said.get(MONITOR, Said())
     text = next((text for t, _, text in said.lines if t == at), said.text)
     silent = all(level == DiagnosticStatus.OK for heard, level, _ in said.lines if heard >= since)
-    return Seen(name, expected, text, at - since, at >= since, silent_inside=silent)
+    hung = rig.is_silent(MONITOR)
+    return Seen(name, expected, text, at - since, at >= since, silent_inside=silent, hung=hung)
+
+
+def _fields(text: str) -> list[str]:
+    return ["-p", f"others:='{text}'"]
+
+
+ARGUMENTS: list[tuple[str, list[str], str]] = [
+    ("others: NaN", _fields('{"twist": {"angular": {"z": NaN}}}'), "NaN is not a number"),
+    ("others: Infinity", _fields('{"twist": {"angular": {"z": Infinity}}}'), "Infinity is not"),
+    ("others: 1e400", _fields('{"twist": {"angular": {"z": 1e400}}}'), "1e400 does not fit"),
+    ("others: true", _fields('{"twist": {"angular": {"z": true}}}'), "z is True; it should be"),
+    ("others: a number too few", _fields('{"twist": {"angular": 1}}'), "1 should be an object"),
+    ("others: a list", _fields('{"twist": [0, 1]}'), "[0, 1] should be an object"),
+    ("others: text for a number", _fields('{"twist": {"angular": {"z": "1"}}}'), "z is '1'"),
+    ("others: a number for text", _fields('{"header": {"frame_id": 1}}'), "frame_id is 1"),
+    ("others: not a field", _fields('{"twist": {"turn": 1}}'), "there is no 'turn'"),
+    ("others: no topic", _fields("/a b"), "others is no topic"),
+    ("namespace without a slash", ["-r", "__ns:=robot1"], "begins with a slash"),
+    ("a name that is none", ["-r", "__node:=a-b"], "ROS refuses"),
+    ("a source that is no name", ["-p", "source:=a-b"], "Invalid topic name"),
+]
+
+
+def argument_faults(only: str) -> Iterator[Seen]:
+    """What a controller is told wrongly when it is configured: it ends, and says why in a line."""
+    for name, arguments, expected in ARGUMENTS:
+        if only not in name:
+            continue
+        command = [sys.executable, "-m", *node(CONTROLLER, highest=0.4), *arguments]
+        since = time.monotonic()
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            yield Seen(name, expected, "it does not end", math.nan, False, hung=True)
+            continue
+        said = done.stderr + done.stdout
+        named = done.returncode == 1 and expected in said and "Traceback" not in said
+        seconds = time.monotonic() - since
+        yield Seen(name, expected, said.strip().splitlines()[-1], seconds, named)
+
+
+def verdict_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[Seen]:
+    """Verdicts of another funnel, of no run or of two nodes, to a controller that requires them."""
+    digest = good.digest
+    cases = [
+        ("verdicts of no funnel", [""], "judges a funnel that it does not name"),
+        ("verdicts of another funnel", [f"{other.digest} {WAITING}"], "judges the funnel sha256:"),
+        ("verdicts of no run", [f"{digest} {UNANNOUNCED}"], "judges no run"),
+        ("verdicts of another run", [f"{digest} 7"], "has judged nothing"),
+        ("no verdicts", [], "nobody publishes"),
+        ("verdicts of two nodes", [f"{digest} {WAITING}"] * 2, "2 nodes publish"),
+    ]
+    required = {"stale_after": PATIENT, "require_monitor": True, "monitor_patience": STALE}
+    rig.said.clear()
+    rig.node.destroy_publisher(rig.command)
+    chosen = [case for case in cases if only in case[0]]
+    if chosen:
+        with python(*node(CONTROLLER, highest=0.4, **required)):
+            rig.need("the controller", lambda: rig.has_said(CONTROLLER, "^idle$") >= 0)
+            for name, judging, expected in chosen:
+                yield _watched_by(rig, name, judging, expected)
+    name, expected = "a monitor of a wider funnel", f"judges the funnel {other.digest}"
+    if only not in name:
+        return
+    wide = rig.node.create_publisher(String, "/wide/design", qos.DOCUMENT)
+    wide.publish(String(data=other.text()))
+    watching = {"nominal": "profile", "controller": CONTROLLER, "source": "/wide"}
+    rig.said.clear()
+    with python(*node(CONTROLLER, highest=0.4, **required)), python(*node(MONITOR, **watching)):
+        rig.need("the controller", lambda: rig.has_said(CONTROLLER, "^idle$") >= 0)
+        rig.need("the monitor", lambda: rig.has_said(MONITOR, "no speed yet") >= 0)
+        rig.spin(1.0)  # the graph knows of a subscription before its publisher does
+        yield _watched_by(rig, name, [], expected)
+
+
+def _watched_by(rig: Rig, name: str, judging: list[str], expected: str) -> Seen:
+    """A run that is begun, and a verdict of each of `judging` with every sample of it."""
+    topic, since = f"/{MONITOR}/margin", time.monotonic()
+    rig.commands.clear()
+    made = [rig.node.create_publisher(JointState, topic, qos.STREAM) for _ in judging]
+    rig.need("the verdicts", lambda: all(p.get_subscription_count() for p in made))
+    rig.spin(0.5)  # the controller may know of them later
+    answer = rig.call(f"/{CONTROLLER}/start")
+    for _ in range(BAD if answer.success else 0):
+        stamp_ns = time.time_ns()
+        rig.sample(stamp_ns, command=None)
+        for publisher, text in zip(made, judging, strict=True):
+            said = JointState(name=["margin"], position=[0.5])
+            said.header.stamp.sec, said.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            said.header.frame_id = text
+            publisher.publish(said)
+        rig.spin(PERIOD_NS * 1e-9)
+    for publisher in made:
+        rig.node.destroy_publisher(publisher)
+    heard = rig.has_said(CONTROLLER, expected, since)
+    named = heard >= since or expected in answer.message
+    moved = any(command != 0.0 for command in rig.commands)
+    text = answer.message or rig.said[CONTROLLER].text
+    hung = rig.is_silent(CONTROLLER)
+    return Seen(name, expected, text, heard - since, named and not moved, False, moved, hung)
+
+
+HOLD = 1.28 * PERIOD_NS * 1e-9  # s: a quarter of a period is room for late samples
+
+
+def hold_faults(folder: Path, only: str) -> Iterator[Seen]:
+    """A state at rest, ẋ = u, whose input is proved for a hold: samples too far apart."""
+    field = VectorField.from_function(lambda x, u: [u[0]], 1, 1)  # noqa: ARG005
+    t = np.linspace(0.0, 3.0, 4)
+    rest = integrate_nominal(field, lambda _: [0.0], t=t, start=[0.0])
+    design(ContinuousTracking(field, rest, goal=[0.2], hold=HOLD)).save(folder)
+    text = Bundle.load(folder / FUNNEL).text()
+    slow = dict.fromkeys((MONITOR, CONTROLLER), "design refused: samples come .* hold=")
+    late = {MONITOR: "^assumption violated: the input was held", CONTROLLER: "the input was held"}
+    cases = (("samples too far apart", PERIOD_NS * 1e-9, late), ("hold = period", HOLD, slow))
+    for number, (name, period, said) in enumerate(cases):
+        if only in name:
+            os.environ["ROS_DOMAIN_ID"] = own_domain(50 + number)
+            with robot() as rig:
+                yield from _held(rig, name, text, period, said)
+
+
+def _held(rig: Rig, name: str, text: str, period: float, said: dict[str, str]) -> Iterator[Seen]:
+    """Samples of which two are 1.48 periods apart, to monitor and controller of this design."""
+    wired = {"response": "/odom:twist.twist.linear.x", "command": "/cmd_vel:twist.linear.x"}
+    given: dict[str, object] = {**wired, "period": period, "stale_after": PATIENT}
+    with (
+        python(*node(MONITOR, **given)),
+        python(*node(CONTROLLER, lowest=-9.0, highest=9.0, **given)),
+    ):
+        rig.node.destroy_publisher(rig.command)
+        rig.design.publish(String(data=text))
+        ready = "^(idle$|design refused)"
+        rig.need("the controller", lambda: rig.has_said(CONTROLLER, ready) >= 0)
+        rig.need("the monitor", lambda: rig.has_said(MONITOR, "no x0 yet|design refused") >= 0)
+        since, refused = time.monotonic(), "refused" in said[MONITOR]
+        moved = rig.call(f"/{CONTROLLER}/start").success and refused
+        start_ns, began = time.time_ns(), time.monotonic()
+        for k in range(2 * GOOD):
+            off = {GOOD: -0.24, GOOD + 1: 0.24}.get(k, 0.0)
+            rig.sample(start_ns + round((k + off) * PERIOD_NS), command=None)
+            rig.spin(began + (k + 1) * PERIOD_NS * 1e-9 - time.monotonic())
+        for who, expected in said.items():
+            rig.until(lambda: rig.has_said(who, expected) >= 0, VERDICT)  # noqa: B023
+            at, hung = rig.has_said(who, expected), rig.is_silent(who)
+            silent = who == MONITOR and not at >= 0
+            seen = rig.said[who].text
+            yield Seen(f"{name}, {who}", expected, seen, at - since, at >= 0, silent, moved, hung)
 
 
 def clock_faults(rig: Rig, only: str) -> Iterator[Seen]:
@@ -312,7 +504,7 @@ def clock_faults(rig: Rig, only: str) -> Iterator[Seen]:
         if only not in name:
             continue
         rig.said.clear()
-        with python(*node(MONITOR, stale_after=STALE, command_wait=0.1, use_sim_time=True)):
+        with python(*node(MONITOR, stale_after=PATIENT, command_wait=0.1, use_sim_time=True)):
             rig.need("the monitor", lambda: rig.odom.get_subscription_count() >= 1)
             rig.need("its clock", lambda: rig.clock.get_subscription_count() >= 1)
             rig.need("its design", lambda: rig.has_said(MONITOR, "no speed yet") >= 0)
@@ -338,7 +530,7 @@ def machine_faults(rig: Rig, folder: Path, only: str) -> Iterator[Seen]:
     name = "outside, with the processor starved"
     if only in name:
         with ExitStack() as stack:
-            patient = {"stale_after": STALE, "command_wait": 0.1}
+            patient = {"stale_after": PATIENT, "command_wait": 0.1}
             monitor = stack.enter_context(python(*node(MONITOR, **patient)))
             rig.need("the monitor", lambda: rig.odom.get_subscription_count() >= 1)
             rig.need("its commands", lambda: rig.command.get_subscription_count() >= 2)
@@ -372,7 +564,8 @@ def machine_faults(rig: Rig, folder: Path, only: str) -> Iterator[Seen]:
                 rig.spin(0.002)
             at, said = rig.has_said(recorder, expected), rig.said.get(recorder, Said())
             named = at >= 0 and said.level == DiagnosticStatus.ERROR and running.poll() is None
-        yield Seen(name, expected, said.text, at - since, named)
+            hung = rig.is_silent(recorder)
+        yield Seen(name, expected, said.text, at - since, named, hung=hung)
 
 
 def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
@@ -418,8 +611,13 @@ def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
 
 def design_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[Seen]:
     """Faults in what is published as a design, to both nodes, which then are asked to move."""
+    seconds = (("second publisher", good), ("second publisher, other", other))
+    names = [name for name, _, _ in bundles(good, other)] + [name for name, _ in seconds]
+    if not any(only in name for name in names):
+        return
+    rig.node.destroy_publisher(rig.command)  # from here on the controller's are the only commands
     rig.said.clear()
-    stale = {"stale_after": STALE}
+    stale = {"stale_after": PATIENT}
     with ExitStack() as stack:
         stack.enter_context(python(*node(MONITOR, **stale)))
         stack.enter_context(python(*node(CONTROLLER, highest=0.4, **stale)))
@@ -432,7 +630,7 @@ def design_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[
                 yield _refused(rig, name, because)
         rig.design.publish(String(data=good.text()))
         rig.need("the good one", lambda: rig.has_said(CONTROLLER, "^idle$") >= 0)
-        for name, bundle in (("second publisher", good), ("second publisher, other", other)):
+        for name, bundle in seconds:
             second = rig.node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
             second.publish(String(data=bundle.text()))
             if only in name:
@@ -455,13 +653,20 @@ def _refused(rig: Rig, name: str, because: str) -> Seen:
     moved = started or bool(rig.commands)
     seconds = max(times) - since
     seen = rig.said[CONTROLLER].text
-    named = error and not moved and seconds >= 0
-    return Seen(name, expected, seen, seconds, named, moved_unproved=moved)
+    named, hung = error and not moved and seconds >= 0, any(map(rig.is_silent, both))
+    return Seen(name, expected, seen, seconds, named, moved_unproved=moved, hung=hung)
+
+
+def own_domain(number: int) -> str:
+    """A domain where what was killed before is not still announced."""
+    return str(1 + (os.getpid() + number) % 101)
 
 
 @contextmanager
-def loop(rig: Rig, funnel: Path) -> Iterator[dict[str, "subprocess.Popen[bytes]"]]:
-    """The plant's closed loop, tracking inside its funnel."""
+def loop(
+    rig: Rig, funnel: Path, **common: object
+) -> Iterator[dict[str, "subprocess.Popen[bytes]"]]:
+    """The plant's closed loop, tracking inside its funnel; parameters that all nodes have."""
     rig.said.clear()
     rig.commands.clear()
     stale = {"stale_after": STALE}
@@ -475,7 +680,7 @@ def loop(rig: Rig, funnel: Path) -> Iterator[dict[str, "subprocess.Popen[bytes]"
     }
     with ExitStack() as stack:
         running = {
-            name: stack.enter_context(python(*node(name, **parameters)))
+            name: stack.enter_context(python(*node(name, **parameters, **common)))
             for name, parameters in nodes.items()
         }
         rig.need("the controller", lambda: rig.has_said(CONTROLLER, "^idle$") >= 0)
@@ -490,10 +695,7 @@ def loop(rig: Rig, funnel: Path) -> Iterator[dict[str, "subprocess.Popen[bytes]"
 
 
 def loop_faults(funnel: Path, only: str) -> Iterator[Seen]:
-    """Nodes killed, held and pushed in mid-run: the robot comes to rest, and it is said.
-
-    Each on a domain of its own, where what was killed before is not still announced.
-    """
+    """Nodes killed, held and pushed in mid-run: the robot comes to rest, and it is said."""
     stopped = "stopped"
     cases: list[tuple[str, str, signal.Signals | None, str, str]] = [
         ("monitor killed", MONITOR, signal.SIGKILL, CONTROLLER, f"{stopped}: {MONITOR} has judged"),
@@ -508,7 +710,7 @@ def loop_faults(funnel: Path, only: str) -> Iterator[Seen]:
     for number, (name, victim, how, who, expected) in enumerate(cases, start=1):
         if only not in name:
             continue
-        os.environ["ROS_DOMAIN_ID"] = str(1 + (os.getpid() + number) % 101)
+        os.environ["ROS_DOMAIN_ID"] = own_domain(number)
         with robot(drives=False) as rig, loop(rig, funnel) as running:
             since = time.monotonic()
             if how is None:
@@ -519,8 +721,35 @@ def loop_faults(funnel: Path, only: str) -> Iterator[Seen]:
             at = rig.has_said(who, expected, since)
             silent = who == MONITOR and not at >= since
             rest = who == MONITOR or rig.until(lambda: rig.commands[-1] == 0.0, 1.0)
-            seen = rig.said[who].text
-        yield Seen(name, expected, seen, at - since, at >= since and rest, silent_inside=silent)
+            seen, hung = rig.said[who].text, rig.is_silent(who)
+        named = at >= since and rest
+        yield Seen(name, expected, seen, at - since, named, silent_inside=silent, hung=hung)
+    if only in SIMULATED:
+        yield simulated(funnel)
+
+
+SIMULATED = "a good run, /clock once a sample"
+
+
+def simulated(funnel: Path) -> Seen:
+    """Whether a run that goes well in simulated time ends without an alarm."""
+    os.environ["ROS_DOMAIN_ID"] = own_domain(0)
+    with robot(drives=False) as rig:
+        clock, ticks = rig.node.create_publisher(Clock, "/clock", qos.STREAM), count(10**12)
+
+        def tick() -> None:
+            now = Clock()
+            now.clock.sec, now.clock.nanosec = divmod(next(ticks) * PERIOD_NS, 10**9)
+            clock.publish(now)
+
+        rig.node.create_timer(PERIOD_NS * 1e-9, tick)
+        with loop(rig, funnel, use_sim_time=True):
+            since, expected = time.monotonic(), "unknown: the run has ended: the plan is over"
+            rig.until(lambda: rig.has_said(MONITOR, expected) >= 0, VERDICT)
+            at, said = rig.has_said(MONITOR, expected), rig.said[MONITOR]
+            alarmed = any(level == DiagnosticStatus.ERROR for _, level, _ in said.lines)
+            hung = rig.is_silent(MONITOR)
+    return Seen(SIMULATED, expected, said.text, at - since, at >= 0 and not alarmed, hung=hung)
 
 
 @contextmanager
@@ -557,6 +786,9 @@ def run(folder: Path, only: str = "") -> Iterator[Seen]:
         yield from clock_faults(rig, only)
         yield from machine_faults(rig, folder, only)
         yield from design_faults(rig, good, other, only)
+        yield from verdict_faults(rig, good, other, only)
+    yield from argument_faults(only)
+    yield from hold_faults(folder / "held", only)
     yield from loop_faults(made[0], only)
 
 
@@ -579,6 +811,7 @@ def main() -> None:
         "as_expected": sum(each.as_expected for each in seen),
         "silent_inside": sum(each.silent_inside for each in seen),
         "moved_unproved": sum(each.moved_unproved for each in seen),
+        "hung": sum(each.hung for each in seen),
     }
     print(result)
     if options.json:

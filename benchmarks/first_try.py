@@ -11,11 +11,9 @@ A design that takes more than --limit of processor time is stopped and reported 
 became of each problem is printed, and written to --out, when it is known.
 """
 
-import argparse
 import ast
 import inspect
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.limits import OutOfTimeError, stopped_after
-from benchmarks.machine import describe
+from benchmarks.machine import parser, tell
 from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
@@ -348,30 +346,20 @@ def summary(results: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """Print what became of each, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--only", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
-    parser.add_argument("--starts", type=int, default=4000)
-    parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a design")
-    parser.add_argument("--out", type=Path, help="a file for the results, as they come")
-    arguments = parser.parse_args()
-    print(describe(), flush=True)
+    options = parser(__doc__)
+    options.add_argument("--only", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
+    options.add_argument("--starts", type=int, default=4000)
+    options.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a design")
+    options.add_argument("--out", type=Path, help="a file for the results, as they come")
+    arguments = options.parse_args()
     results: dict[str, Any] = {}
     for name in arguments.only:
         results[name] = run(name, arguments.starts, arguments.limit)
-        print(f"\n{name}")
-        show(results[name])
-        sys.stdout.flush()
+        print(line(name, results[name]), flush=True)
         if arguments.out is not None:
             written = json.dumps(summary(results), indent=1) + "\n"
             files.write_atomically(arguments.out, written.encode())
-    print()
-    for name, told in results.items():
-        print(line(name, told))
-    whole = summary(results)
-    print({key: value for key, value in whole.items() if key not in results})
-    if arguments.json:
-        print(json.dumps(whole))
+    tell(summary(results), as_json=arguments.json)
 
 
 if __name__ == "__main__":

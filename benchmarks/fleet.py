@@ -1,25 +1,21 @@
 """A fleet of bags behind an S3 server of this machine: how fast it is read, and what is fetched.
 
-python -m benchmarks.fleet [--bags 200] [--kills 4] [--endpoint URL] [--json]
+python -m benchmarks.fleet [--bags 200] [--kills 4] [--json]
 
 The bags are made of the shipped F1TENTH trials with noise of their own on the speed, and with eight
 more topics, among them a camera: 1.9 MB each, chunks of 768 KiB without compression, as `ros2 bag
 record` writes them. Wanted are speed and command. The server is moto's, in a process of its own on
 the same cores, which keeps its objects on the disk: 2.1 MB a bag, in the cache folder until it
 ends. What is done is said on standard error. By hand is what one writes with s3fs, rosbags and
-Dask: fetch the file, decode the two topics, interpolate. With --endpoint the bags go to a server
-that runs already (credentials in the environment), which may spend less of these cores on a request
-than moto's.
+Dask: fetch the file, decode the two topics, interpolate.
 """
 
 import argparse
 import hashlib
-import json
 import multiprocessing
 import os
 import random
 import resource
-import shutil
 import signal
 import socket
 import subprocess
@@ -47,11 +43,9 @@ from bags.fleet.workers import Workers
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import standard_definition
 from bags.recordings.message_types import decode, standard_types
-from bags.recordings.remote import place
 from bags.samples import f1tenth
-from bags.signals.expressions import factors
-from bags.signals.reader import bag_origin, read_signals
 from benchmarks.cache import cache_folder
+from benchmarks.machine import parser, tell
 
 BUCKET = "fleet"
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "f1tenth.yaml"
@@ -61,7 +55,6 @@ CHUNK = 768 * 2**10
 NOISE = 1e-3  # m/s
 MANY = 1000  # bags, at most, that one worker reads, and that are read by hand
 BLOB = "std_msgs/msg/ByteMultiArray"
-BAG_BYTES = 2_200_000  # at most, on the disk
 FILES = 1000  # that are open besides those of the server, one an object
 SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
 
@@ -75,16 +68,9 @@ def say(what: str) -> None:
 def scratch(bags: int) -> Iterator[Path]:
     """A folder for the server's objects and everything else, which is gone at the end.
 
-    Raises OSError if there is no room for so many bags, or if too few files may be open at a time.
+    Raises ValueError if the server may not have so many files open at a time.
     """
-    free = shutil.disk_usage(cache_folder()).free
-    if free < bags * BAG_BYTES:
-        raise OSError(
-            f"{bags} bags need {bags * BAG_BYTES / 1e9:.1f} GB, {free / 1e9:.1f} are free"
-        )
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard != resource.RLIM_INFINITY and hard < bags + FILES:
-        raise OSError(f"{bags} bags are as many open files of the server; {hard} are allowed")
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, bags + FILES), hard))
     with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="fleet-") as name:
         os.environ |= {"TMPDIR": name, "MOTO_S3_DEFAULT_KEY_BUFFER_SIZE": "1"}
@@ -92,11 +78,11 @@ def scratch(bags: int) -> Iterator[Path]:
         yield Path(name)
 
 
-def made_bag(trial: Path, seed: int, compression: CompressionType = CompressionType.NONE) -> bytes:
+def made_bag(trial: Path, seed: int) -> bytes:
     """The trial as one MCAP file, with noise on the speed and with the other topics."""
     rng = np.random.default_rng(seed)
     stream = BytesIO()
-    writer = Writer(stream, chunk_size=CHUNK, compression=compression)
+    writer = Writer(stream, chunk_size=CHUNK, compression=CompressionType.NONE)
     writer.start(profile="ros2")
     channels: dict[str, int] = {}
 
@@ -132,15 +118,8 @@ def made_bag(trial: Path, seed: int, compression: CompressionType = CompressionT
 
 
 @contextmanager
-def s3_server(folder: Path, endpoint: str = "") -> Iterator[Any]:
-    """moto's server in a process of its own, or that at `endpoint`; yields a client of it."""
-    if endpoint:
-        os.environ["AWS_ENDPOINT_URL"] = endpoint
-        client = boto3.client("s3")
-        if BUCKET not in {bucket["Name"] for bucket in client.list_buckets()["Buckets"]}:
-            client.create_bucket(Bucket=BUCKET)
-        yield client
-        return
+def s3_server(folder: Path) -> Iterator[Any]:
+    """moto's server in a process of its own; yields a client of it."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -168,20 +147,15 @@ def s3_server(folder: Path, endpoint: str = "") -> Iterator[Any]:
         server.wait()
 
 
-def fill(client: Any, count: int, folder: str, compression: CompressionType) -> int:
-    """Put so many bags below a folder of the bucket, but those that are there; their bytes."""
-    pages = client.get_paginator("list_objects_v2").paginate(Bucket=BUCKET, Prefix=f"{folder}/")
-    sizes = {found["Key"]: found["Size"] for page in pages for found in page.get("Contents", ())}
+def fill(client: Any, count: int) -> int:
+    """Put so many bags into the bucket; their bytes."""
     size = 0
     for k, trial in enumerate(islice(cycle(f1tenth()), count)):
-        key = f"{folder}/robot_{k % 10}/drive_{k:05d}.mcap"
-        if key not in sizes:
-            content = made_bag(trial, k, compression)
-            client.put_object(Bucket=BUCKET, Key=key, Body=content)
-            sizes[key] = len(content)
-        size += sizes[key]
-        if (k + 1) % max(1, count // 10) == 0:
-            say(f"{k + 1} of {count} bags made in {folder}")
+        content = made_bag(trial, k)
+        key = f"plain/robot_{k % 10}/drive_{k:05d}.mcap"
+        client.put_object(Bucket=BUCKET, Key=key, Body=content)
+        size += len(content)
+    say(f"{count} bags made")
     return size
 
 
@@ -277,34 +251,6 @@ def _theirs(pipe: Any, pattern: str) -> None:
     pipe.send(Alone(peak, 1e3 * cpu / len(urls)))
 
 
-def cpu_share(bags: Mapping[str, Path]) -> float:
-    """The part of a task's processor time that is fetching, decompressing and decoding."""
-    config = load_config(CONFIG)
-    task = ReadTrials(config)
-    paths = [str(path) for path in bags.values()]
-    signals = [
-        part
-        for signal in (*config.signals.response, *config.signals.excitation)
-        for part in factors(signal.path)
-    ]
-
-    def reading(path: Path) -> None:
-        read_signals(path, signals)
-        bag_origin(path)
-
-    def spent(work: Callable[[], object]) -> float:
-        started = time.process_time()
-        work()
-        return time.process_time() - started
-
-    reading(place(paths[0]))
-    alone = whole = 0.0
-    for name, text in zip(bags, paths, strict=True):  # in turn, so that both see the same machine
-        alone += spent(lambda: reading(place(text)))  # noqa: B023 - called at once
-        whole += spent(lambda: task(place(text), name))  # noqa: B023 - called at once
-    return alone / whole
-
-
 def by_hand(bags: Mapping[str, Path], workers: int) -> float:
     """Bags a second of the script that one would write."""
     from distributed import Client, LocalCluster, as_completed
@@ -392,43 +338,30 @@ def _rows(manifest: Path) -> int:
         return 0
 
 
-def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
+def measured(count: int, kills: int) -> dict[str, Any]:
     """Everything, by the keys of the JSON."""
-    few = min(100, max(10, count // 10))
     with ExitStack() as stack:
-        folder = stack.enter_context(scratch(0 if endpoint else count + few))
-        client = stack.enter_context(s3_server(folder, endpoint))
-        size = fill(client, count, "plain", CompressionType.NONE)
-        zipped = fill(client, few, "zstd", CompressionType.ZSTD)
+        folder = stack.enter_context(scratch(count))
+        client = stack.enter_context(s3_server(folder))
+        size = fill(client, count)
         pattern = f"s3://{BUCKET}/plain/*/drive_*.mcap"
         bags = named_bags([Path(pattern)])
-        some = dict(islice(bags.items(), few))
         many = dict(islice(bags.items(), MANY))
         tenth = f"s3://{BUCKET}/plain/robot_0/drive_*.mcap"
-        say("a tenth of the bags by one process")
-        fewer = alone(_ours, tenth)
-        say("all bags by one process")
-        here = alone(_ours, pattern)
-        say(f"{len(many)} bags by one worker")
-        one = read(many, 1).bags_per_s
-        say("all bags by two workers")
-        two = read(bags, 2)
-        say("compressed bags")
-        compressed = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0).answers
-        say(f"{len(many)} bags by hand, by two workers of Dask")
-        hand = by_hand(many, 2)
-        say("a tenth of the bags by hand, by one process")
-        hand_cpu = alone(_theirs, tenth).cpu_ms
+        say("a tenth of the bags by one process, then all")
+        fewer, here = alone(_ours, tenth), alone(_ours, pattern)
+        say(f"{len(many)} bags by one worker, all by two")
+        one, two = read(many, 1).bags_per_s, read(bags, 2)
+        say(f"{len(many)} bags by hand, by two workers of Dask; a tenth by one process")
+        hand, hand_cpu = by_hand(many, 2), alone(_theirs, tenth).cpu_ms
         part_of_all = f"s3://{BUCKET}/plain/robot_0/drive_00*.mcap"  # one folder to be listed
         wanted = read(named_bags([Path(part_of_all)]), 0).digest
         good = killed(part_of_all, wanted, kills, folder)
-        say("which part of the time is reading")
         return {
             "bags": count,
             "megabytes": round(size / 1e6, 1),
             "bags_per_s": {"1": round(one, 2), "2": round(two.bags_per_s, 2)},
             "bytes_fetched_share": round(here.fetched / size, 4),
-            "bytes_fetched_share_zstd": round(sum(a.fetched for a in compressed) / zipped, 4),
             "requests_per_bag": round(here.requests / count, 2),
             "bytes_sent_home_per_bag": round(here.sent / count),
             "peak_mb": {
@@ -438,7 +371,6 @@ def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
             "cpu_ms_per_bag": round(here.cpu_ms, 2),
             "bit_equal": two.digest == here.digest,
             "resumed_after_kills": f"{good} of {kills}",
-            "cpu_share_in_reading": round(cpu_share(some), 3),
             "by_hand_bags_per_s": round(hand, 2),
             "by_hand_cpu_ms_per_bag": round(hand_cpu, 2),
             "ratio_to_by_hand": round(two.bags_per_s / hand, 2),
@@ -448,24 +380,17 @@ def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
 
 def main() -> None:
     """Make the fleet, read it, say how that went."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bags", type=int, default=200)
-    parser.add_argument("--kills", type=int, default=4, help="runs that are killed half-way")
-    parser.add_argument("--endpoint", default="", help="of an S3 server that runs already")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--once", nargs=2, metavar=("PATTERN", "MANIFEST"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.once:
-        pattern, manifest = options.once
+    options = parser(__doc__)
+    options.add_argument("--bags", type=int, default=200)
+    options.add_argument("--kills", type=int, default=4, help="runs that are killed half-way")
+    options.add_argument("--once", nargs=2, metavar=("PATTERN", "MANIFEST"), help=argparse.SUPPRESS)
+    arguments = options.parse_args()
+    if arguments.once:
+        pattern, manifest = arguments.once
         print(read(named_bags([Path(pattern)]), 2, Path(manifest)).digest)
         return
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that nothing stays behind
-    found = measured(options.bags, options.kills, options.endpoint)
-    if options.json:
-        print(json.dumps(found))
-        return
-    for key, value in found.items():
-        print(f"{key:28} {value}")
+    tell(measured(arguments.bags, arguments.kills), as_json=arguments.json)
 
 
 if __name__ == "__main__":

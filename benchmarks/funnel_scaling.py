@@ -6,15 +6,13 @@ The thesis stopped at 6 states. Every state enters nonlinearly, but with one oth
 states on the programs have a small Gram matrix for every pendulum.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import parser, tell
 from nlsid_core.design import ContinuousTracking, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.lstep import LSteps, section_at
@@ -77,24 +75,15 @@ def row(n: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the table, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--most", type=int, default=12)
-    arguments = parser.parse_args()
-    print(f"chain of pendulums, {KNOTS} knots; {describe()}")
-    print("states   L-step [ms]   total [s]   pieces   proved for every t")
+    """Print the figures, and with --json one JSON object as the last line."""
+    options = parser(__doc__)
+    options.add_argument("--most", type=int, default=12)
+    arguments = options.parse_args()
     rows = []
     for n in range(2, arguments.most + 1, 2):
         rows.append(row(n))
-        r = rows[-1]
-        print(
-            f"{n:6d} {r['l_step_ms']:13.1f} {r['total_seconds']:11.2f} {r['pieces']:8d}   "
-            f"{'yes' if r['proved'] else 'no'}",
-            flush=True,
-        )
-    if arguments.json:
-        print(json.dumps({"rows": rows}))
+        print(rows[-1], flush=True)
+    tell({"rows": rows}, as_json=arguments.json)
 
 
 if __name__ == "__main__":

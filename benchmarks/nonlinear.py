@@ -11,7 +11,7 @@ their speed, where nothing was measured; how far they are apart there is what th
 The class with the least root of the sum of both squares is taken. It is tried with one lag more
 while that makes the sum less, fitted again to all data, and simulated once over the test data.
 Trials are as the owners divide them; where they name no validation data it is the end, or every
-third, of the training data. Comparators are chosen in the same way. On sets of more than
+third, of the training data. Least squares are chosen in the same way. On sets of more than
 `SAMPLES` training samples the choice is made on that many, and fitted to all.
 
 A set takes at most --limit of processor time: a candidate that is not judged in `SHARE` of it, or
@@ -19,29 +19,21 @@ that no time is left for, is listed as not tried. What is known of each set is p
 to --out, when it is known.
 """
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 
 from bags.samples import convert_dart
-from benchmarks import machine
-from benchmarks.arms import kuka, schunk
+from benchmarks import recorded
 from benchmarks.limits import OutOfTimeError, stopped_after
-from benchmarks.recorded import heat_exchanger, single, wiener_hammerstein
-from benchmarks.subspace import n4sid
+from benchmarks.machine import parser, tell
+from benchmarks.recorded import block_means, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -117,7 +109,7 @@ class PublicSet:
 
 def exchanger(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """The first 1500 of 4000 samples, of them the last 500 to choose; scored on all."""
-    flow, temperature = heat_exchanger(folder)
+    flow, temperature = recorded.heat_exchanger(folder)
     parts = (slice(0, 1000), slice(1000, 1500), slice(0, 4000))
     train, validation, test = (single(f"{p}", flow[p], temperature[p], 1.0) for p in parts)
     return train, validation, test
@@ -125,7 +117,7 @@ def exchanger(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
 
 def wh2009(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """Samples 5001-80000, 80001-100000, and the official test samples 105201-184000."""
-    u, y = wiener_hammerstein(folder)
+    u, y = recorded.wiener_hammerstein(folder)
     parts = (slice(5000, 80_000), slice(80_000, 100_000), slice(105_200, 184_000))
     train, validation, test = (single(f"{p}", u[p], y[p], 1 / 51_200) for p in parts)
     return train, validation, test
@@ -135,8 +127,8 @@ def emps(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """Motor voltage to the velocity of the slide at 100 Hz; the pulses are the test."""
     trials = []
     for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
-        table = loadmat(folder / f"{name}.mat")
-        q, vir = table["qm"].ravel()[::10], table["vir"].ravel()
+        table = recorded.emps(folder, name)
+        q, vir = table["qm"][::10], table["vir"]
         voltage = vir[: len(vir) // 10 * 10].reshape(-1, 10).mean(axis=1)
         velocity = np.diff(q)[: len(voltage)] / 0.01  # what the sum of gives the position again
         trials.append((voltage[: len(velocity)], velocity))
@@ -150,27 +142,32 @@ def emps(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
 
 
 def kuka_first(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
-    """The first joint: trajectory A, B to choose, C to test."""
-    train, test = kuka(folder, 0)
-    first, second = train.trajectories
-    return Dataset((first,)), Dataset((second,)), test
+    """The first joint's torque to velocity: trajectory A, B to choose, C to test."""
+    signals = ("act_torque_abs_nm", "act_vel_mot_deg_per_s")
+    first, second, test = (
+        Dataset((block_means(torque[0], np.deg2rad(velocity[0]), 4e-3, 2, letter),))
+        for letter, (torque, velocity) in recorded.kuka(folder, signals).items()
+    )
+    return first, second, test
 
 
 def schunk_first(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """The first joint: every third of trials 1-80 to choose, 81-100 to test."""
-    train, test = schunk(folder, 0)
-    chosen = train.names[2::3]
-    return train.without(chosen), train.select(chosen), test
+    trials = [
+        block_means(u[:, 0], y[:, 0], 4e-3, 2, str(number))
+        for number, (u, y) in recorded.schunk(folder, range(1, 101)).items()
+    ]
+    chosen = trials[2:80:3]
+    train = [trial for trial in trials[:80] if trial not in chosen]
+    return Dataset(tuple(train)), Dataset(tuple(chosen)), Dataset(tuple(trials[80:]))
 
 
 def f1tenth(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """Commanded to measured speed; the test trials of the shipped configuration."""
-    trials = {}
-    for number in range(1, 42):
-        path = folder / "F1tenthCar" / f"measurement_{number}"
-        u = np.loadtxt(path / "input.csv", delimiter=",")[:, 1]
-        y = np.loadtxt(path / "trajectory.csv", delimiter=",")[: len(u), 3]
-        trials[number] = Trajectory(t=0.025 * np.arange(len(u)), y=y, u=u, name=str(number))
+    trials = {
+        number: Trajectory(t=0.025 * np.arange(len(u)), y=motion[:, 3], u=u[:, 1], name=str(number))
+        for number, (u, motion) in recorded.f1tenth_car(folder).items()
+    }
     test = [5, 11, 16, 22, 27, 33, 38, 41]
     rest = [number for number in trials if number not in test]
     parts = (rest[0::3] + rest[1::3], rest[2::3], test)
@@ -188,15 +185,9 @@ def dart(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
         t = np.arange(0.2, at[-1] - 0.2, 0.05)
 
         def of(title: str, when: FloatArray, drive: Any = drive, at: FloatArray = at) -> FloatArray:
-            return np.asarray(
-                np.interp(
-                    when,
-                    at,
-                    np.unwrap(drive.columns[title])
-                    if title == "vicon yaw"
-                    else drive.columns[title],
-                )
-            )
+            column = drive.columns[title]
+            values = np.unwrap(column) if title == "vicon yaw" else column
+            return np.asarray(np.interp(when, at, values))
 
         yaw_rate = (of("vicon yaw", t + 0.1) - of("vicon yaw", t - 0.1)) / 0.2
         moved = [of(f"vicon {axis}", t + 0.1) - of(f"vicon {axis}", t - 0.1) for axis in "xy"]
@@ -404,26 +395,6 @@ def shortened(data: Dataset) -> Dataset:
     return Dataset(tuple(kept))
 
 
-def subspace(case: PublicSet, data: tuple[Dataset, ...], budget: Budget) -> Best | None:
-    """N4SID of the orders, chosen in the same way."""
-    train, validation, test = data
-
-    def simulator(few: Dataset, order: int) -> Simulator:
-        model = n4sid(few, order)
-        return lambda trials: [model.simulate(trial) for trial in trials]
-
-    both = Dataset((*train.trajectories, *validation.trajectories))
-    found = [
-        (judge(case, partial(simulator, order=order), both, budget, f"n4sid, order {order}"), order)
-        for order in ORDERS
-    ]
-    error, order = min(found)
-    if not np.isfinite(error):
-        return None
-    outputs = simulator(shortened(both), order)(test)
-    return Best(f"order {order}", error, case.score(outputs, test, skipped=case.skipped))
-
-
 def measure(case: PublicSet, folder: Path, limit: float) -> dict[str, Any]:
     """The promised keys of one set."""
     started = time.process_time()
@@ -432,13 +403,11 @@ def measure(case: PublicSet, folder: Path, limit: float) -> dict[str, Any]:
     linear = [(LinearClass(n) if one else StateAffineClass(n), LeastSquares()) for n in ORDERS]
     budget = Budget(limit, started, [])
     naive = best_of(case, linear, data, budget, proved=False)
-    usual = subspace(case, data, budget)
     ours = best_of(case, list(ladder(data[0])), data, budget, proved=True)
     return {
         "best_proved": None if ours is None else ours.test,
         "unit": case.unit,
         "least_squares": None if naive is None else naive.test,
-        "n4sid": None if usual is None else usual.test,
         "published": case.published,
         "seconds": time.process_time() - started,
         "best": None if ours is None else ours.what,
@@ -448,32 +417,23 @@ def measure(case: PublicSet, folder: Path, limit: float) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the table, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the sets' folders")
-    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
-    parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a set")
-    parser.add_argument("--out", type=Path, help="a file for the results, as they come")
-    parser.add_argument("names", nargs="*", help="parts of names; all by default")
-    arguments = parser.parse_args()
+    """Print the figures, and with --json one JSON object as the last line."""
+    options = parser(__doc__, data=True)
+    options.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a set")
+    options.add_argument("--out", type=Path, help="a file for the results, as they come")
+    options.add_argument("names", nargs="*", help="parts of names; all by default")
+    arguments = options.parse_args()
     wanted = [s for s in SETS if not arguments.names or any(n in s.name for n in arguments.names)]
-    print(f"test error in simulation, {machine.describe()}\n")
     rows = {}
     for case in wanted:
         print(case.name, flush=True)
         if not (arguments.data / case.folder).is_dir():
             print(f"    no folder {case.folder}")
             continue
-        rows[case.name] = row = measure(case, arguments.data, arguments.limit)
-        cells = [f"{key} {row[key]:.4g}" for key in ("best_proved", "least_squares", "n4sid")
-                 if row[key] is not None]  # fmt: skip
-        published = ", ".join(f"{source} {value:g}" for source, value in case.published.items())
-        print(f"  {', '.join(cells)} {case.unit}; published: {published or 'none read'}; "
-              f"{row['seconds']:.0f} s\n  {row['best']}", flush=True)  # fmt: skip
+        rows[case.name] = measure(case, arguments.data, arguments.limit)
         if arguments.out is not None:
             files.write_atomically(arguments.out, (json.dumps(rows, indent=1) + "\n").encode())
-    if arguments.json:
-        print(json.dumps(rows))
+    tell(rows, as_json=arguments.json)
 
 
 if __name__ == "__main__":

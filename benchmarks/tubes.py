@@ -12,11 +12,6 @@ designed and scaled on all trials.
 """
 
 import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -26,16 +21,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import read_trials
 from bags.monitoring.catching import what_it_catches
 from bags.samples import f1tenth
-from benchmarks.machine import describe
+from benchmarks import recorded
+from benchmarks.machine import parser, tell
 from benchmarks.processes import resident_mb
-from benchmarks.recorded import heat_exchanger, wiener_hammerstein
+from benchmarks.recorded import block_means
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -112,10 +107,7 @@ def thirds(trials: Sequence[Trajectory], model_class: Any, horizon: int) -> Case
 def f1tenth_two_case(data: Path) -> Case:
     """Steering and speed commands to yaw rate (over four samples) and speed."""
     trials = []
-    for k in range(1, 42):
-        folder = data / "f1tenth" / "F1tenthCar" / f"measurement_{k}"
-        motion = np.loadtxt(folder / "trajectory.csv", delimiter=",")
-        u = np.loadtxt(folder / "input.csv", delimiter=",")
+    for k, (u, motion) in recorded.f1tenth_car(data / "f1tenth").items():
         yaw, speed = np.unwrap(motion[:, 2]), motion[:, 3]
         y = np.column_stack([(yaw[4:] - yaw[:-4]) / 0.1, speed[4:]])[: len(u) - 4]
         trials.append(
@@ -141,7 +133,7 @@ def in_parts(
 
 def exchanger_case(data: Path) -> Case:
     """Flow to temperature, state-affine with a quadratic G_0."""
-    u, y = heat_exchanger(data / "exchanger")
+    u, y = recorded.heat_exchanger(data / "exchanger")
     trials = in_parts(u, y, 1.0, 250, "exchanger")
     model_class = StateAffineClass(
         4, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),), delays=(0, 1, 2)
@@ -152,7 +144,7 @@ def exchanger_case(data: Path) -> Case:
 
 def wh2009_case(data: Path) -> Case:
     """The circuit's voltages, block cascade (3, 3)."""
-    u, y = wiener_hammerstein(data / "wh2009")
+    u, y = recorded.wiener_hammerstein(data / "wh2009")
     whole = in_parts(u[5000:25000], y[5000:25000], 1 / 51200, 20000, "train")
     later = in_parts(u[30000:60000], y[30000:60000], 1 / 51200, 2000, "later")
     validation = named(in_parts(u[80000:90000], y[80000:90000], 1 / 51200, 10000, "val"))
@@ -164,38 +156,24 @@ def wh2009_case(data: Path) -> Case:
 
 def schunk_case(data: Path) -> Case:
     """Six torques to six velocities at 50 Hz."""
-    trials = []
-    for k in range(1, 101, 2):
-        folder = data / "schunk_arm" / "Robot" / f"measurement_{k}"
-        u = np.loadtxt(folder / "input.csv", delimiter=",")
-        y = np.loadtxt(folder / "trajectory.csv", delimiter=",")[: len(u), 6:]
-        trials.append(block_means(u, y, 0.004, 5, str(k)))
+    measured = recorded.schunk(data / "schunk_arm", range(1, 101, 2))
+    trials = [block_means(u, y, 0.004, 5, str(k)) for k, (u, y) in measured.items()]
     return thirds(trials, StateAffineClass(2), 155)
-
-
-def block_means(u: FloatArray, y: FloatArray, period: float, count: int, name: str) -> Trajectory:
-    """Means over blocks of `count` samples."""
-    N = len(y) // count * count
-    u, y = (v[:N].reshape(-1, count, v.shape[1]).mean(axis=1) for v in (u, y))
-    return Trajectory(t=period * count * np.arange(len(y)), y=y, u=u, name=name)
 
 
 def emps_case(data: Path) -> Case:
     """Reference to measured position of a servo with dry friction, 100 Hz."""
-    table = loadmat(data / "emps" / "DATA_EMPS.mat")
-    u, y = table["qg"].reshape(-1, 1), table["qm"].reshape(-1, 1)
-    whole = block_means(u, y, 1e-3, 10, "emps")
+    table = recorded.emps(data / "emps")
+    whole = block_means(table["qg"], table["qm"], 1e-3, 10, "emps")
     return thirds(in_parts(whole.u, whole.y, 0.01, 270, "emps"), LinearClass(5), 240)
 
 
 def kuka_case(data: Path, joint: int) -> Case:
     """Reference to measured motor angle, in windows of 2 s."""
     trials = []
-    for letter in "ABC":
-        path = data / "kuka_kr300" / f"2020-10-21_10s_FF_{letter}_08ms.mat"
-        recorded = loadmat(path, squeeze_me=True, struct_as_record=False)["rec"]
-        u, y = recorded.ref_pos_deg[joint - 1], recorded.act_pos_mot_deg[joint - 1]
-        whole = block_means(u[:, None], y[:, None], 4e-3, 2, letter)
+    signals = ("ref_pos_deg", "act_pos_mot_deg")
+    for letter, (u, y) in recorded.kuka(data / "kuka_kr300", signals).items():
+        whole = block_means(u[joint - 1], y[joint - 1], 4e-3, 2, letter)
         trials += in_parts(whole.u, whole.y, 8e-3, 200, letter)
     return thirds(trials, LinearClass(4), 125)
 
@@ -339,40 +317,35 @@ def lasting(samples: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print the table, and with --json one JSON object as the last line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="folder of the recordings that do not ship")
-    parser.add_argument("--case", action="append", help="one of the cases; repeat for several")
-    parser.add_argument(
+    """Print the figures, and with --json one JSON object as the last line."""
+    options = parser(__doc__)
+    options.add_argument("--data", type=Path, help="folder of the recordings that do not ship")
+    options.add_argument("--case", action="append", help="one of the cases; repeat for several")
+    options.add_argument(
         "--lasting", type=int, help="samples of one run, e.g. 10000000: nothing else"
     )
-    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
-    arguments = parser.parse_args()
+    arguments = options.parse_args()
+    if arguments.lasting:
+        tell(lasting(arguments.lasting), as_json=arguments.json)
+        return
     cases: dict[str, Callable[[], Case]] = dict(SHIPPED)
     if arguments.data is not None:
         cases |= {name: partial(made, arguments.data) for name, made in RECORDED.items()}
-    print(f"tubes around the simulation of identified models, {describe()}\n")
     keys: dict[str, float | int | str] = {}
-    if arguments.lasting:
-        cases, arguments.case = {}, None
-        keys |= lasting(arguments.lasting)
-        print("\n".join(f"  {key:34s}{value:12.4g}" for key, value in keys.items()))
     for name in arguments.case or cases:
         print(name, flush=True)
         try:
             found = measure(cases[name]())
         except NlsidError as refused:
             keys[f"{name}_refused"] = str(refused)
-            print(f"  refused: {refused}\n", flush=True)
             continue
         keys |= {f"{name}_{key}": value for key, value in found.items()}
-        published = dict(zip(FORMS, PUBLISHED[name], strict=True))
-        for key, value in found.items():
-            before = published.get(key.removeprefix("half_width_"), "")
-            print(f"  {key:34s}{value:12.4g}{before!s:>12s}")
-        print(flush=True)
-    if arguments.json:
-        print(json.dumps(keys))
+    published = {
+        f"{name}_half_width_{form}": value
+        for name, values in PUBLISHED.items()
+        for form, value in zip(FORMS, values, strict=True)
+    }
+    tell(keys, published, as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,7 @@ disagree. A disagreement is listed by what each kernel said of it. Recorded are 
 first kernel's tests ask it about, forged or not; both are asked again.
 """
 
-import argparse
 import importlib
-import json
 import os
 import re
 import resource
@@ -24,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import parser, tell
 from benchmarks.shipped import shipped
 from nlsid_core import files, kernel, second
 from tests.core.kernel import mutations
@@ -35,24 +33,16 @@ VERIFIED = ROOT / "verified"
 MUTATIONS = 10_000
 SEED = 4
 KINDS = ("continuous_funnel", "tube", "stability", "sampled_funnel", "funnel_composition")
-TESTS = (
-    "tests/core/kernel", "tests/core/test_decay.py", "tests/core/test_funnel_composition.py",
-    "tests/core/test_funnel_forgeries.py", "tests/core/test_held_funnels.py",
-    "tests/core/test_implicit_proofs.py", "tests/core/test_linear_states.py",
-    "tests/core/test_sampled_funnel.py", "tests/core/test_sampled_funnel_implicit.py",
-    "tests/core/test_saturated_funnels.py", "tests/core/test_trajectory_funnels.py",
-    "tests/core/test_uncertain_funnels.py",
-)  # fmt: skip
+TESTS = "tests/core"
 
 
 def main() -> None:
     """Print the figures; the last line is one JSON object with --json."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--mutations", type=int, default=MUTATIONS)
-    parser.add_argument("--no-designs", action="store_true", help="without the examples' proofs")
-    parser.add_argument("--no-tests", action="store_true", help="without the tests' files")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--mutations", type=int, default=MUTATIONS)
+    options.add_argument("--no-designs", action="store_true", help="without the examples' proofs")
+    options.add_argument("--no-tests", action="store_true", help="without the tests' files")
+    arguments = options.parse_args()
     theory = [path.read_text().splitlines() for path in VERIFIED.glob("*.v")]
     result: dict[str, Any] = {"lines": sum(bool(line.strip()) for text in theory for line in text)}
     with tempfile.TemporaryDirectory() as folder:
@@ -66,11 +56,7 @@ def main() -> None:
         if not arguments.no_tests:
             result |= tested(Path(folder) / "recorded", build / "second")
         result |= mutated(arguments.mutations, Path(folder) / "mutant", build / "second")
-    print(describe())
-    for key, value in result.items():
-        print(f"{key:24}{value!s}")
-    if arguments.json:
-        print(json.dumps(result))
+    tell(result, as_json=arguments.json)
 
 
 def decided(folder: Path, make: list[str], program: Path) -> dict[str, Any]:
@@ -125,7 +111,7 @@ def tested(folder: Path, checker: Path) -> dict[str, Any]:
     """The same of the files that the first kernel's tests ask it about, forged or not."""
     generate = generator()
     subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", recorded.__name__, *TESTS],
+        [sys.executable, "-m", "pytest", "-q", "-p", recorded.__name__, TESTS],
         check=True, cwd=ROOT, env={**os.environ, recorded.FOLDER: str(folder)},
         stdout=subprocess.DEVNULL,
     )  # fmt: skip

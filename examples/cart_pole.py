@@ -9,10 +9,17 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from examples.transcription import motion
+from nlsid import (
+    ContinuousTracking,
+    Goal,
+    Nominal,
+    VectorField,
+    design,
+    nominal_through,
+    taylor_field,
+)
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, nominal_through
-from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.dynamics.taylor import taylor_field
+from nlsid_core.design import FunnelDesign
 
 CART, POLE, LENGTH, GRAVITY = 1.0, 0.25, 0.5, 9.81  # kg, kg, m, m/s²
 SECONDS, SEGMENTS = 2.0, (24, 100)

@@ -1,11 +1,8 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
 from bags.samples import f1tenth
-from bags.signals.grid import read_dataset
-from nlsid_core.design import OutputTube, design
-from nlsid_core.identification import LinearClass, identify, simulation_percent
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
+from nlsid import LinearClass, Monitor, OutputTube, Status, design, identify, read_bags
+from nlsid_core.identification import simulation_percent
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
 SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
@@ -13,7 +10,7 @@ SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
 
 def run() -> tuple[dict[str, float], dict[str, float]]:
     """(computed, known): the test error in % and how many test trials stay inside."""
-    dataset = read_dataset(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
+    dataset = read_bags(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
     train, test = dataset.without(TEST), dataset.select(TEST)
 
     fit = identify(train, LinearClass(4))

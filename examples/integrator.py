@@ -15,10 +15,9 @@ import numpy as np
 
 from bags.designs.displacement import displacement_half_width
 from bags.signals.expressions import washout
+from nlsid import Dataset, LinearClass, OutputTube, Trajectory, design, identify
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, OutputTubeDesign, design
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.identification.prediction import simulate_trial
 
 PERIOD, SPAN = 0.05, 2.0  # s

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from nlsid import ContinuousTracking, Goal, Nominal, VectorField, design, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, integrate_nominal
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.design import FunnelDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
 KNOTS = 40

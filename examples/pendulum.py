@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from nlsid import ContinuousTracking, Nominal, VectorField, design, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.design import FunnelDesign
 
 LENGTH, GRAVITY, DAMPING = 0.5, 9.81, 0.1  # m, m/s², 1/s
 ANGLE, TORQUE = 0.6, 12.0  # rad where the sine is bounded; limit of torque over inertia in 1/s²

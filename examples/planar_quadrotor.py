@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
+from nlsid import Nominal, VectorField, taylor_field
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -18,8 +19,6 @@ from nlsid_core.design import (
     nominal_through,
     plan_motion,
 )
-from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.dynamics.taylor import taylor_field
 
 GRAVITY = 9.81  # m/s²
 SECONDS, KNOTS = 2.0, 41

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
+from nlsid import Nominal, VectorField, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 
 MASS, GRAVITY = 0.5, 9.81  # kg, m/s²
 INERTIA = np.array([0.0032, 0.0032, 0.0055])  # kg m²

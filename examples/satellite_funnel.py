@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from examples.satellite import FINAL_TIME, GOAL, KNOTS, dynamics, nominal_input
+from nlsid import Nominal, VectorField, check, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
-from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.proofs import check
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 
 PUBLISHED_SECONDS = 13429.0  # thesis: 223 min 49 s on 12 cores, exact in time
 WEIGHTS = {"Q": np.eye(6), "R": 10.0 * np.eye(3)}

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from nlsid import ContinuousTracking, Nominal, VectorField, design, integrate_nominal
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.design import FunnelDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 

@@ -225,24 +225,18 @@ class FunnelMonitor(ManagedNode):
 
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0, or the end of that run."""
-        before = self._run
         try:
             self._run = Run.from_document(files.parse_document(message.data, source="run"))
         except NlsidError as error:
             self.get_logger().error(f"announcement not used: {error}")
             return
         if self._run.ended:
-            self._end(before)
+            if self._watch is not None:
+                self._watch.stop(self._run.last_ns, self._run.ended)
             return
         if self._latched is not None:  # what happened before has not been looked at
             self._call_for_help()
         self._begin()
-
-    def _end(self, before: Run | None) -> None:
-        """Judge no more: the announced run, `before` it ended, is over."""
-        assert self._run is not None
-        if self._watch is not None and before is not None and before.name == self._run.name:
-            self._watch.stop(self._run.last_ns, self._run.ended)
 
     def _begin(self) -> None:
         """Begin the announced run if it is of the funnel at hand, and on."""
@@ -457,7 +451,7 @@ class FunnelMonitor(ManagedNode):
         assert self._watch is not None
         if not self._controller or self._watch.monitor.goes_on:
             return f"{self._digest} {UNANNOUNCED}"
-        if self._run is None or self._run.funnel != self._digest:
+        if self._run is None or self._run.ended or self._run.funnel != self._digest:
             return f"{self._digest} {RUN_WAITING}"
         return self._run.name
 

@@ -1,4 +1,4 @@
-"""Several nodes in one process, on one executor of one thread: `nlsid live ... --one-process`.
+"""Several nodes in one process, on one executor of one thread: `nlsid run ... --one-process`.
 
 Each has its own parameters and remappings, and none keeps the others waiting: proofs are decided
 and models identified in processes of their own. They end together, the controller first, which

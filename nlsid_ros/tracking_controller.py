@@ -31,7 +31,7 @@ from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
 from bags.designs.documents import load_unproved
-from bags.monitoring.announcement import UNANNOUNCED, Run
+from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
@@ -230,6 +230,8 @@ class TrackingController(ManagedNode):
         elif (response, command) != (self._design.response, self._design.command):
             raise DataError("it is about other signals; deactivate and activate again")
         self._design, self._digest = design, digest
+        self._say_run(Run(0, digest, ended="the controller has another design, or began anew"))
+        self._run = None
         self._tell("idle")
         if self._start_at_once:
             self._begin()
@@ -257,7 +259,7 @@ class TrackingController(ManagedNode):
             judging = f"{count} nodes publish" if count else "nobody publishes"
             return f"require_monitor is set and {judging} {self._margin.topic_name}"
         self._first_ns, self._run, self._stage = None, None, 1
-        self._stamped_ns, self._accompanied = 0, not self._watched
+        self._stamped_ns, self._hears, self._accompanied = 0, False, not self._watched
         self._began = time.monotonic()
         self._tell("waiting for the response")
         return ""
@@ -269,15 +271,18 @@ class TrackingController(ManagedNode):
             return
         stamp_ns = stamp_ns_of(message)
         self._heard = time.monotonic()
-        if self._first_ns is None:
-            self._frame_heard, self._judged = self._frame or frame_of(message), self._heard
+        if not self._hears:
+            self._hears, self._frame_heard = True, self._frame or frame_of(message)
+            self._judged = self._sent = self._heard
         if reason := self._distrust(stamp_ns, message):
             self._halt(reason)
             return
         self._stamped_ns = max(self._stamped_ns, stamp_ns)
-        if self._first_ns is None or not self._accompanied:
-            # Its input is not ours. The next sample's is, once the required monitor is heard.
-            self._first_ns, self._sent = stamp_ns, self._heard
+        u = controller.u
+        if not self._accompanied:
+            u = self._limits.stop_at  # until the required monitor is heard
+        elif self._first_ns is None:
+            self._first_ns = stamp_ns  # its input is not ours; the next sample's is
         else:
             waiting = controller.k < 1
             try:
@@ -297,7 +302,8 @@ class TrackingController(ManagedNode):
                 self._tell(self._tracking(controller))
             elif controller.stage != self._stage:
                 self._tell(self._tracking(controller))
-        self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
+            u = controller.u
+        self._due.append((stamp_ns + round(controller.lead * 1e9), u))
         self._on_due()
 
     def _doubt(self) -> str:
@@ -349,7 +355,7 @@ class TrackingController(ManagedNode):
         One of another funnel, or of no run, ends this one.
         """
         stamp_ns = stamp_ns_of(message)
-        if self._controller is None or self._first_ns is None:
+        if self._controller is None or not self._hears:
             return
         start_ns = 0 if self._run is None else self._run.start_ns
         if stamp_ns < start_ns or off_clock(stamp_ns, self.get_clock(), self._monitor_patience):
@@ -362,10 +368,9 @@ class TrackingController(ManagedNode):
         if of_run == UNANNOUNCED:
             self._halt(f"{self._monitor} judges no run: set its controller and nominal:=profile")
             return
-        if self._run is None:  # it watches, and waits for the announcement
+        if self._run is None and of_run == WAITING:
             self._accompanied, self._judged = True, time.monotonic()
-            return
-        if message.header.frame_id != self._run.name:
+        if self._run is None or message.header.frame_id != self._run.name:
             return
         numbers = dict(zip(message.name, message.position, strict=False))
         margin, assumption = (numbers.get(key, math.nan) for key in ("margin", "assumption"))
@@ -373,12 +378,12 @@ class TrackingController(ManagedNode):
             self._halt(f"outside: {self._monitor} says margin {margin:.3g}")
         elif assumption > 1.0:
             self._halt(f"assumption violated: {self._monitor} says {assumption:.3g} of it is used")
-        elif margin >= 0.0:
+        elif 0.0 <= margin <= 1.0:
             self._judged = time.monotonic()
 
     def _look(self) -> None:
         """Watch on the wall's clock that responses come, commands go and the monitor judges."""
-        if self._controller is None or self._first_ns is None:
+        if self._controller is None or not self._hears:
             return
         assert self._design is not None
         assert self._command is not None

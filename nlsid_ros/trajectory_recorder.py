@@ -5,8 +5,8 @@ messages undecoded: log time is the arrival (of /clock, in simulated time), publ
 stamp. What a killed recorder loses is what came after the last chunk, at most `chunk_period` and
 one WRITE. Counts of received and lost messages, rate, jitter and gaps go to /diagnostics every
 second and into the bag's metadata.
-`~/start` and `~/stop` begin and end a bag, `~/pause` and `~/resume` leave out a part of one,
-`~/snapshot` saves the last seconds in a bag of their own.
+`~/start` and `~/stop` begin and end a bag, `~/snapshot` saves the last seconds in a bag of their
+own.
 """
 
 import sys
@@ -173,8 +173,6 @@ class TrajectoryRecorder(ManagedNode):
         for name, serve in (
             ("start", self._on_start),
             ("stop", self._on_stop),
-            ("pause", partial(self._on_pause, True)),
-            ("resume", partial(self._on_pause, False)),
             ("snapshot", self._on_snapshot),
         ):
             self.create_service(Trigger, f"~/{name}", _answering(serve))
@@ -251,11 +249,12 @@ class TrajectoryRecorder(ManagedNode):
             with suppress(BagError):  # serialised by rules whose header we do not know
                 stamp_ns = header_stamp_ns(data)
         publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
-        arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns)
+        number = info["publication_sequence_number"]
+        arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns, number)
         if self._recent is not None:
             self._recent.add(arrival)
         if self._recording is not None:
-            self._recording.add(arrival, stamp_ns, info["publication_sequence_number"])
+            self._recording.add(arrival, stamp_ns)
 
     def _lose(self, topic: str, count: int) -> None:
         if self._recording is not None:
@@ -302,13 +301,6 @@ class TrajectoryRecorder(ManagedNode):
         said = self._close(recording)
         return not recording.ended, said
 
-    def _on_pause(self, pause: bool) -> tuple[bool, str]:
-        if self._recording is None:
-            return False, "nothing is being recorded"
-        self._take()
-        self._recording.paused = pause
-        return True, "paused" if pause else "recording"
-
     def _on_snapshot(self) -> tuple[bool, str]:
         """Save the last seconds in a bag of their own."""
         if self._recent is None:
@@ -326,7 +318,7 @@ class TrajectoryRecorder(ManagedNode):
         level, text, values = DiagnosticStatus.OK, "waiting for ~/start", {}
         if recording is not None:
             values = {"bag": str(recording.bag.path)} | recording.counts()
-            text = "paused" if recording.paused else "recording"
+            text = "recording"
             self._topics.follow()
             if warnings := [*recording.warnings(), *self._topics.warnings.values()]:
                 level, text = DiagnosticStatus.WARN, "; ".join(warnings)

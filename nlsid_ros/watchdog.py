@@ -31,9 +31,9 @@ def thread(folder: Path) -> tuple[str, int]:
 
 
 def threads(pid: int) -> dict[str, tuple[str, int]]:
-    """Return state and switches of each thread of a process."""
+    """Return state and switches of each thread of a process; none of one that is gone."""
     found = {}
-    for folder in Path(f"/proc/{pid}/task").iterdir():
+    for folder in Path(f"/proc/{pid}/task").glob("*"):
         with suppress(OSError, KeyError, ValueError):  # it ended meanwhile
             found[folder.name] = thread(folder)
     return found

@@ -36,11 +36,10 @@ Record segment := Segment {
   equations : list equation; bounds : list (nat * (num * num)) }.
 
 (* [limits]: for each input, what it is clipped to, if it is. [box]: the range of each w.
-   [goal]: centre and P (upper triangle) of an ellipsoid. [decay]: how fast V falls, in 1/s, and down
-   to what. *)
+   [goal]: centre and P (upper triangle) of an ellipsoid. *)
 Record problem := Problem {
   segments : list segment; limits : list (option (num * num)); box : list (num * num);
-  goal : option (list num * list (list num)); decay : option (num * num) }.
+  goal : option (list num * list (list num)) }.
 
 Definition begins (g : segment) : R := val (time (start g)).
 Definition ends (g : segment) : R := val (time (stop g)).
@@ -80,13 +79,19 @@ Definition at_time (x : list (R -> R)) (t : R) : list R := map (fun f => f t) x.
 Definition begin (d : problem) : R := match segments d with [] => 0 | g :: _ => begins g end.
 Definition finish (d : problem) : R := last (map ends (segments d)) 0.
 
-(* x is continuous, and between knots its derivative is what the equations give under the policy,
-   for some w in its box, which may be another one at each time. *)
+(* The derivative of f at t from the right. Where an input or w jumps, as a held one does, the state
+   has none from both sides. *)
+Definition right_derivative (f : R -> R) (t l : R) : Prop :=
+  forall e, 0 < e -> exists d, 0 < d /\
+    forall h, 0 < h < d -> Rabs ((f (t + h) - f t) / h - l) < e.
+
+(* x is continuous, and between knots its derivative from the right is what the equations give under
+   the policy, for some w in its box, which may be another one at each time. *)
 Definition solution (d : problem) (x : list (R -> R)) : Prop :=
   (forall t, begin d <= t <= finish d -> Forall (fun f => continuity_pt f t) x) /\
   (forall g t, In g (segments d) -> begins g < t < ends g ->
     exists w, in_box w (box d) /\
-      Forall2 (fun f v => derivable_pt_lim f t v) x
+      Forall2 (fun f v => right_derivative f t v) x
         (field g t (at_time x t) (input d g (place g t) (at_time x t)) w)).
 
 (* W <= rho *)
@@ -112,20 +117,6 @@ Definition in_goal (d : problem) (x : list (R -> R)) : Prop :=
       form (map (map val) B) z z <= 1
   end.
 
-(* V = W / rho. With a decay, of any two times the excess of V over the floor at the later one is at
-   most exp(- pace (t2 - t1)) of that at the earlier one; at a knot for V on either side of it. *)
-Definition V (g : segment) (x : list (R -> R)) (t : R) : R :=
-  let s := place g t in
-  let z := deviation g s (at_time x t) in
-  form (P g s) z z / rho g s.
-Definition decays (d : problem) (x : list (R -> R)) (since : R) : Prop :=
-  match decay d with
-  | None => True
-  | Some (pace, floor) => forall g h t1 t2, In g (segments d) -> In h (segments d) ->
-      begins g <= t1 <= ends g -> begins h <= t2 <= ends h -> since <= t1 <= t2 ->
-      V h x t2 <= val floor + exp (- val pace * (t2 - t1)) * Rmax 0 (V g x t1 - val floor)
-  end.
-
 (* A policy that is held, late, or measures with an error: the input at t is the policy's of some
    time tau at most [period] before, not before [since], for the state then, which is measured wrong
    by at most so much. At a knot it is the policy's on either side. *)
@@ -135,8 +126,8 @@ Definition was_applied (d : problem) (period : num) (errors : list num) (x : lis
     since <= tau /\ t - val period <= tau <= t /\
     Forall2 (fun v most => Rabs v <= val most) e errors /\
     u = input d g (place g tau) (zip Rplus (at_time x tau) e).
-(* x starts at [since] and is continuous from then on; between knots its derivative is what the
-   equations give under u, for some w in its box. *)
+(* x starts at [since] and is continuous from then on; between knots its derivative from the right is
+   what the equations give under u, for some w in its box. *)
 Definition held_solution (d : problem) (period : num) (errors : list num) (since : R)
   (x : list (R -> R)) (u : R -> list R) : Prop :=
   Forall (fun g => length x = length (nominal g)) (segments d) /\
@@ -144,7 +135,7 @@ Definition held_solution (d : problem) (period : num) (errors : list num) (since
   (forall g t, In g (segments d) -> begins g < t < ends g ->
     (since <= t -> was_applied d period errors x since t (u t)) /\
     (since < t -> exists w, in_box w (box d) /\
-      Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (u t) w))).
+      Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) (u t) w))).
 (* The state within its bounds at every time, the input that is applied between knots. *)
 Definition held_in_bounds (d : problem) (x : list (R -> R)) (u : R -> list R) (t : R) : Prop :=
   forall g b, In g (segments d) -> In b (bounds g) ->

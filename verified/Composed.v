@@ -4,10 +4,9 @@ From Verified Require Import Integers Forms Claim Definite Funnel Stays Goal Val
 Import ListNotations.
 Open Scope R_scope.
 
-(* x is in the funnel d from ta on, within its bounds, ends in its goal, and decays as it claims. *)
+(* x is in the funnel d from ta on, within its bounds, and ends in its goal. *)
 Definition kept (d : problem) (x : list (R -> R)) (ta : R) : Prop :=
-  (forall t, ta <= t <= finish d -> inside d x t /\ in_bounds d x t) /\ in_goal d x /\
-  decays d x ta.
+  (forall t, ta <= t <= finish d -> inside d x t /\ in_bounds d x t) /\ in_goal d x.
 (* A solution of all stages that is in one of them, at a time of its own, is kept in it, and in each
    that follows from its beginning on. *)
 Fixpoint carried (ds : list problem) (x : list (R -> R)) : Prop :=
@@ -22,9 +21,9 @@ Definition composed (ds : list problem) : Prop :=
 
 Record stage := Stage {
   dynamics : field_file; control : policy_file; tunnel : funnel_file;
-  aim : option (list num * list (list num)); descent : option (num * num) }.
+  aim : option (list num * list (list num)) }.
 Definition stated_by (g : stage) : problem :=
-  stated (dynamics g) (control g) (tunnel g) (aim g) (descent g).
+  stated (dynamics g) (control g) (tunnel g) (aim g).
 
 Section Composed.
 Context {K : Ints}.
@@ -32,7 +31,7 @@ Context {K : Ints}.
 Definition starting (g : segment) : list num * list (list num) :=
   (map first_of (nominal g), map (map (fun e => ndiv e (level (start g)))) (shape (start g))).
 Definition aimed (d : problem) (g : segment) : problem :=
-  Problem (segments d) (limits d) (box d) (Some (starting g)) (decay d).
+  Problem (segments d) (limits d) (box d) (Some (starting g)).
 (* [d] ends when [e] begins, and inside it there. *)
 Definition enters (d e : problem) (lambda : num) : bool :=
   match rev (segments d), segments e with
@@ -49,7 +48,7 @@ Fixpoint joined (ds : list problem) (lambdas : list num) : bool :=
   | _, _ => false
   end.
 Definition stage_ok (s : stage) (w : witness) : bool :=
-  files_ok (dynamics s) (control s) (tunnel s) (aim s) (descent s) w.
+  files_ok (dynamics s) (control s) (tunnel s) (aim s) w.
 Definition composed_ok (gs : list stage) (ws : list witness) (lambdas : list num) : bool :=
   andb (Nat.eqb (length gs) (length ws))
     (andb (forallb (fun e => stage_ok (fst e) (snd e)) (combine gs ws))
@@ -155,7 +154,7 @@ Proof.
     destruct (stage_checked s w W1) as [C N]. pose proof (ordered _ w C N) as O.
     assert (Here : forall ta, begin (stated_by s) <= ta <= finish (stated_by s) ->
       inside (stated_by s) x ta -> kept (stated_by s) x ta).
-    { intros ta Hta Hin. exact (funnel_theorem _ _ _ _ _ w W1 x S1 ta Hta Hin). }
+    { intros ta Hta Hin. exact (funnel_theorem _ _ _ _ w W1 x S1 ta Hta Hin). }
     assert (Next : inside (stated_by s) x (finish (stated_by s)) ->
       Forall (fun e => kept e x (begin e)) (map stated_by gs)).
     { intros Hend. destruct gs as [|s2 gs]; [constructor|]. destruct ws as [|w2 ws]; [discriminate|].

@@ -60,15 +60,6 @@ Definition condition (margin : num) (limits : list (option (num * num))) (mode :
   -1 * most - val margin * (duration g * rho g s)
     + mu * (rho g s - form (P g s) z z)
     - dot taus (held limits mode (wanted g s z)).
-(* With a decay: on all of the funnel above its floor, times rho. *)
-Definition decaying (pace floor : num) (limits : list (option (num * num))) (mode : list side)
-  (g : segment) (s : R) (x : list R) (most outer inner : R) (taus : list R) : R :=
-  let z := deviation g s x in
-  let W := form (P g s) z z in
-  rho g s * (-1 * most + val pace * (duration g * (val floor * rho g s - W)))
-    - (rho g s - W) * (rho' g + outer) - inner * (W - val floor * rho g s)
-    - dot taus (held limits mode (wanted g s z)).
-
 Section Condition.
 Context {K : Ints}.
 
@@ -185,22 +176,6 @@ Definition fcondition (margin : num) (limits : list (option (num * num))) (mode 
       (fsub (fscale (-1) most) (fmul (fnum margin) (fmul (fduration g) rho)))
       (fmul mu (fsub rho (fform (fshape B g) z z))))
     (fdot taus (fheld limits mode (fwanted B g))).
-Definition fdecaying (pace floor : num) (limits : list (option (num * num))) (mode : list side)
-  (g : segment) (depth index : Z) (most outer inner : F) (taus : list F) : F :=
-  let B := fbernstein (fplace depth index) (fremaining depth index) in
-  let z := fdeviation g in
-  let rho := flevel B g in
-  let W := fform (fshape B g) z z in
-  let low := fmul (fnum floor) rho in
-  fsub
-    (fsub
-      (fsub
-        (fmul rho (fadd (fscale (-1) most)
-          (fmul (fnum pace) (fmul (fduration g) (fsub low W)))))
-        (fmul (fsub rho W) (fadd (flevel' g) outer)))
-      (fmul inner (fsub W low)))
-    (fdot taus (fheld limits mode (fwanted B g))).
-
 Section At.
 Variables (s r : R) (z : list R) (depth index : Z).
 Hypothesis Hdepth : (0 <= depth)%Z.
@@ -450,23 +425,6 @@ Proof.
   - now apply (means_scale _ _ (-1)).
   - apply means_mul; [apply means_fnum|]. apply means_mul; [apply means_duration|apply means_level].
   - apply means_mul; auto. apply means_sub; auto. apply means_level.
-  - apply means_fdot; auto. apply means_held, means_wanted.
-Qed.
-Lemma means_decaying pace floor most a outer o inner i taus ts : means most a -> means outer o ->
-  means inner i -> Forall2 means taus ts ->
-  means (fdecaying pace floor limits mode g depth index most outer inner taus)
-    (decaying pace floor limits mode g s x a o i ts).
-Proof.
-  intros Ha Ho Hi Htau. pose proof means_W. pose proof means_level.
-  assert (Hl : means (fmul (fnum floor) (flevel B g)) (val floor * rho g s)).
-  { apply means_mul; auto. apply means_fnum. }
-  unfold fdecaying, decaying. rewrite <- Hz.
-  apply means_sub; [apply means_sub; [apply means_sub|]|].
-  - apply means_mul; auto. apply means_add; [now apply (means_scale _ _ (-1))|].
-    apply means_mul; [apply means_fnum|]. apply means_mul; [apply means_duration|].
-    now apply means_sub.
-  - apply means_mul; [now apply means_sub|]. apply means_add; auto. apply means_sub; apply means_fnum.
-  - apply means_mul; auto. now apply means_sub.
   - apply means_fdot; auto. apply means_held, means_wanted.
 Qed.
 End Segment.

@@ -41,10 +41,10 @@ Definition segment_of (f : field_file) (p : policy_file) (u : funnel_file) (k : 
 Definition clip_of (p : policy_file) (i : nat) : option (num * num) :=
   option_map snd (find (fun row => Nat.eqb (fst row) i) (clips p)).
 Definition stated (f : field_file) (p : policy_file) (u : funnel_file)
-  (g : option (list num * list (list num))) (e : option (num * num)) : problem :=
+  (g : option (list num * list (list num))) : problem :=
   Problem (map (segment_of f p u) (seq 0 (pred (length (knots u)))))
     (map (clip_of p) (seq 0 (inputs f))) (uncertain f)
-    (option_map (fun g => (fst g, upper (snd g))) g) e.
+    (option_map (fun g => (fst g, upper (snd g))) g).
 
 (* The files have the sizes that they state; nothing else in them is dropped. *)
 Definition sized {A : Type} (n : nat) (l : list A) : bool := Nat.eqb (length l) n.
@@ -85,24 +85,24 @@ Open Scope R_scope.
 Section Files.
 Context {K : Ints}.
 
-Definition files_ok f p u g e (w : witness) : bool :=
-  let d := stated f p u g e in
+Definition files_ok f p u g (w : witness) : bool :=
+  let d := stated f p u g in
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
     (andb (andb (funnel_ok d (unmoved d) w) (bounds_ok d (unmoved d)))
       (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
        else true)).
 
-Theorem funnel_theorem f p u g e w : files_ok f p u g e w = true ->
-  forall x, solution (stated f p u g e) x ->
-  forall ta, begin (stated f p u g e) <= ta <= finish (stated f p u g e) ->
-  inside (stated f p u g e) x ta ->
-  (forall t, ta <= t <= finish (stated f p u g e) ->
-    inside (stated f p u g e) x t /\ in_bounds (stated f p u g e) x t) /\
-  in_goal (stated f p u g e) x /\ decays (stated f p u g e) x ta.
+Theorem funnel_theorem f p u g w : files_ok f p u g w = true ->
+  forall x, solution (stated f p u g) x ->
+  forall ta, begin (stated f p u g) <= ta <= finish (stated f p u g) ->
+  inside (stated f p u g) x ta ->
+  (forall t, ta <= t <= finish (stated f p u g) ->
+    inside (stated f p u g) x t /\ in_bounds (stated f p u g) x t) /\
+  in_goal (stated f p u g) x.
 Proof.
-  unfold files_ok. cbn zeta. set (d := stated f p u g e). intros H x Hx ta Hta Hin.
+  unfold files_ok. cbn zeta. set (d := stated f p u g). intros H x Hx ta Hta Hin.
   apply andb_prop in H as [_ H]. apply andb_prop in H as [H _]. apply andb_prop in H as [H Hb].
-  destruct (funnel_proved d w H x Hx ta Hta Hin) as [S [G D]]. split; auto.
+  destruct (funnel_proved d w H x Hx ta Hta Hin) as [S G]. split; auto.
   unfold funnel_ok in H. apply andb_prop in H as [H Hne]. apply andb_prop in H as [H _].
   apply andb_prop in Hne as [Hne _]. apply Nat.ltb_lt in Hne. pose proof (check_facts _ _ _ H) as C.
   intros t Ht. split; auto. apply (valid_kept d w x t); auto; [|lra]. now apply (solution_length d w).

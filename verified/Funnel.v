@@ -61,19 +61,12 @@ Fixpoint all_expanded (rows : list mono) (l : list (list Z * squares)) : option 
 Definition kappa_ok (d : problem) (g : segment) (p : piece) (skipped : nat) : bool :=
   andb (forallb (pushes_only skipped) (equations g))
     (andb (Nat.eqb (length (kappa p)) (length (box d))) (forallb (num_ltb (0%Z, xH)) (kappa p))).
-(* What has to be positive on a piece. With a decay the first two of its sums of squares are for
-   rho - W and W - floor rho. *)
+(* What has to be positive on a piece. *)
 Definition falling (d : problem) (w : witness) (g : segment) (m : list side) (p : piece) (most : F)
   (taus : list F) : option F :=
-  match decay d, taus with
-  | None, _ =>
-      let f := fmu (multiplier w) (mu p) in
-      if ipos (den f)
-      then Some (fcondition (margin w) (limits d) m g (depth p) (index p) most f taus) else None
-  | Some (pace, floor), outer :: inner :: taus' =>
-      Some (fdecaying pace floor (limits d) m g (depth p) (index p) most outer inner taus')
-  | _, _ => None
-  end.
+  let f := fmu (multiplier w) (mu p) in
+  if ipos (den f)
+  then Some (fcondition (margin w) (limits d) m g (depth p) (index p) most f taus) else None.
 Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (off : list num)
   (p : piece) : bool :=
   match nth_error (cases w (box d) off) (vertex p), nth_error (modes (limits d)) (mode p),
@@ -139,17 +132,11 @@ Fixpoint linked (gs : list segment) : bool :=
   | _ => true
   end.
 
-Definition falls (d : problem) (w : witness) : bool :=
-  match decay d with
-  | None => num_ltb (0%Z, xH) (margin w)
-  | Some (pace, floor) => andb (num_ltb (0%Z, xH) pace)
-      (andb (num_leb (0%Z, xH) floor) (num_ltb floor (1%Z, xH)))
-  end.
 (* [offs]: by segment, what the inputs are off by at most. *)
 Definition check (d : problem) (offs : list (list num)) (w : witness) : bool :=
   let n := match segments d with [] => O | g :: _ => length (nominal g) end in
   let products := products (basis w) in
-  andb (andb (andb (falls d w) (linked (segments d)))
+  andb (andb (andb (num_ltb (0%Z, xH) (margin w)) (linked (segments d)))
          (forallb (fun l => match l with Some (a, b) => num_ltb a b | None => true end) (limits d)))
     (andb (andb (Nat.eqb (length (pieces w)) (length (segments d)))
         (Nat.eqb (length offs) (length (segments d))))
@@ -379,46 +366,35 @@ Proof.
 Qed.
 
 (* The multiplier of rho - W at a place, and a bound on all of them that is continuous *)
-Definition outer (d : problem) (w : witness) (p : piece) : F :=
-  match decay d with
-  | None => fmu (multiplier w) (mu p)
-  | Some _ => match all_expanded (sides w) (tau p) with Some (f :: _) => f | _ => fone end
-  end.
-Definition outer_at (d : problem) (w : witness) (p : piece) (s : R) (z : list R) : R :=
-  pval (s * IZR (2 ^ depth p) - IZR (index p)) (env z) (Polynomials.num (outer d w p))
-    / r (den (outer d w p)).
-Fixpoint outer_bound (d : problem) (w : witness) (ps : list piece) (s : R) (z : list R) : R :=
+Definition outer_at (w : witness) (p : piece) (s : R) (z : list R) : R :=
+  pval (s * IZR (2 ^ depth p) - IZR (index p)) (env z)
+      (Polynomials.num (fmu (multiplier w) (mu p)))
+    / r (den (fmu (multiplier w) (mu p))).
+Fixpoint outer_bound (w : witness) (ps : list piece) (s : R) (z : list R) : R :=
   match ps with
   | [] => 0
-  | p :: ps' => 1 + outer_at d w p s z * outer_at d w p s z + outer_bound d w ps' s z
+  | p :: ps' => 1 + outer_at w p s z * outer_at w p s z + outer_bound w ps' s z
   end.
-Lemma outer_bound_nonneg d w ps s z : 0 <= outer_bound d w ps s z.
+Lemma outer_bound_nonneg w ps s z : 0 <= outer_bound w ps s z.
 Proof.
-  induction ps as [|p ps IH]; cbn; [lra|]. pose proof (Rle_0_sqr (outer_at d w p s z)).
+  induction ps as [|p ps IH]; cbn; [lra|]. pose proof (Rle_0_sqr (outer_at w p s z)).
   unfold Rsqr in *. lra.
 Qed.
-Lemma outer_bound_above d w ps p s z : In p ps ->
-  Rabs (outer_at d w p s z) <= outer_bound d w ps s z.
+Lemma outer_bound_above w ps p s z : In p ps ->
+  Rabs (outer_at w p s z) <= outer_bound w ps s z.
 Proof.
   induction ps as [|q ps IH]; cbn; [tauto|]. intros [->|H].
-  - pose proof (outer_bound_nonneg d w ps s z). apply Rabs_le.
-    pose proof (Rle_0_sqr (outer_at d w p s z + 1)). pose proof (Rle_0_sqr (outer_at d w p s z - 1)).
+  - pose proof (outer_bound_nonneg w ps s z). apply Rabs_le.
+    pose proof (Rle_0_sqr (outer_at w p s z + 1)). pose proof (Rle_0_sqr (outer_at w p s z - 1)).
     unfold Rsqr in *. nra.
-  - specialize (IH H). pose proof (Rle_0_sqr (outer_at d w q s z)). unfold Rsqr in *. lra.
+  - specialize (IH H). pose proof (Rle_0_sqr (outer_at w q s z)). unfold Rsqr in *. lra.
 Qed.
-Definition pace (d : problem) : R := match decay d with None => 0 | Some (l, _) => val l end.
-Definition bottom (d : problem) : R := match decay d with None => 1 | Some (_, f) => val f end.
-Definition bound_at (d : problem) (w : witness) (g : segment) (ps : list piece) (s : R) (z : list R)
-  : R :=
-  (Rabs (rho' g) + outer_bound d w ps s z)
-    * (1 + / val (level (start g)) + / val (level (stop g))).
-
-(* The heart: where W is above c rho, c from the bottom to 1, it grows relative to c rho by less than
-   a bounded multiple of the excess, if c falls towards the bottom at its pace. *)
+(* The heart: where W is above rho, it grows relative to rho by less than a bounded multiple of the
+   excess. *)
 Section Segment.
 Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
-Hypothesis Hfalls : falls d w = true.
+Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
 Hypothesis Hoff : off_ok n d g off = true.
 Hypothesis Hcov : covered d w off ps = true.
@@ -490,113 +466,46 @@ Qed.
 Definition within_off (a u : list R) : Prop :=
   match off with [] => u = a | _ => exists delta, in_box delta (around off) /\ u = zip Rplus a delta end.
 
-Lemma fall_facts : 0 <= pace d /\ bottom d <= 1 /\ (decay d = None -> 0 < val (margin w)).
-Proof.
-  unfold pace, bottom. pose proof Hfalls as F. unfold falls in F. destruct (decay d) as [[l f]|].
-  - apply andb_prop in F as [A B]. apply andb_prop in B as [_ B]. apply num_ltb_lt in A, B.
-    rewrite val_zero in A. unfold val at 2 in B. cbn in B. repeat split; try lra. discriminate.
-  - apply num_ltb_lt in F. rewrite val_zero in F. repeat split; try lra.
-Qed.
-
-Lemma falling_enough s x z m p most a taus ts fc share : 0 <= s <= 1 -> holds p s ->
-  z = deviation g s x -> length x = n -> In p ps -> (0 <= depth p)%Z ->
+Lemma falling_enough s x z m p most a taus ts fc : 0 <= s <= 1 -> z = deviation g s x ->
+  length x = n -> In p ps -> (0 <= depth p)%Z ->
   means (s * IZR (2 ^ depth p) - IZR (index p)) (env z) most a ->
-  all_expanded (sides w) (tau p) = Some taus ->
   Forall2 (means (s * IZR (2 ^ depth p) - IZR (index p)) (env z)) taus ts ->
   Forall (fun q => 0 <= q) ts -> Forall (fun q => 0 <= q) (held (limits d) m (wanted g s z)) ->
   falling d w g m p most taus = Some fc ->
   (forall c, means (s * IZR (2 ^ depth p) - IZR (index p)) (env z) fc c -> 0 < c) ->
-  bottom d <= share <= 1 -> 0 < form (P g s) z z - share * rho g s ->
-  a + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
-    < bound_at d w g ps s z * (form (P g s) z z - share * rho g s).
+  0 < form (P g s) z z - rho g s ->
+  a < outer_bound w ps s z * (form (P g s) z z - rho g s).
 Proof.
-  intros Hs Hh Hz Hx Hp Hd Ha Etau Hts Hns Hheld Hf Hpos Hsh Hgap. destruct segment_facts.
+  intros Hs Hz Hx Hp Hd Ha Hts Hns Hheld Hf Hpos Hgap. destruct segment_facts.
   set (r0 := s * IZR (2 ^ depth p) - IZR (index p)) in *.
   pose proof (rho_pos s Hs) as Hrho.
   assert (Hdur : 0 < duration g) by (unfold duration; lra).
-  destruct fall_facts as [Hpace [Hbot Hmargin]].
-  pose proof (Rinv_0_lt_compat _ f_start0) as I0. pose proof (Rinv_0_lt_compat _ f_stop0) as I1.
-  assert (Big : 1 <= rho g s * (1 + / val (level (start g)) + / val (level (stop g)))).
-  { set (l0 := val (level (start g))) in *. set (l1 := val (level (stop g))) in *.
-    assert (E0 : l0 * / l0 = 1) by (apply Rinv_r; lra).
-    assert (E1 : l1 * / l1 = 1) by (apply Rinv_r; lra).
-    assert (M0 : 0 <= (1 - s) * l0 * / l1).
-    { apply Rmult_le_pos; [apply Rmult_le_pos|]; lra. }
-    assert (M1 : 0 <= s * l1 * / l0).
-    { apply Rmult_le_pos; [apply Rmult_le_pos|]; lra. }
-    assert (R1 : rho g s * (1 + / l0 + / l1) = rho g s + (1 - s) * (l0 * / l0) + s * l1 * / l0
-      + (1 - s) * l0 * / l1 + s * (l1 * / l1)).
-    { unfold rho, line. fold l0 l1. ring. }
-    rewrite R1, E0, E1. lra. }
-  pose proof (outer_bound_above d w ps p s z Hp) as Hab. pose proof (Rabs_pos (rho' g)) as Hr0.
-  pose proof (outer_bound_nonneg d w ps s z) as Hob.
-  set (gap := form (P g s) z z - share * rho g s) in *.
-  set (K0 := 1 + / val (level (start g)) + / val (level (stop g))) in *.
+  pose proof (outer_bound_above w ps p s z Hp) as Hab.
   assert (Lx : length x = length (nominal g)) by congruence.
-  unfold falling in Hf. unfold bound_at. fold K0. unfold pace, bottom in *.
-  revert Hf Hsh Hpace Hbot Hmargin. destruct (decay d) as [[l f]|] eqn:Ed; intros Hf Hsh Hpace Hbot Hmargin.
-  - destruct taus as [|o [|i taus]]; try discriminate. injection Hf as <-.
-    inversion Hts as [|? to ? ts1 Ho Hts1]; subst ts. subst. inversion Hts1 as [|? ti ? ts2 Hi Hts2]; subst.
-    inversion Hns as [|? ? No Hns1]; subst. inversion Hns1 as [|? ? Ni Hns2]; subst.
-    pose proof (means_decaying s r0 _ (depth p) (index p) Hd ltac:(unfold r0; ring) (limits d) m g x
-      eq_refl Lx l f _ _ _ _ _ _ _ _ Ha Ho Hi Hts2) as Hc.
-    specialize (Hpos _ Hc). unfold decaying in Hpos.
-    pose proof (dot_nonneg _ Hns2 _ Hheld) as Hdot.
-    assert (Eo : outer_at d w p s (deviation g s x) = to).
-    { unfold outer_at, outer. rewrite Ed, Etau. fold r0. destruct Ho as [D E]. rewrite E. field. lra. }
-    rewrite Eo in Hab. pose proof (Rle_abs to) as Hto. pose proof (Rle_abs (rho' g)) as Hrr.
-    set (W := form (P g s) _ _) in *. set (rh := rho g s) in *. set (rp := rho' g) in *.
-    set (ob := outer_bound _ _ _ _ _) in *.
-    assert (N1 : 0 <= ti * (W - val f * rh)).
-    { apply Rmult_le_pos; auto. pose proof (Rmult_le_compat_r rh _ _ (Rlt_le _ _ Hrho) (proj1 Hsh)).
-      unfold gap in Hgap. lra. }
-    assert (N2 : 0 <= val l * duration g * rh * gap).
-    { pose proof (Rmult_le_pos _ _ Hpace (Rlt_le _ _ Hdur)) as A1.
-      pose proof (Rmult_le_pos _ _ A1 (Rlt_le _ _ Hrho)) as A2.
-      exact (Rmult_le_pos _ _ A2 (Rlt_le _ _ Hgap)). }
-    assert (N3 : to * (W - rh) <= ob * gap).
-    { apply Rle_trans with (to * gap).
-      - apply Rmult_le_compat_l; auto. unfold gap.
-        pose proof (Rmult_le_compat_r rh _ _ (Rlt_le _ _ Hrho) (proj2 Hsh)). lra.
-      - apply Rmult_le_compat_r; lra. }
-    assert (N4 : rp * gap <= Rabs rp * gap) by (apply Rmult_le_compat_r; lra).
-    assert (N5 : (Rabs rp + ob) * gap <= (Rabs rp + ob) * gap * (rh * K0)).
-    { rewrite <- (Rmult_1_r ((Rabs rp + ob) * gap)) at 1. apply Rmult_le_compat_l; auto.
-      apply Rmult_le_pos; lra. }
-    apply (Rmult_lt_reg_l rh); auto.
-    replace (rh * ((Rabs rp + ob) * K0 * gap)) with ((Rabs rp + ob) * gap * (rh * K0)) by ring.
-    eapply Rlt_le_trans; [|exact N5].
-    apply Rle_lt_trans with (rh * a + (1 - share) * rh * rp
-      + val l * duration g * rh * ((share - val f) * rh)); [right; ring|].
-    unfold gap in *. nra.
-  - destruct (ipos (den (fmu (multiplier w) (mu p)))) eqn:Eden; [|discriminate]. injection Hf as <-.
-    apply r_pos in Eden. specialize (Hmargin eq_refl).
-    assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (outer_at d w p s z)).
-    { unfold outer_at, outer. rewrite Ed. split; auto. fold r0. field. lra. }
-    subst z. pose proof (means_condition s r0 _ (depth p) (index p) Hd ltac:(unfold r0; ring) (limits d) m
-      g x eq_refl Lx (margin w) _ _ _ _ _ _ Ha Hmu Hts) as Hc.
-    specialize (Hpos _ Hc). unfold condition in Hpos.
-    pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
-    pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
-    assert (share = 1) by lra. subst share.
-    set (W := form (P g s) _ _) in *. set (ob := outer_bound _ _ _ _ _) in *.
-    set (mu0 := outer_at _ _ _ _ _) in *.
-    assert (N1 : - mu0 * gap <= ob * gap).
-    { apply Rmult_le_compat_r; [lra|]. pose proof (Rle_abs (- mu0)). rewrite Rabs_Ropp in *. lra. }
-    assert (N2 : ob * gap <= (Rabs (rho' g) + ob) * K0 * gap).
-    { apply Rmult_le_compat_r; [lra|]. rewrite <- (Rmult_1_r ob) at 1.
-      apply Rmult_le_compat; unfold K0; lra. }
-    unfold gap in *. lra.
+  unfold falling in Hf.
+  destruct (ipos (den (fmu (multiplier w) (mu p)))) eqn:Eden; [|discriminate]. injection Hf as <-.
+  apply r_pos in Eden.
+  assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (outer_at w p s z)).
+  { unfold outer_at. split; auto. fold r0. field. lra. }
+  subst z. pose proof (means_condition s r0 _ (depth p) (index p) Hd ltac:(unfold r0; ring) (limits d) m
+    g x eq_refl Lx (margin w) _ _ _ _ _ _ Ha Hmu Hts) as Hc.
+  specialize (Hpos _ Hc). unfold condition in Hpos.
+  pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
+  pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
+  set (W := form (P g s) _ _) in *. set (ob := outer_bound _ _ _ _) in *.
+  set (mu0 := outer_at _ _ _ _) in *.
+  assert (N1 : - mu0 * (W - rho g s) <= ob * (W - rho g s)).
+  { apply Rmult_le_compat_r; [lra|]. pose proof (Rle_abs (- mu0)). rewrite Rabs_Ropp in *. lra. }
+  lra.
 Qed.
 
-Lemma growth_bounded s x u w0 share : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
-  within_off (input d g s x) u -> bottom d <= share <= 1 ->
+Lemma growth_bounded s x u w0 : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
+  within_off (input d g s x) u ->
   let z := deviation g s x in
-  0 < form (P g s) z z - share * rho g s ->
-  growth g s x u w0 + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
-    < bound_at d w g ps s z * (form (P g s) z z - share * rho g s).
+  0 < form (P g s) z z - rho g s ->
+  growth g s x u w0 < outer_bound w ps s z * (form (P g s) z z - rho g s).
 Proof.
-  intros Hs Hx Hw Hu Hsh z Hgap. pose proof segment_facts as SF. destruct SF.
+  intros Hs Hx Hw Hu z Hgap. pose proof segment_facts as SF. destruct SF.
   set (us := wanted g s z).
   assert (Hus : length us = length (limits d)).
   { unfold us, wanted. rewrite zip_length; congruence. }
@@ -606,9 +515,7 @@ Proof.
   assert (Lapp : length (applied (limits d) m us) = length (limits d)).
   { rewrite Happ. rewrite zip_length; congruence. }
   apply In_nth_error in Hm as [im Him].
-  set (target := bound_at d w g ps s z * (form (P g s) z z - share * rho g s)
-    - ((1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s)).
-  enough (Enough : growth g s x u w0 < target) by (unfold target in Enough; lra).
+  set (target := outer_bound w ps s z * (form (P g s) z z - rho g s)).
   assert (At : forall iv delta v, nth_error (cases w (box d) off) iv = Some (delta, v) -> exists p,
     (pushed w = true -> kappa_ok d g p (1 + n + length (limits d)) = true) /\
     growth g s x (moved (map val delta) (applied (limits d) m us)) (map val v)
@@ -629,10 +536,7 @@ Proof.
       (limits d) m delta v g x eq_refl ltac:(congruence)) as Hg0. fold us in Hg0.
     set (top := growth g s x (moved (map val delta) (applied (limits d) m us)) (map val v)
       + (if pushed w then cost (kappa p) (box d) g s z skipped else 0)).
-    enough (E : top + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
-      < bound_at d w g ps s z * (form (P g s) z z - share * rho g s)) by (unfold target; lra).
-    refine (falling_enough s x z m p _ top taus ts fc share Hs Hh eq_refl Hx Hp A1 _ Etau Hts Hns Hheld
-      Ef _ Hsh Hgap).
+    refine (falling_enough s x z m p _ top taus ts fc Hs eq_refl Hx Hp A1 _ Hts Hns Hheld Ef _ Hgap).
     - unfold top. destruct (pushed w).
       + apply means_add; [exact Hg0|]. apply means_fpushed; auto; try congruence.
         { unfold r0. ring. }

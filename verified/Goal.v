@@ -157,14 +157,14 @@ Proof.
 Qed.
 Theorem funnel_proved d w : funnel_ok d (unmoved d) w = true -> forall x, solution d x ->
   forall ta, begin d <= ta <= finish d -> inside d x ta ->
-  (forall t, ta <= t <= finish d -> inside d x t) /\ in_goal d x /\ decays d x ta.
+  (forall t, ta <= t <= finish d -> inside d x t) /\ in_goal d x.
 Proof.
   intros H x Hx ta Hta Hin. unfold funnel_ok in H.
   apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [Hc _].
   apply andb_prop in H2 as [Hne Hg]. apply Nat.ltb_lt in Hne.
-  destruct (stays d w Hc Hne x Hx ta (proj1 Hta) Hin) as [S D].
+  pose proof (stays d w Hc Hne x Hx ta (proj1 Hta) Hin) as S.
   pose proof (check_facts _ _ _ Hc) as C.
-  split; auto. split; auto.
+  split; auto.
   apply (goal_reached d w _ C Hg Hne x (solution_length d w x C Hne Hx)). apply S. lra.
 Qed.
 End Goal.

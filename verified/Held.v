@@ -605,25 +605,25 @@ Proof.
   eapply Rle_lt_trans; [apply clip_lipschitz|exact N].
 Qed.
 Lemma d_plan g i t w0 : In g (segments d) -> (i < m)%nat -> begins g < t < ends g ->
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (u t) w0) ->
-  derivable_pt_lim (wish i) t (turn g (place g t) (at_time x t) (u t) w0 i * / duration g).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) (u t) w0) ->
+  right_derivative (wish i) t (turn g (place g t) (at_time x t) (u t) w0 i * / duration g).
 Proof.
   intros Hg Hi Hr Hd. pose proof (segment_known g Hg) as Hok. destruct (curves_known g i Hg Hi) as [Lf Lr].
-  apply (derivable_pt_lim_locally_ext (fun v => plan g i v (at_time x v)) _ t (begins g) (ends g)); auto.
+  apply (right_near (fun v => plan g i v (at_time x v)) _ t _ (ends g - t)); [lra| |].
   { intros v Hv. unfold wish. now rewrite (now_is g v Hg) by lra. }
-  apply (limit_same (fun v => along (place g v) (nth i (feed g) [])
+  apply (right_same (fun v => along (place g v) (nth i (feed g) [])
     - dot (map (along (place g v)) (row_of g i)) (dev g x v))).
   { intros v. now rewrite plan_value by auto. }
-  eapply limit_equal.
-  { apply (d_minus (fun v => along (place g v) (nth i (feed g) []))).
-    - apply (d_along d g n Hok); auto.
+  eapply right_equal.
+  { apply (r_minus (fun v => along (place g v) (nth i (feed g) []))).
+    - apply from_right, (d_along d g n Hok); auto.
     - apply d_dot; [|apply (d_dev d g n Hok x x_length t Hr (u t) w0 Hd)].
       exists (map (fun c v => along (place g v) c) (row_of g i)). split.
       + intros v. unfold at_time. rewrite map_map. reflexivity.
       + instantiate (1 := map (fun v => v * / duration g)
           (map (fun c => curve' (map val c) (place g t)) (row_of g i))).
         clear - Lr Hok. induction Lr as [|c row Hc Hrow IH]; cbn; constructor; auto.
-        now apply (d_along d g n Hok). }
+        now apply from_right, (d_along d g n Hok). }
   unfold turn. rewrite dot_scaled, dot_scaled_r. fold (dev g x t). unfold dev. ring.
 Qed.
 
@@ -773,12 +773,6 @@ Proof.
 Qed.
 Lemma held_stays t : since <= t <= finish d -> inside d x t.
 Proof. intros Hr. apply (inside_until (finish d)); auto; [lra|]. intros s Hs. now apply good_always. Qed.
-Lemma held_decays : decays d x since.
-Proof.
-  apply (decays_until d offs w H_checked x (fun _ => u)); auto; [lra|].
-  apply followed; [lra|exact good_always].
-Qed.
-
 Lemma bounds_here t : since <= t <= finish d -> held_in_bounds d x u t.
 Proof.
   intros Hr g b Hg Hb. pose proof (segment_known g Hg) as Hok.
@@ -829,11 +823,10 @@ Proof.
 Qed.
 End Solution.
 
-(* What starts inside stays inside, within its bounds, ends in its goal, and decays. *)
+(* What starts inside stays inside, within its bounds, and ends in its goal. *)
 Theorem held_proved since x u : held_solution d period errors since x u ->
   begin d <= since <= finish d -> inside d x since ->
-  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x /\
-  decays d x since.
+  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x.
 Proof.
   intros Hs Hr Hi. destruct held_parts as [_ [Hg [Hne _]]].
   assert (E : exists g0 gs0, segments d = g0 :: gs0).
@@ -843,8 +836,7 @@ Proof.
   { intros t Ht'. now apply (held_stays since x u g0 gs0 E Hs Hr Hi). }
   split.
   - intros t Ht'. split; auto. now apply (bounds_here since x u g0 gs0 E Hs Hr Hi).
-  - split; [|exact (held_decays since x u g0 gs0 E Hs Hr Hi)].
-    apply (goal_reached d w (goal_multiplier w) C Hg); auto.
+  - apply (goal_reached d w (goal_multiplier w) C Hg); auto.
     + exact (x_length since x u g0 gs0 E Hs).
     + apply S. lra.
 Qed.
@@ -854,20 +846,20 @@ End Problem.
 Definition pushing_of (f : field_file) : list bool :=
   map (fun j => forallb (forallb (alone (1 + states f + j))) (spans f))
     (seq 0 (inputs f + length (uncertain f))).
-Definition held_files_ok f p u g e (period : num) (errors : list num) (w : witness)
+Definition held_files_ok f p u g (period : num) (errors : list num) (w : witness)
   (rs : list (list num)) (ts : list (list rate_piece)) : bool :=
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
-    (andb (held_ok (stated f p u g e) period errors w (Rates rs (pushing_of f) ts))
+    (andb (held_ok (stated f p u g) period errors w (Rates rs (pushing_of f) ts))
       (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
        else true)).
 
-Theorem held_theorem f p u g e period errors w rs ts :
-  held_files_ok f p u g e period errors w rs ts = true ->
-  forall since x act, held_solution (stated f p u g e) period errors since x act ->
-  begin (stated f p u g e) <= since <= finish (stated f p u g e) -> inside (stated f p u g e) x since ->
-  (forall t, since <= t <= finish (stated f p u g e) ->
-    inside (stated f p u g e) x t /\ held_in_bounds (stated f p u g e) x act t) /\
-  in_goal (stated f p u g e) x /\ decays (stated f p u g e) x since.
+Theorem held_theorem f p u g period errors w rs ts :
+  held_files_ok f p u g period errors w rs ts = true ->
+  forall since x act, held_solution (stated f p u g) period errors since x act ->
+  begin (stated f p u g) <= since <= finish (stated f p u g) -> inside (stated f p u g) x since ->
+  (forall t, since <= t <= finish (stated f p u g) ->
+    inside (stated f p u g) x t /\ held_in_bounds (stated f p u g) x act t) /\
+  in_goal (stated f p u g) x.
 Proof.
   unfold held_files_ok. intros H since x act Hx Hr Hi. apply andb_prop in H as [_ H].
   apply andb_prop in H as [H _]. now apply (held_proved _ period errors w (Rates rs (pushing_of f) ts)).

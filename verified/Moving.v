@@ -1,4 +1,4 @@
-(* How far a function of time can move that has a derivative but at a few times, if its derivative
+(* How far a function of time can move that has a derivative from the right but at a few times, if its derivative
    is bounded where a limit does not clip it; and functions that are glued together. *)
 From Coq Require Import ZArith Reals List Lra Lia Ranalysis5.
 From Verified Require Import Forms Claim Calculus.
@@ -36,19 +36,23 @@ Qed.
 (* Between two times, with a bounded slope but at the times of a list. *)
 Lemma moves_less (f : R -> R) r ks : forall a b, a < b ->
   (forall t, a <= t <= b -> continuity_pt f t) ->
-  (forall t, a < t < b -> ~ In t ks -> exists l, derivable_pt_lim f t l /\ Rabs l < r) ->
+  (forall t, a < t < b -> ~ In t ks -> exists l, right_derivative f t l /\ Rabs l < r) ->
   Rabs (f b - f a) < r * (b - a).
 Proof.
   induction ks as [|k ks IH]; intros a b Hab C D.
-  - assert (E : forall t, a < t < b -> exists l, derivable_pt_lim f t l).
-    { intros t Ht. destruct (D t Ht) as [l [Hl _]]; auto. now exists l. }
-    destruct (MVT f (fun t => t) a b (fun t Ht => named_slope f t (E t Ht))
-      (fun t _ => exist _ 1 (d_id t)) Hab C (fun t _ => d_continuous _ _ _ (d_id t))) as [e [He V]].
-    unfold derive_pt in V. cbn [proj1_sig] in V. rewrite Rmult_1_r in V.
-    destruct (named_slope f e (E e He)) as [l Hl]. cbn [proj1_sig] in V.
-    destruct (D e He) as [l' [Hl' B]]; [auto|].
-    rewrite (uniqueness_limite _ _ _ _ Hl Hl') in V. rewrite <- V, Rabs_mult.
-    rewrite (Rabs_right (b - a)) by lra. rewrite Rmult_comm. apply Rmult_lt_compat_r; lra.
+  - assert (S : forall t, a < t < b -> exists l, right_derivative f t l /\ - r < l < r).
+    { intros t Ht. destruct (D t Ht) as [l [Hl B]]; [auto|]. exists l. apply Rabs_def2 in B. split; auto; lra. }
+    assert (Up : f b - r * b < f a - r * a).
+    { apply (falls (fun t => f t - r * t)); auto.
+      - intros t Ht. apply continuity_pt_minus; [auto|]. eapply d_continuous, d_line.
+      - intros t Ht. destruct (S t Ht) as [l [Hl B]]. exists (l - r). split; [|lra].
+        apply r_minus; [exact Hl|apply from_right, d_line]. }
+    assert (Down : - f b - r * b < - f a - r * a).
+    { apply (falls (fun t => - f t - r * t)); auto.
+      - intros t Ht. apply continuity_pt_minus; [now apply continuity_pt_opp, C|]. eapply d_continuous, d_line.
+      - intros t Ht. destruct (S t Ht) as [l [Hl B]]. exists (- l - r). split; [|lra].
+        apply r_minus; [now apply r_opp|apply from_right, d_line]. }
+    apply Rabs_def1; lra.
   - destruct (Rlt_dec a k) as [A|A]; [destruct (Rlt_dec k b) as [B|B]|].
     + assert (H1 : Rabs (f k - f a) < r * (k - a)).
       { apply IH; auto; [intros; apply C; lra|]. intros t Ht N. apply D; [lra|].
@@ -62,28 +66,7 @@ Proof.
     + apply IH; auto. intros t Ht N. apply D; auto. intros [->|I]; [lra|auto].
 Qed.
 
-(* The last time at which f is at most y, and the first at which it is at least y. *)
-Lemma last_below f a b y : a <= b -> (forall t, a <= t <= b -> continuity_pt f t) -> f a <= y ->
-  y < f b -> exists c, a <= c < b /\ f c <= y /\ forall t, c < t <= b -> y < f t.
-Proof.
-  intros Hab C Ha Hb. pose (E := fun t => a <= t <= b /\ f t <= y).
-  destruct (completeness E) as [c [Hub Hlub]].
-  { exists b. intros t [Ht _]. lra. }
-  { exists a. split; auto; lra. }
-  assert (Hc : a <= c <= b).
-  { split; [apply Hub; split; auto; lra|]. apply Hlub. intros t [Ht _]. lra. }
-  assert (Gc : f c <= y).
-  { apply Rnot_lt_le. intros Hc0. destruct (C c Hc (f c - y) ltac:(lra)) as [d [Hd N]].
-    assert (c <= c - d); [|lra]. apply Hlub. intros t [Ht Gt].
-    assert (t <= c) by (apply Hub; split; auto). apply Rnot_lt_le. intros Hlt.
-    destruct (Req_dec t c) as [->|Hne]; [lra|].
-    assert (X : R_dist (f t) (f c) < f c - y).
-    { apply N. split. { split; [exact I|auto]. } cbn. unfold R_dist. rewrite Rabs_left; lra. }
-    unfold R_dist in X. rewrite Rabs_left in X; lra. }
-  exists c. split; [|split]; auto.
-  - split; [lra|]. destruct (Req_dec c b) as [->|]; lra.
-  - intros t Ht. apply Rnot_le_lt. intros G. assert (t <= c); [|lra]. apply Hub. split; auto. lra.
-Qed.
+(* The first time at which f is at least y. *)
 Lemma turned_continuous f t : continuity_pt f (- t) -> continuity_pt (fun u => - f (- u)) t.
 Proof.
   intros H k Hk. destruct (H k Hk) as [d [Hd N]]. exists d. split; auto. intros u [[_ Hu] Hdist].
@@ -116,7 +99,7 @@ Qed.
 Lemma clip_up l f ks r : apart l -> forall a b, a < b ->
   (forall t, a <= t <= b -> continuity_pt f t) ->
   (forall t, a < t < b -> ~ In t ks ->
-    exists s, derivable_pt_lim f t s /\ (free l (f t) -> Rabs s < r)) ->
+    exists s, right_derivative f t s /\ (free l (f t) -> Rabs s < r)) ->
   0 < r -> clip l (f b) - clip l (f a) < r * (b - a).
 Proof.
   intros Hl a b Hab C D Hr. set (p := clip l (f a)). set (q := clip l (f b)).
@@ -164,7 +147,7 @@ Qed.
 Lemma clip_moves l f ks r : apart l -> forall a b, a < b ->
   (forall t, a <= t <= b -> continuity_pt f t) ->
   (forall t, a < t < b -> ~ In t ks ->
-    exists s, derivable_pt_lim f t s /\ (free l (f t) -> Rabs s < r)) ->
+    exists s, right_derivative f t s /\ (free l (f t) -> Rabs s < r)) ->
   0 < r -> Rabs (clip l (f b) - clip l (f a)) < r * (b - a).
 Proof.
   intros Hl a b Hab C D Hr. pose proof (clip_up l f ks r Hl a b Hab C D Hr) as U.
@@ -173,7 +156,7 @@ Proof.
     - destruct l as [[p q]|]; cbn in *; auto. rewrite !val_flip. lra.
     - intros t Ht. apply continuity_pt_opp. now apply C.
     - intros t Ht N. destruct (D t Ht N) as [s [Hs B]]. exists (- s). split.
-      + now apply derivable_pt_lim_opp.
+      + now apply r_opp.
       + rewrite Rabs_Ropp. intros Fr. apply B. destruct l as [[p q]|]; cbn in *; auto.
         rewrite !val_flip in Fr. lra. }
   rewrite !clip_flipped in V by auto. unfold Rabs. destruct (Rcase_abs _); lra.

@@ -42,42 +42,10 @@ Proof.
   apply (c_mult (fun u => bval (S u) a)); [now apply c_bval|now apply c_mval].
 Qed.
 
-(* A share of rho that falls from the bottom and c more, at t1, to the bottom; 1 without a decay. *)
-Definition share (d : problem) (c t1 t : R) : R := bottom d + c * exp (- pace d * (t - t1)).
-Lemma share_between d w c t1 t : falls d w = true -> 0 <= c <= 1 - bottom d -> t1 <= t ->
-  bottom d <= share d c t1 t <= 1.
-Proof.
-  intros F Hc Ht. destruct (fall_facts d w F) as [Hp _]. unfold share.
-  pose proof (exp_pos (- pace d * (t - t1))) as E0.
-  assert (E1 : exp (- pace d * (t - t1)) <= 1).
-  { rewrite <- exp_0. destruct (Req_dec (- pace d * (t - t1)) 0) as [->|N]; [right; reflexivity|].
-    left. apply exp_increasing. pose proof (Rmult_le_pos _ (t - t1) Hp ltac:(lra)). lra. }
-  split; [nra|]. pose proof (Rmult_le_compat_l c _ _ (proj1 Hc) E1). lra.
-Qed.
-Lemma share_first d c t1 : share d c t1 t1 = bottom d + c.
-Proof. unfold share. rewrite Rminus_diag_eq, Rmult_0_r, exp_0 by auto. ring. Qed.
-Lemma d_share d c t1 t :
-  derivable_pt_lim (share d c t1) t (- pace d * (share d c t1 t - bottom d)).
-Proof.
-  unfold share. eapply limit_equal.
-  { apply (d_plus (fun _ => bottom d)); [apply d_const|].
-    apply (d_mult (fun _ => c)); [apply d_const|].
-    apply (derivable_pt_lim_comp (fun u => - pace d * (u - t1)) exp).
-    - apply (d_mult (fun _ => - pace d)); [apply d_const|].
-      apply (d_minus id (fun _ => t1)); [apply derivable_pt_lim_id|apply d_const].
-    - apply derivable_pt_lim_exp. }
-  cbn beta. ring.
-Qed.
-(* W <= c rho *)
-Definition under (c : R -> R) (g : segment) (x : list (R -> R)) (t : R) : Prop :=
-  let s := place g t in
-  let z := deviation g s (at_time x t) in
-  form (P g s) z z <= c t * rho g s.
-
 Section Segment.
 Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
-Hypothesis Hfalls : falls d w = true.
+Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
 Hypothesis Hoff : off_ok n d g off = true.
 Hypothesis Hcov : covered d w off ps = true.
@@ -90,7 +58,7 @@ Hypothesis Hx : length x = n.
 Hypothesis Cx : forall t, begins g <= t <= ends g -> lo <= t <= hi ->
   Forall (fun f => continuity_pt f t) x.
 Definition moves (t : R) : Prop := exists w, in_box w (box d) /\
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (act t) w).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) (act t) w).
 Hypothesis Dx : forall t, begins g < t < ends g -> lo < t < hi ->
   within_off off (input d g (place g t) (at_time x t)) (act t) /\ moves t.
 
@@ -151,7 +119,7 @@ Proof.
 Qed.
 
 Lemma d_dev t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) ut w0) ->
   slopes dev t (map (fun v => v * / duration g) (relative g (place g t) (at_time x t) ut w0)).
 Proof.
   intros Ht ut w0 Hd. unfold relative. rewrite line_place.
@@ -165,8 +133,8 @@ Proof.
         (curve' (map val c) (place g t) * / duration g)) by (intros; apply d_along; lia).
     clear - Hd Hcv D DA. revert Hcv. generalize (nominal g).
     induction Hd as [|f v fs vs Hf Hfs IH]; intros [|c cs] Hc; cbn; constructor; inversion Hc; subst.
-    + eapply limit_equal.
-      { apply (d_minus f (fun u => along (place g u) c)); [exact Hf|]. now apply DA. }
+    + eapply right_equal.
+      { apply (r_minus f (fun u => along (place g u) c)); [exact Hf|]. now apply from_right, DA. }
       field. lra.
     + now apply IH.
 Qed.
@@ -177,9 +145,9 @@ Proof.
     clear. induction l as [|row l IH]; intros [|row' l']; cbn; auto. f_equal; auto.
     revert row'. induction row as [|a row IHr]; intros [|b row']; cbn; auto. f_equal. apply IHr.
   - unfold P'. generalize (shape (start g)) (shape (stop g)).
-    assert (D : forall a b, derivable_pt_lim (fun u => line (place g u) a b) t
+    assert (D : forall a b, right_derivative (fun u => line (place g u) a b) t
       ((val b - val a) * / duration g)).
-    { intros a b. unfold line. eapply limit_equal.
+    { intros a b. apply from_right. unfold line. eapply limit_equal.
       { apply (d_plus (fun u => (1 - place g u) * val a) (fun u => place g u * val b)).
         - apply (d_mult (fun u => 1 - place g u) (fun _ => val a)); [|apply d_const].
           apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
@@ -196,15 +164,15 @@ Proof.
   rewrite IH, !dot_scaled. ring.
 Qed.
 Lemma d_gap t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
-  derivable_pt_lim gap t (growth g (place g t) (at_time x t) ut w0 * / duration g).
+  Forall2 (fun f v => right_derivative f t v) x (field g t (at_time x t) ut w0) ->
+  right_derivative gap t (growth g (place g t) (at_time x t) ut w0 * / duration g).
 Proof.
   intros Ht ut w0 Hd. pose proof (d_dev t Ht ut w0 Hd) as Hdev.
   pose proof (d_form _ _ _ _ _ _ _ (d_P t) Hdev Hdev) as D.
-  eapply limit_equal.
-  { unfold gap. apply (d_minus (fun u => form (P g (place g u)) (dev u) (dev u))
+  eapply right_equal.
+  { unfold gap. apply (r_minus (fun u => form (P g (place g u)) (dev u) (dev u))
       (fun u => rho g (place g u))); [exact D|].
-    unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
+    apply from_right. unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
       (fun u => place g u * val (level (stop g)))).
     - apply (d_mult (fun u => 1 - place g u) (fun _ => val (level (start g)))); [|apply d_const].
       apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
@@ -237,80 +205,47 @@ Proof.
   apply c_pval; [apply place_continuous|now apply dev_continuous].
 Qed.
 Lemma bound_continuous t : begins g <= t <= ends g -> lo <= t <= hi ->
-  continuity_pt (fun u => bound_at d w g ps (place g u) (dev u) * / duration g) t.
+  continuity_pt (fun u => outer_bound w ps (place g u) (dev u) * / duration g) t.
 Proof.
-  intros Ht Hr. apply (c_mult (fun u => bound_at d w g ps (place g u) (dev u))); [|apply c_const].
-  unfold bound_at. apply (c_mult (fun u => Rabs (rho' g) + outer_bound d w ps (place g u) (dev u)));
-    [|apply c_const].
-  apply (c_plus (fun _ => Rabs (rho' g))); [apply c_const|].
+  intros Ht Hr. apply (c_mult (fun u => outer_bound w ps (place g u) (dev u))); [|apply c_const].
   clear Hcov Hps. induction ps as [|p l IH]; cbn [outer_bound]; [apply c_const|].
-  assert (C : continuity_pt (fun u => outer_at d w p (place g u) (dev u)) t).
+  assert (C : continuity_pt (fun u => outer_at w p (place g u) (dev u)) t).
   { unfold outer_at. apply (c_mult (fun u => pval (place g u * IZR (2 ^ depth p) - IZR (index p))
-      (env (dev u)) (Polynomials.num (outer d w p)))); [|apply c_const].
+      (env (dev u)) (Polynomials.num (fmu (multiplier w) (mu p))))); [|apply c_const].
     apply (c_pval (fun u => place g u * IZR (2 ^ depth p) - IZR (index p)) (fun u => env (dev u)));
       [|now apply dev_continuous].
     apply (c_minus (fun u => place g u * IZR (2 ^ depth p)) (fun _ => IZR (index p)));
       [|apply c_const].
     apply (c_mult (place g)); [apply place_continuous|apply c_const]. }
-  apply (c_plus (fun u => 1 + outer_at d w p (place g u) (dev u)
-    * outer_at d w p (place g u) (dev u))); auto.
+  apply (c_plus (fun u => 1 + outer_at w p (place g u) (dev u)
+    * outer_at w p (place g u) (dev u))); auto.
   apply (c_plus (fun _ => 1)); [apply c_const|].
-  now apply (c_mult (fun u => outer_at d w p (place g u) (dev u))).
+  now apply (c_mult (fun u => outer_at w p (place g u) (dev u))).
 Qed.
 
-(* the excess over a share of rho that falls *)
-Lemma d_excess c t1 t : begins g < t < ends g -> forall ut w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
-  derivable_pt_lim (fun u => gap u + (1 - share d c t1 u) * rho g (place g u)) t
-    ((growth g (place g t) (at_time x t) ut w0 + (1 - share d c t1 t) * rho' g
-      + duration g * pace d * (share d c t1 t - bottom d) * rho g (place g t)) * / duration g).
+Lemma segment_stays ta t : begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
+  inside_segment g x ta -> inside_segment g x t.
 Proof.
-  intros Ht ut w0 Hd. pose proof duration_pos as D. eapply limit_equal.
-  { apply (d_plus gap); [exact (d_gap t Ht ut w0 Hd)|].
-    apply (d_mult (fun u => 1 - share d c t1 u) (fun u => rho g (place g u))).
-    - apply (d_minus (fun _ => 1)); [apply d_const|apply d_share].
-    - unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
-        (fun u => place g u * val (level (stop g)))).
-      + apply (d_mult (fun u => 1 - place g u) (fun _ => val (level (start g)))); [|apply d_const].
-        apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
-      + apply (d_mult (place g) (fun _ => val (level (stop g)))); [apply d_place|apply d_const]. }
-  cbn beta. unfold rho, line, rho'. field. lra.
-Qed.
-Lemma segment_stays c t1 ta t : 0 <= c <= 1 - bottom d -> t1 <= ta ->
-  begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
-  under (share d c t1) g x ta -> under (share d c t1) g x t.
-Proof.
-  intros Hc H1 Ha Hlo Ht Hhi H.
-  set (excess := fun u => gap u + (1 - share d c t1 u) * rho g (place g u)).
-  assert (E : forall u, excess u = form (P g (place g u)) (dev u) (dev u)
-    - share d c t1 u * rho g (place g u)) by (intros u; unfold excess, gap; ring).
-  assert (G : excess t <= 0); [|rewrite E in G; unfold under; fold (dev t); lra].
-  apply (barrier excess (fun u => bound_at d w g ps (place g u) (dev u) * / duration g)
-    ta t); auto; try lra.
-  - intros v Hv. apply (c_plus gap); [apply gap_continuous; lra|].
-    apply (c_mult (fun u => 1 - share d c t1 u) (fun u => rho g (place g u))).
-    + apply (c_minus (fun _ => 1)); [apply c_const|]. eapply d_continuous, d_share.
-    + unfold rho, line. apply (c_plus (fun u => (1 - place g u) * val (level (start g)))
-        (fun u => place g u * val (level (stop g)))).
-      * apply (c_mult (fun u => 1 - place g u)); [|apply c_const].
-        apply (c_minus (fun _ => 1)); [apply c_const|apply place_continuous].
-      * apply (c_mult (place g)); [apply place_continuous|apply c_const].
+  intros Ha Hlo Ht Hhi H.
+  assert (G : gap t <= 0); [|unfold gap in G; unfold inside_segment; fold (dev t); lra].
+  apply (barrier gap (fun u => outer_bound w ps (place g u) (dev u) * / duration g) ta t);
+    auto; try lra.
+  - intros v Hv. apply gap_continuous; lra.
   - intros v Hv. apply bound_continuous; lra.
   - intros v Hv. destruct (Dx v ltac:(lra) ltac:(lra)) as [Hu [w0 [Hw Hd]]].
-    eexists. split; [apply (d_excess c t1 v ltac:(lra) (act v) w0 Hd)|]. rewrite E. intros Hpos.
-    pose proof (growth_bounded d w g off ps n Hlimits Hfalls Hok Hoff Hcov Hps (place g v)
-      (at_time x v) (act v) w0 (share d c t1 v) (place_in v ltac:(lra)) (at_time_length v) Hw Hu
-      (share_between d w c t1 v Hfalls Hc ltac:(lra)) Hpos) as B.
+    eexists. split; [apply (d_gap v ltac:(lra) (act v) w0 Hd)|]. intros Hpos. unfold gap in Hpos.
+    pose proof (growth_bounded d w g off ps n Hlimits Hmargin Hok Hoff Hcov Hps (place g v)
+      (at_time x v) (act v) w0 (place_in v ltac:(lra)) (at_time_length v) Hw Hu Hpos) as B.
     pose proof (Rinv_0_lt_compat _ duration_pos) as D.
-    apply (Rmult_lt_compat_r _ _ _ D) in B. fold (dev v) in B. nra.
-  - rewrite E. unfold under in H. fold (dev ta) in H. lra.
+    apply (Rmult_lt_compat_r _ _ _ D) in B. fold (dev v) in B. unfold gap. nra.
+  - unfold inside_segment in H. fold (dev ta) in H. unfold gap. lra.
 Qed.
 End Segment.
 
 (* Segments joined. *)
-Definition member_stays (c : R -> R) (x : list (R -> R)) (lo hi : R) (g : segment) : Prop :=
+Definition member_stays (x : list (R -> R)) (lo hi : R) (g : segment) : Prop :=
   forall ta t, begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
-  under c g x ta -> under c g x t.
+  inside_segment g x ta -> inside_segment g x t.
 Lemma place_start g : place g (begins g) = 0.
 Proof. unfold place. unfold Rdiv. ring. Qed.
 Lemma place_end g : begins g < ends g -> place g (ends g) = 1.
@@ -386,37 +321,12 @@ Proof.
   rewrite Dev. unfold P, rho. rewrite line_0, line_1.
   rewrite (zip_line n 1 line_1 _ _ S0 S), (zip_line_left n 0 line_0 _ _ S' S''), Hk. auto.
 Qed.
-Lemma V_same n d x t gs : linked gs = true -> Forall (fun g => segment_ok n d g = true) gs ->
-  forall g h, In g gs -> In h gs -> begins g <= t <= ends g -> begins h <= t <= ends h ->
-  V g x t = V h x t.
-Proof.
-  induction gs as [|g0 gs IH]; intros Hl Hok; [intros g h []|].
-  assert (Times : Forall (fun g => begins g < ends g) (g0 :: gs)).
-  { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
-  assert (First : forall h, In h gs -> begins g0 <= t <= ends g0 -> begins h <= t <= ends h ->
-    V g0 x t = V h x t).
-  { intros h Hh R0 Rh. pose proof (after g0 gs Hl Times h Hh) as A.
-    destruct gs as [|g1 gs]; [destruct Hh|].
-    pose proof (after g1 gs (linked_tail _ _ Hl)) as A1.
-    inversion Hok as [|? ? K0 Hok1]; subst. inversion Hok1 as [|? ? K1 _]; subst.
-    inversion Times as [|? ? _ T1]; subst. specialize (A1 T1). inversion T1; subst.
-    pose proof (after g0 (g1 :: gs) Hl Times g1 (or_introl eq_refl)) as A2.
-    destruct Hh as [<-|Hh]; [|specialize (A1 h Hh); lra].
-    assert (t = ends g0) as -> by lra. unfold V.
-    assert (L : linked [g0; g1] = true).
-    { cbn [linked] in *. apply andb_prop in Hl as [Hl _]. now rewrite Hl. }
-    destruct (linked_same n d g0 g1 x K0 K1 L) as [E1 E2]. now rewrite E1, E2. }
-  intros g h [<-|Hg] [<-|Hh] Rg Rh; auto.
-  - symmetry. now apply First.
-  - apply IH; auto. + now apply (linked_tail g0). + now inversion Hok.
-Qed.
-
-Lemma chain n d c x lo hi gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
-  Forall (member_stays c x lo hi) gs ->
+Lemma chain n d x lo hi gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
+  Forall (member_stays x lo hi) gs ->
   forall g0, In g0 gs ->
   forall ta t, (match gs with g :: _ => begins g | [] => ta end) <= ta <= t -> lo <= ta -> t <= hi ->
-  (forall g, In g gs -> begins g <= ta <= ends g -> under c g x ta) ->
-  begins g0 <= t <= ends g0 -> under c g0 x t.
+  (forall g, In g gs -> begins g <= ta <= ends g -> inside_segment g x ta) ->
+  begins g0 <= t <= ends g0 -> inside_segment g0 x t.
 Proof.
   induction gs as [|g gs IH]; intros Hok Hl Hs g0 H0 ta t Ht Hlo Hhi Hin Hg0; [destruct H0|].
   inversion Hok as [|? ? Hok1 Hok2]; subst. inversion Hs as [|? ? Hs1 Hs2]; subst.
@@ -440,9 +350,9 @@ Proof.
   - apply (IH Hok2 Hl2 Hs2 g0 H0 ta t); auto; try lra. intros h Hh. apply Hin. now right.
   - apply (IH Hok2 Hl2 Hs2 g0 H0 (begins g') t); auto; try lra.
     intros h Hh Hr. destruct Hh as [<-|Hh]; [|specialize (Order h Hh); lra].
-    rewrite <- E. assert (U : under c g x (ends g)).
+    rewrite <- E. assert (U : inside_segment g x (ends g)).
     { apply (Hs1 ta (ends g)); try lra. apply Hin; [now left|]. lra. }
-    unfold under in *. destruct (linked_same n d g g' x Hok1 Hok3 L) as [E1 E2].
+    unfold inside_segment in *. destruct (linked_same n d g g' x Hok1 Hok3 L) as [E1 E2].
     cbn zeta in E1. now rewrite <- E1, <- E2.
 Qed.
 
@@ -498,7 +408,7 @@ Qed.
 
 (* What the other theorems read of a funnel that was decided. *)
 Record checked (d : problem) (w : witness) : Prop := {
-  c_falls : falls d w = true;
+  c_margin : 0 < val (margin w);
   c_limits : Forall proper (limits d);
   c_linked : linked (segments d) = true;
   c_segments : Forall (fun g => segment_ok (first_size d) d g = true) (segments d);
@@ -515,6 +425,7 @@ Proof.
   assert (Times : Forall (fun g => begins g < ends g) (segments d)).
   { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
   constructor; auto.
+  { apply num_ltb_lt in Hm. now rewrite val_zero in Hm. }
   intros g Hg. destruct (last_end (segments d) g Hg Hl Times) as [A B]. split; auto.
   unfold begin. destruct (segments d); [destruct Hg|]. exact A.
 Qed.
@@ -527,78 +438,26 @@ Definition follows (d : problem) (offs : list (list num)) (x : list (R -> R))
   forall g off t, In (g, off) (combine (segments d) offs) -> begins g < t < ends g -> lo < t < hi ->
     within_off off (input d g (place g t) (at_time x t)) (u g t) /\ moves d g x (u g) t.
 
-Lemma under_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
-  follows d offs x u lo hi -> forall c ta t, 0 <= c <= 1 - bottom d -> lo <= ta -> ta <= t <= hi ->
-  (forall g, In g (segments d) -> begins g <= ta <= ends g -> under (share d c ta) g x ta) ->
-  forall g, In g (segments d) -> begins g <= t <= ends g -> under (share d c ta) g x t.
+Theorem stays_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
+  follows d offs x u lo hi -> forall ta t, lo <= ta -> ta <= t <= hi -> inside d x ta -> inside d x t.
 Proof.
-  intros H x u lo hi Hb [Lx [Cx Dx]] c ta t Hc Ha Ht Hin.
+  intros H x u lo hi Hb [Lx [Cx Dx]] ta t Ha Ht Hin.
   destruct (checked_segments d offs w H) as [Hok [Lo Each]].
   destruct (check_facts d offs w H) as [Hm Hlim Hl _ Times Range]. set (n := first_size d) in *.
-  intros g Hg Hgt. apply (chain n d (share d c ta) x ta hi (segments d) Hok Hl) with (ta := ta);
+  intros g Hg Hgt. apply (chain n d x ta hi (segments d) Hok Hl) with (ta := ta);
     auto; try lra.
   2:{ unfold begin in Hb. destruct (segments d); lra. }
   apply Forall_forall. intros h Hh.
   assert (G : exists off, In (h, off) (combine (segments d) offs)).
   { clear - Hh Lo. revert Hh Lo. generalize offs. induction (segments d) as [|g1 gs IH];
       intros [|o os] Hg L; cbn in *; try tauto; try discriminate. destruct Hg as [->|Hg]; [eauto|].
-    destruct (IH os Hg) as [q Hq]; eauto. }
+      destruct (IH os Hg) as [q Hq]; eauto. }
   destruct G as [off G]. destruct (Each h off G) as [ps [O [B C]]].
   assert (A : segment_ok n d h = true) by (rewrite Forall_forall in Hok; auto).
   intros ta' t' Ha' Hlo Ht' Hhi Hin'.
   apply (segment_stays d w h off ps n Hlim Hm A O B C x (u h) ta hi Lx) with (ta := ta'); auto.
   - intros v _ Hv. apply Cx. lra.
   - intros v Hv Hv'. apply Dx; auto. lra.
-Qed.
-Theorem stays_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
-  follows d offs x u lo hi -> forall ta t, lo <= ta -> ta <= t <= hi -> inside d x ta -> inside d x t.
-Proof.
-  intros H x u lo hi Hb F ta t Ha Ht Hin g Hg Hgt.
-  destruct (check_facts d offs w H) as [Hm _ _ Hok _ _]. destruct (fall_facts d w Hm) as [_ [Hbot _]].
-  pose proof (under_until d offs w H x u lo hi Hb F (1 - bottom d) ta t ltac:(lra) Ha Ht) as U.
-  assert (U' : under (share d (1 - bottom d) ta) g x t).
-  { apply U; auto. intros h Hh Hr. specialize (Hin h Hh Hr). unfold under, inside_segment in *.
-    rewrite share_first. lra. }
-  unfold under in U'. unfold inside_segment. eapply Rle_trans; [exact U'|].
-  rewrite Forall_forall in Hok. specialize (Hok g Hg).
-  pose proof (rho_pos d g _ Hok (place g t) (place_in d g _ Hok t Hgt)) as Hrho.
-  destruct (share_between d w (1 - bottom d) ta t Hm ltac:(lra) ltac:(lra)) as [_ S].
-  pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hrho) S). lra.
-Qed.
-Theorem decays_until d offs w : check d offs w = true -> forall x u lo, begin d <= lo ->
-  follows d offs x u lo (finish d) -> inside d x lo -> decays d x lo.
-Proof.
-  intros H x u lo Hb F Hin. unfold decays. destruct (decay d) as [[l f]|] eqn:Ed; auto.
-  intros g h t1 t2 Hg Hh Hg1 Hh2 Ht.
-  destruct (check_facts d offs w H) as [Hm _ Hl Hok Times Range].
-  destruct (Range h Hh) as [_ Rh].
-  assert (In1 : forall k, In k (segments d) -> begins k <= t1 <= ends k -> inside_segment k x t1).
-  { intros k Hk Hr. apply (stays_until d offs w H x u lo (finish d) Hb F lo t1); auto; lra. }
-  assert (Rho : forall k t, In k (segments d) -> begins k <= t <= ends k -> 0 < rho k (place k t)).
-  { intros k t Hk Hr. rewrite Forall_forall in Hok. specialize (Hok k Hk).
-    exact (rho_pos d k _ Hok (place k t) (place_in d k _ Hok t Hr)). }
-  assert (Eb : bottom d = val f) by (unfold bottom; now rewrite Ed).
-  assert (Ep : pace d = val l) by (unfold pace; now rewrite Ed).
-  destruct (fall_facts d w Hm) as [_ [Hbot _]].
-  set (c := Rmax 0 (V g x t1 - val f)).
-  assert (Same : forall k, In k (segments d) -> begins k <= t1 <= ends k -> V k x t1 <= val f + c).
-  { intros k Hk Hr. enough (E : V k x t1 = V g x t1).
-    { rewrite E. unfold c. pose proof (Rmax_r 0 (V g x t1 - val f)). lra. }
-    exact (V_same _ d x t1 (segments d) Hl Hok k g Hk Hg Hr Hg1). }
-  assert (Hc : 0 <= c <= 1 - bottom d).
-  { unfold c. split; [apply Rmax_l|]. apply Rmax_lub; [lra|]. rewrite Eb.
-    specialize (In1 g Hg Hg1). unfold inside_segment in In1. pose proof (Rho g t1 Hg Hg1) as R0.
-    enough (V g x t1 <= 1) by lra. unfold V. apply (Rmult_le_reg_r (rho g (place g t1))); auto.
-    unfold Rdiv. rewrite Rmult_assoc, Rinv_l by lra. lra. }
-  pose proof (under_until d offs w H x u lo (finish d) Hb F c t1 t2 Hc ltac:(lra) ltac:(lra)) as U.
-  assert (U' : under (share d c t1) h x t2).
-  { apply U; auto. intros k Hk Hr. unfold under. rewrite share_first, Eb.
-    pose proof (Rho k t1 Hk Hr) as R0. specialize (Same k Hk Hr). unfold V in Same.
-    apply (Rmult_le_compat_r _ _ _ (Rlt_le _ _ R0)) in Same.
-    unfold Rdiv in Same. rewrite Rmult_assoc, Rinv_l in Same by lra. lra. }
-  unfold under, share in U'. rewrite Eb, Ep in U'. pose proof (Rho h t2 Hh Hh2) as R0.
-  unfold V at 1. apply (Rmult_le_reg_r (rho h (place h t2))); auto.
-  unfold Rdiv. rewrite Rmult_assoc, Rinv_l by lra. fold c. lra.
 Qed.
 
 Lemma solution_length d w x : checked d w -> (0 < length (segments d))%nat -> solution d x ->
@@ -613,15 +472,13 @@ Proof.
 Qed.
 Theorem stays d w : check d (unmoved d) w = true -> (0 < length (segments d))%nat ->
   forall x, solution d x -> forall ta, begin d <= ta -> inside d x ta ->
-  (forall t, ta <= t <= finish d -> inside d x t) /\ decays d x ta.
+  forall t, ta <= t <= finish d -> inside d x t.
 Proof.
-  intros H Hne x Hx ta Ha Hin. pose proof (check_facts _ _ _ H) as C.
+  intros H Hne x Hx ta Ha Hin t Ht. pose proof (check_facts _ _ _ H) as C.
   pose proof (solution_length d w x C Hne Hx) as Lx. destruct Hx as [Cx Dx].
   set (u := fun g v => input d g (place g v) (at_time x v)).
-  assert (F : follows d (unmoved d) x u ta (finish d)).
-  2:{ split; [intros t Ht; apply (stays_until d _ w H x u ta (finish d) Ha F ta t); auto; lra|].
-      exact (decays_until d _ w H x u ta Ha F Hin). }
-  split; [|split]; auto; [intros t Ht; apply Cx; lra|]. intros g off v Hg Hv _.
+  apply (stays_until d _ w H x u ta (finish d) Ha) with (ta := ta); auto; [|lra].
+  split; [|split]; auto; [intros v Hv; apply Cx; lra|]. intros g off v Hg Hv _.
   assert (Eo : off = []).
   { apply in_combine_r in Hg. unfold unmoved in Hg. apply in_map_iff in Hg as [? [<- _]]. reflexivity. }
   subst off. split; [reflexivity|]. apply in_combine_l in Hg. exact (Dx g v Hg Hv).

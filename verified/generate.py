@@ -5,9 +5,10 @@
     python generate.py FILE.proof.json --ask CHECKER   what the extracted checker says of these
                                                        numbers: status 0, 1; 3 is not covered
 
-Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them, and printed.py
-prints those back into the files before anything is said. What the second kernel does not cover is
-told by name (NotCovered, status 3); what the pages do not allow is refused (strict.py, status 1).
+Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them. printed.py
+prints those back into the files before anything is said, and theorems.py holds every line to its
+template. What the second kernel does not cover is told by name (NotCovered, status 3); what the
+pages do not allow is refused (strict.py, status 1).
 Standard library only.
 """
 
@@ -19,96 +20,33 @@ from pathlib import Path
 from typing import Any
 
 import printed
+import theorems
 from problems import Composition, Funnel, Increments, NotCovered, Problem, Sampled, read
 from strict import Refused
 from terms import Coq, Writer
 
-THEOREM = """\
-Definition data := stated field policy funnel goal decay.
-Theorem accepted : files_ok field policy funnel goal decay proof = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem funnel_stays : forall x, solution data x ->
-  forall ta, (begin data <= ta <= finish data)%R -> inside data x ta ->
-  (forall t, (ta <= t <= finish data)%R -> inside data x t /\\ in_bounds data x t) /\\
-  in_goal data x /\\ decays data x ta.
-Proof. exact (funnel_theorem field policy funnel goal decay proof accepted). Qed.
-Print Assumptions funnel_stays.
-"""
-HELD = """\
-Definition data := stated field policy funnel goal decay.
-Theorem accepted :
-  held_files_ok field policy funnel goal decay period errors proof rates turns = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem held_stays : forall since x u, held_solution data period errors since x u ->
-  (begin data <= since <= finish data)%R -> inside data x since ->
-  (forall t, (since <= t <= finish data)%R -> inside data x t /\\ held_in_bounds data x u t) /\\
-  in_goal data x /\\ decays data x since.
-Proof.
-  exact (held_theorem field policy funnel goal decay period errors proof rates turns accepted).
-Qed.
-Print Assumptions held_stays.
-"""
-NEAR = """\
-Theorem accepted : tubes_ok data tubes proofs = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem near : Forall (stays_near data) tubes.
-Proof. exact (tubes_proved data tubes proofs accepted). Qed.
-Print Assumptions near.
-"""
-PLANNED = """\
-Theorem planned : forallb (plan_ok a b b0 feedback) tubes = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem near_plan : Forall (stays_near_plan a b b0 c feedback) tubes.
-Proof. exact (plans_proved a b b0 c feedback tubes planned). Qed.
-Print Assumptions near_plan.
-"""
-COMPOSED = """\
-Theorem accepted : composed_ok stages proofs multipliers = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem follow : composed (map stated_by stages).
-Proof. exact (composed_theorem stages proofs multipliers accepted). Qed.
-Print Assumptions follow.
-"""
-SAMPLED = """\
-Theorem accepted : sampled_ok model policy funnel proof = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem stays : stays_in_tube model policy funnel /\\ arrives_from_inlet model policy funnel.
-Proof. exact (sampled_theorem model policy funnel proof accepted). Qed.
-Print Assumptions stays.
-"""
-STABLE = """\
-Theorem accepted : stability_ok data storage rate proof = true.
-Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem stable : forgets data storage rate.
-Proof. exact (stability_proved data storage rate proof accepted). Qed.
-Print Assumptions stable.
-"""
-
 
 def coq(problem: Problem) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
+    to = Coq()
+    writer = Writer(to)
+
     if isinstance(problem, Funnel):
-        modules = "Turning Held " if problem.held else ""
-        to = Coq(f"Integers Forms Polynomials Positive Claim Funnel Goal Files {modules}Data")
-        writer = Writer(to)
         writer.problem(problem)
         to.named("proof", writer.witness(problem))
         if problem.held:
             writer.held(problem)
-            return "\n".join(to.lines) + "\n" + HELD
-        return "\n".join(to.lines) + "\n" + THEOREM
+        return theorems.text("held" if problem.held else "funnel", to.lines)
+
     if isinstance(problem, Composition):
-        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Composed Data")
-        Writer(to).composition(problem)
-        return "\n".join(to.lines) + "\n" + COMPOSED
+        writer.composition(problem)
+        return theorems.text("composed", to.lines)
+
     if isinstance(problem, Sampled):
-        to = Coq("Integers Forms Polynomials Positive Claim Tubes Samples Steps Stepwise Data")
-        writer = Writer(to)
         writer.sampled(problem)
         to.named("proof", writer.links(problem.proof))
-        return "\n".join(to.lines) + "\n" + SAMPLED
-    to = Coq("Integers Forms Claim Data Tubes Boxes Near Driven")
-    writer = Writer(to)
+        return theorems.text("sampled", to.lines)
+
     to.named("data", writer.model(problem.model))
     if problem.boxed:
         raise Refused("a box of a model that needs none")
@@ -116,15 +54,17 @@ def coq(problem: Problem) -> str:
         to.named("storage : matrix", writer.symmetric(problem.P, "P"))
         to.named("rate : num", writer.num(problem.rate))
         to.named("proof", writer.tree(problem.trees[0], 1))
-        return "\n".join(to.lines) + "\n" + STABLE
+        return theorems.text("stability", to.lines)
+
     to.named("tubes", to.listed(map(writer.tube, problem.tubes)))
     to.named("proofs", to.listed(trees(writer, problem)))
     if problem.policy is None:
-        return "\n".join(to.lines) + "\n" + NEAR
+        return theorems.text("tube", to.lines)
+
     names = ("a : list num", "b : list num", "b0 : num", "c : num", "feedback : list num")
     for name, term in zip(names, writer.plan(problem), strict=True):
         to.named(name, term)
-    return "\n".join(to.lines) + "\n" + NEAR + PLANNED
+    return theorems.text("plan", to.lines)
 
 
 def trees(writer: Writer, problem: Increments) -> list[str]:
@@ -135,8 +75,8 @@ def trees(writer: Writer, problem: Increments) -> list[str]:
 
 
 ASKED = {
-    "held": "field policy funnel goal decay period errors proof rates turns",
-    "funnel": "field policy funnel goal decay proof",
+    "held": "field policy funnel goal period errors proof rates turns",
+    "funnel": "field policy funnel goal proof",
     "plan": "data tubes proofs a b b0 feedback",
     "tube": "data tubes proofs",
     "stability": "data storage rate proof",

@@ -80,8 +80,7 @@ let rec tree () = match count () with
 
 let stage () =
   let dynamics = field () in let control = policy () in let tunnel = funnel () in
-  let aim = maybe (pair nums matrix) () in
-  { dynamics; control; tunnel; aim; descent = maybe ends () }
+  { dynamics; control; tunnel; aim = maybe (pair nums matrix) () }
 let map () =
   let powers0 = listed (fun () -> listed count) in let coefficients = matrix () in
   let x_range = listed ends in { powers0; coefficients; x_range; u_range = listed ends }
@@ -111,13 +110,13 @@ let () =
   let accepted = match word () with
     | "funnel" ->
       let f = field () in let p = policy () in let u = funnel () in
-      let g = maybe (pair nums matrix) () in let e = maybe ends () in decide_funnel f p u g e (witness ())
+      let g = maybe (pair nums matrix) () in decide_funnel f p u g (witness ())
     | "held" ->
       let f = field () in let p = policy () in let u = funnel () in
-      let g = maybe (pair nums matrix) () in let e = maybe ends () in
+      let g = maybe (pair nums matrix) () in
       let period = num () in let errors = nums () in
       let w = witness () in let rates = matrix () in
-      decide_held f p u g e period errors w rates (listed (fun () -> listed rate_piece))
+      decide_held f p u g period errors w rates (listed (fun () -> listed rate_piece))
     | "tube" -> let m = model () in let ts = listed tube in decide_tubes m ts (listed tree)
     | "plan" ->
       let m = model () in let ts = listed tube in let proofs = listed tree in

@@ -182,14 +182,10 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
         ]
         for f in spans
     ]
-    claim: dict[str, Any] = {"goal": None, "decay": None}
-    for rate, floor in _maybe(terms["decay"]):
-        claim["decay"] = {"rate": number(rate), "floor": number(floor)}
+    claim: dict[str, Any] = {"goal": None}
     for centre, P in _maybe(terms["goal"]):
         claim["goal"] = {"centre": number(centre), "P": number(P)}
     proof = _witness(terms["proof"], len(clips), states, files["proof"][1]["proof"]["pieces"])
-    if claim["decay"]:
-        proof["pieces"] = [_unmultiplied(piece) for piece in proof["pieces"]]
     if claim["goal"] is None:
         proof["goal_multiplier"] = None
     if "turns" in terms:
@@ -213,7 +209,7 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
 def composed(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
     """The files of funnels that follow each other, and their proofs."""
     documents: dict[str, Any] = {"proof": {"proof": {"multipliers": number(terms["multipliers"])}}}
-    parts = ("field", "policy", "funnel", "goal", "decay")
+    parts = ("field", "policy", "funnel", "goal")
     for i, (stage, proof) in enumerate(zip(terms["stages"], terms["proofs"], strict=True), start=1):
         own = dict(zip(parts, stage.terms, strict=True)) | {"proof": proof}
         printed = funnel(own, {"proof": files[f"stage{i}.proof"]})

@@ -31,6 +31,8 @@ class Funnel:
         self.claim, self.proof = document["claim"], document["proof"]
         self.files: Files = {"proof": (content, document)}
         roles = "vector_field policy funnel"
+        if "decay" in self.claim:
+            raise NotCovered("a decay")
         files, digests = _bound(self.claim.get("about"), folder, roles, self.files)
         strict_funnels.flow(self.files)
         self.field, self.policy, self.funnel = files

@@ -1,7 +1,7 @@
 """Hold the files of a tube or of stability to docs/certificate*.md, by members.
 
 What the theorems do not speak of is decided here, and nothing else: which members there are, their
-types, sizes and limits, names, trials, what follows commands, the numbers of a plan.
+types, sizes and limits, names, what follows commands, the numbers of a plan.
 Written from the pages, not from the first kernel. Raises Refused. Standard library only.
 """
 
@@ -14,14 +14,13 @@ from itertools import pairwise
 from typing import Any
 
 DIGEST = re.compile(r"sha256:[0-9a-f]{64}\Z")
-TRIAL = re.compile(r"(sha256:[0-9a-f]{64})(?:\[([0-9]{1,12}):([0-9]{1,12})\])?\Z")
 DEGREES = 63
 PHASES = 8
 TEXT, STATES, SIGNALS, POWER, SPLITS = 200, 120, 50, 20, 40
 ORDER = 200  # of a matrix
 IMPLICIT_STATES, IMPLICIT_INPUTS = 30, 60
-MONOMIALS, TRIALS, TUBES, TERMS, FACTORS = 20_000, 10**5, 8, 200, 4
-COUNT, PLAN, END, MOST = 10**9, 10**6, 10**12, 2**53
+MONOMIALS, TUBES, TERMS, FACTORS = 20_000, 8, 200, 4
+COUNT, PLAN, MOST = 10**9, 10**6, 2**53
 BYTES, TOGETHER = 32 * 2**20, 48 * 2**20  # of a file, of all of a claim
 SIGNAL = "name unit path"
 EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
@@ -113,21 +112,6 @@ def head(document: Any, where: str, kinds: Iterable[str]) -> None:
     word(document.get("kind"), f"{where}'s kind", kinds)
 
 
-def trials(value: Any, where: str, least: int = 0) -> list[tuple[str, int, int]]:
-    """The recording of each, its first sample and the one after its last."""
-    found: list[tuple[str, int, int]] = []
-    for trial in listed(value, where, least, TRIALS):
-        members(trial, where, "name digest")
-        text(trial["name"], where)
-        given = TRIAL.match(trial["digest"]) if type(trial["digest"]) is str else None
-        if given is None:
-            raise Refused(f"{where}: {trial['digest']!r} is no digest of a recording or window")
-        first, end = (0, END) if given[2] is None else (int(given[2]), int(given[3]))
-        need(first < end and (given[2] is None or end < END), f"{where}: an empty window")
-        found.append((given[1], first, end))
-    return found
-
-
 def signals(value: Any, where: str, least: int = 1, most: int = SIGNALS) -> list[str]:
     """Of distinct names."""
     rows = listed(value, where, least, most)
@@ -187,10 +171,6 @@ RECORDED = "format version kind period y u training bags"
 def _recorded(model: dict[str, Any], more: str, optional: str = "") -> None:
     members(model, "model", f"{RECORDED} {more}", optional)
     text(model.get("equation", ""), "equation")
-    text(model["training"], "training")
-    for bag in listed(model["bags"], "bags", 0, MOST):
-        for entry in members(bag, "bags", "name digest").values():
-            text(entry, "bags")
 
 
 def _difference(model: dict[str, Any]) -> Sizes:
@@ -326,22 +306,6 @@ def tree(value: Any, where: str, sizes: Sizes, forms: int | None, depth: int = 0
         matrix(N, where, sizes.m + sizes.n + sizes.p, sizes.m)
 
 
-def measured(given: dict[str, Any], where: str) -> tuple[Fraction, Fraction]:
-    """What was measured and its safety factor, on samples that chose nothing."""
-    found, factor = real(given["measured"], where), real(given["safety_factor"], where)
-    need(found >= 0 and factor >= 1, f"{where}: measured >= 0 and safety_factor >= 1")
-    before = trials(given["designed_on"], f"{where}.designed_on")
-    on: dict[str, list[tuple[int, int]]] = {}
-    for recording, first, end in trials(given["measured_on"], f"{where}.measured_on", 1):
-        on.setdefault(recording, []).append((first, end))
-    shared = any(
-        max(a, first) < min(b, end) for recording, a, b in before
-        for first, end in on.get(recording, ())
-    )  # fmt: skip
-    need(not shared, f"{where}: measured on what it was designed on")
-    return found, factor
-
-
 def follows(value: Any, where: str, inputs: int, rows: int) -> None:
     """A level by commands."""
     members(value, where, "terms weights")
@@ -359,7 +323,7 @@ def follows(value: Any, where: str, inputs: int, rows: int) -> None:
 
 
 TUBE = "rho L P R tau half_widths level inlet assumption"
-MEASURED = "measured safety_factor designed_on measured_on"
+MEASURED = "measured safety_factor designed_on measured_on"  # of a level; no part of the claim
 
 
 def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
@@ -371,7 +335,7 @@ def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
     for name in ("tau", "half_widths"):
         need(min(reals(value[name], f"{where}.{name}", p)) > 0, f"{where}.{name} should be > 0")
     rho, level, inlet = (real(value[name], f"{where}.{name}") for name in ("rho", "level", "inlet"))
-    need(inlet >= 0, f"{where}: inlet >= 0")
+    need(min(inlet, level) >= 0, f"{where}: inlet >= 0 and level >= 0")
     given = value["assumption"]
     need(type(given) is dict, f"{where}.assumption should be an object")
     kind = word(given.get("kind"), f"{where}.assumption", ("fading", "energy"))
@@ -380,12 +344,6 @@ def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
     if samples:
         whole(given["samples"], "samples", 1, COUNT)
     need((rho == 1) == (kind == "energy"), f"{where}: rho is 1 exactly for an energy")
-    found, factor = measured(given, f"{where}.assumption")
-    need(level >= factor**2 * found, f"{where}: the level is below what was measured")
-    if "peak" in value:
-        peak = members(value["peak"], f"{where}.peak", "level measured")
-        most, largest = (real(peak[name], f"{where}.peak.{name}") for name in ("level", "measured"))
-        need(0 <= factor**2 * largest <= most, f"{where}: the peak is below what was measured")
     if "follows" in value:
         need(kind == "fading" and inlet == 0, f"{where}: only a fading level follows commands")
         follows(value["follows"], f"{where}.follows", sizes.inputs, 1)
@@ -402,21 +360,6 @@ def funnel(document: dict[str, Any], sizes: Sizes, planned: bool, boxed: bool) -
     whole(document["settling"], "settling", 0, COUNT)
     for k, entry in enumerate(listed(document["tubes"], "tubes", 1, TUBES)):
         tube(entry, f"tube {k + 1}", sizes, planned)
-    if "response" in document:
-        response = members(document["response"], "response", "half_widths assumption", "follows")
-        widths = reals(response["half_widths"], "response", sizes.p)
-        need(min(widths) > 0, "response: half_widths > 0")
-        found, factor = measured(
-            members(response["assumption"], "response", MEASURED), "response.assumption"
-        )
-        need(found * factor <= 1, "response: more was measured than is assumed")
-        if "follows" in response:
-            follows(response["follows"], "response.follows", sizes.inputs, sizes.p)
-    if "cusum" in document:
-        cusum = members(document["cusum"], "cusum", "deviation drift threshold")
-        need(min(reals(cusum["deviation"], "cusum", sizes.p)) > 0, "cusum: deviation > 0")
-        need(real(cusum["threshold"], "cusum") > 0, "cusum: threshold > 0")
-        need(real(cusum["drift"], "cusum") >= 0, "cusum: drift >= 0")
 
 
 def plan(document: dict[str, Any], model: dict[str, Any], tubes: list[Any]) -> None:
@@ -464,7 +407,6 @@ def held(files: dict[str, tuple[str, Any]]) -> None:
         return
     members(claim, "claim", "kind about")
     planned = "policy" in files
-    trials(of.get("bags", []), "bags")
     if "box" in files["funnel"][1]:
         sizes = replace(sizes, box=sizes.p + sizes.n + len(of.get("window", ())))
     funnel(files["funnel"][1], sizes, planned, of["kind"] == "implicit")

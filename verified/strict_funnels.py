@@ -7,7 +7,6 @@ from typing import Any
 
 from strict import (
     DEGREES,
-    END,
     MONOMIALS,
     MOST,
     head,
@@ -21,7 +20,6 @@ from strict import (
     reals,
     signals,
     text,
-    trials,
     whole,
     word,
 )
@@ -155,16 +153,12 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     need(len(set(inputs)) == len(inputs), "limits: an input twice")
     need(all(low < high for _, low, high in rows), "limits: low >= high")
     claim, limits = document["claim"], len(rows)
-    members(claim, "claim", "kind about", "goal hold error decay")
+    members(claim, "claim", "kind about", "goal hold error")
     if "goal" in claim:
         members(claim["goal"], "goal", "centre P")
         reals(claim["goal"]["centre"], "goal", n)
         matrix(claim["goal"]["P"], "goal", n, n)
-    held, decays, errors = "hold" in claim, "decay" in claim, [Fraction(0)]
-    if decays:
-        members(claim["decay"], "decay", "rate floor")
-        need(real(claim["decay"]["rate"], "rate") > 0, "decay: rate > 0")
-        need(0 <= real(claim["decay"]["floor"], "floor") < 1, "decay: 0 <= floor < 1")
+    held, errors = "hold" in claim, [Fraction(0)]
     if held:
         need(real(claim["hold"], "hold") > 0, "hold > 0")
     if "error" in claim:
@@ -175,21 +169,18 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
         for e in row[1 + n : 1 + n + m]
     )  # fmt: skip
     need(affine or not claim.keys() & {"hold", "error"}, "the equations are not affine in an input")
-    required = "basis pieces" + " margin multiplier" * (not decays)
-    required += " sides" * (limits > 0 or held or decays)
+    required = "basis pieces margin multiplier" + " sides" * (limits > 0 or held)
     required += " goal_multiplier" * ("goal" in claim) + " rates rate_pieces" * held
     proof = members(document["proof"], "proof", required, "kappa" if uncertain else "")
-    if not decays:
-        need(real(proof["margin"], "margin") > 0, "the margin should be > 0")
+    need(real(proof["margin"], "margin") > 0, "the margin should be > 0")
     if "goal" in claim:
         real(proof["goal_multiplier"], "goal_multiplier")
     if "kappa" in proof:
         for row in matrix(proof["kappa"], "kappa", intervals, uncertain):
             need(min(row) > 0, "kappa > 0")
-    terms = 0 if decays else len(monomials(proof["multiplier"], "multiplier", n))
-    sizes = basis(proof["basis"], "basis", n), terms
-    sides = basis(proof["sides"], "sides", n) if limits or held or decays else 0
-    modes = " mode" * (limits > 0) + " tau" * (limits > 0 or decays)
+    sizes = basis(proof["basis"], "basis", n), len(monomials(proof["multiplier"], "multiplier", n))
+    sides = basis(proof["sides"], "sides", n) if limits or held else 0
+    modes = " mode tau" * (limits > 0)
     corners = 2**m if held or any(errors) else 1
 
     def place(piece: dict[str, Any], vertices: int, taus: int) -> None:
@@ -207,11 +198,8 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
 
     vertices = corners * (1 if "kappa" in proof else 2**uncertain)
     for piece in listed(proof["pieces"], "pieces", 0, PIECES):
-        names = "interval vertex level index columns squares" + " mu" * (not decays)
-        members(piece, "piece", names + modes)
-        place(piece, vertices, limits + 2 * decays)
-        if decays:
-            continue
+        members(piece, "piece", "interval vertex level index columns squares mu" + modes)
+        place(piece, vertices, limits)
         mu = members(piece["mu"], "mu", "shifts start end")
         for name in ("shifts", "start", "end"):
             for entry in listed(mu[name], name, sizes[1], sizes[1]):
@@ -256,7 +244,7 @@ def sampled(files: dict[str, tuple[str, Any]]) -> None:
     for name, count in (("S", N + 1), ("A", N)):
         for M in listed(funnel[name], name, count, count):
             matrix(M, name, n, n)
-    _kept(funnel["assumption"], trials(model["bags"], "bags"))
+    _kept(funnel["assumption"])
     members(document["claim"], "claim", "kind about")
     proof = members(document["proof"], "proof", "basis ball_basis steps")
     sizes = [basis(proof[name], name, n) for name in ("basis", "ball_basis")]
@@ -290,18 +278,12 @@ def _map(model: dict[str, Any]) -> tuple[int, int]:
     return n, p
 
 
-def _kept(given: Any, fitted: list[tuple[str, int, int]]) -> None:
-    """The assumption about the disturbance; `fitted` are the model's trials."""
-    names = "bound rate gain measured safety_factor"
-    members(given, "assumption", f"form {names} measured_on")
+def _kept(given: Any) -> None:
+    """The assumption about the disturbance; what was measured is no part of the claim."""
+    members(given, "assumption", "form bound rate gain measured safety_factor measured_on")
     form = word(given["form"], "form", ("response", "peak", "energy", "fading"))
-    bound, rate, gain, found, factor = (real(given[name], name) for name in names.split())
-    need(min(bound, rate, gain, found, factor) >= 0, "assumption: a negative number")
+    bound, rate, gain = (real(given[name], name) for name in ("bound", "rate", "gain"))
+    need(min(bound, rate, gain) >= 0, "assumption: a negative number")
     need(rate <= 1 <= gain, "rate <= 1, gain >= 1")
     need(rate == 1 or form == "fading", "rate is 1 but in form fading")
     need(gain == 1 or form in ("energy", "fading"), "gain is 1 in forms response and peak")
-    need(factor >= 1 and factor * found <= bound, "the bound is below what was measured")
-    runs = trials(given["measured_on"], "measured_on", 1)
-    need(all(end == END for _, _, end in runs), "measured_on: a window is no commissioning run")
-    seen = {recording for recording, _, _ in fitted}
-    need(not seen & {run for run, _, _ in runs}, "measured on what the model was fitted to")

@@ -52,15 +52,9 @@ def bits(value: Any) -> int:
 class Coq:
     """Terms of Coq; what is defined is named."""
 
-    def __init__(self, modules: str) -> None:
+    def __init__(self) -> None:
         self.mark = ""  # before every name
-        self.lines = [
-            "(* Made by generate.py. The theorem is about the numbers below. *)",
-            "From Coq Require Import ZArith Reals List Uint63.",
-            f"From Verified Require Import {modules}.",
-            "Import ListNotations.",
-            "Open Scope Z_scope.",
-        ]
+        self.lines: list[str] = []
 
     def whole(self, value: int) -> str:
         return str(value)
@@ -88,9 +82,6 @@ class Coq:
 
     def made(self, constructor: str, *terms: str) -> str:
         return f"({constructor} {' '.join(terms)})"
-
-    def chosen(self, constructor: str, _place: int, *terms: str) -> str:
-        return self.made(constructor, *terms)
 
     def named(self, name: str, term: str) -> str:
         self.lines.append(f"Definition {self.mark}{name} := {term}.")
@@ -177,7 +168,7 @@ class Writer:
         """What two solutions under the same inputs are told apart by (Tubes.v)."""
         to, kind = self.to, model["kind"]
         if kind == "difference_equation":
-            return to.chosen("Linear", 0, self.nums(model["a"]))
+            return to.made("Linear", self.nums(model["a"]))
         if kind == "monotone_equation":
             a = [-number(entry) for entry in model["a"]]
             return self.monotone([number(entry) for entry in model["e"]], a, shifted(len(a), 1))
@@ -194,16 +185,16 @@ class Writer:
         if kind == "cell_network":
             tables = (zip(f["knots"], f["values"], strict=True) for f in model["maps"])
             maps = to.listed(
-                to.chosen("Broken", 0, to.listed(map(self.ends, table))) for table in tables
+                to.made("Broken", to.listed(map(self.ends, table))) for table in tables
             )
             size = len(model["maps"]) + len(model["start"])
             known = ([row[:size] for row in model[key]] for key in ("into", "next", "output"))
-            return to.chosen("Cells", 3, maps, *map(self.matrix, known))
+            return to.made("Cells", maps, *map(self.matrix, known))
         if kind == "block_cascade":
             f, parts = model["f"], printed.cascade(model, *printed.orders(model))
             numbers = self.num(f["low"]), self.num(f["spacing"]), self.nums(f["coefficients"])
-            maps = to.listed([to.chosen("Spline", 1, *numbers)] * len(model["b1"]))
-            return to.chosen("Cells", 3, maps, *map(self.matrix, parts))
+            maps = to.listed([to.made("Spline", *numbers)] * len(model["b1"]))
+            return to.made("Cells", maps, *map(self.matrix, parts))
         raise NotCovered(f"models of kind {kind} are not covered")
 
     def affine(
@@ -214,11 +205,11 @@ class Writer:
         to = self.to
         rows = to.listed(to.pair(self.counts(e, 20), self.matrix(C)) for e, C in terms)
         box = to.listed(to.pair(self.num(low), self.num(high)) for low, high in ranges)
-        return to.chosen("Affine", 1, to.count(p), to.count(n), self.nums(scale), box, rows)
+        return to.made("Affine", to.count(p), to.count(n), self.nums(scale), box, rows)
 
     def monotone(self, e: list[Fraction], a: list[Fraction], shift: list[list[Fraction]]) -> str:
         """0 = e(v) + a'x + what the inputs add, x+ = [v; shift x]."""
-        return self.to.chosen("Monotone", 2, *map(self.num, e), self.nums(a), self.matrix(shift))
+        return self.to.made("Monotone", *map(self.num, e), self.nums(a), self.matrix(shift))
 
     def implicit(self, model: dict[str, Any]) -> str:
         """An implicit model whose equations are affine in v and x, or a cubic in one v."""
@@ -257,10 +248,10 @@ class Writer:
         """The multipliers of the leaves, by columns, one for each form."""
         to = self.to
         if tree is None:
-            return to.chosen("Leaf", 0, to.maybe(None), to.listed([to.listed([])] * forms))
+            return to.made("Leaf", to.maybe(None), to.listed([to.listed([])] * forms))
         if set(tree) == {"split", "parts"}:
             lower, upper = (self.tree(part, forms) for part in tree["parts"])
-            return to.chosen("Split", 1, to.count(integer(tree["split"], 0, 99)), lower, upper)
+            return to.made("Split", to.count(integer(tree["split"], 0, 99)), lower, upper)
         stated = None
         if "ends" in tree:
             ends = tree["ends"]
@@ -268,7 +259,7 @@ class Writer:
             stated = to.made("Ends", self.num(ends["low"]), self.num(ends["high"]), *weights)
         Ns = tree["N"] if forms > 1 else [tree["N"]]
         columns = to.listed(self.matrix(zip(*N, strict=True)) for N in Ns)
-        return to.chosen("Leaf", 0, to.maybe(stated), columns)
+        return to.made("Leaf", to.maybe(stated), columns)
 
     def plan(self, problem: "Increments") -> list[str]:
         """a, b_1 ..., b_0, c of a difference equation, and the policy's feedback."""
@@ -328,7 +319,7 @@ class Writer:
 
     def composition(self, problem: Composition) -> None:
         """What the theorem is about, stage by stage, and what is used to decide it."""
-        to, parts = self.to, ("field", "policy", "funnel", "goal", "decay")
+        to, parts = self.to, ("field", "policy", "funnel", "goal")
         stages, proofs = [], []
         for i, stage in enumerate(problem.stages, start=1):
             to.mark = f"stage{i}_"
@@ -384,7 +375,7 @@ class Writer:
         return to.listed(to.named(f"{name}_{k}", row) for k, row in enumerate(rows))
 
     def problem(self, problem: Funnel) -> None:
-        """What the theorem is about: field, policy, funnel, goal, decay."""
+        """What the theorem is about: field, policy, funnel, goal."""
         to, policy, funnel = self.to, problem.policy, problem.funnel
         to.named("field", self.field(problem.field))
         limits = (
@@ -405,9 +396,6 @@ class Writer:
             stated = problem.claim["goal"]
             goal = to.pair(self.nums(stated["centre"]), self.matrix(stated["P"]))
         to.named("goal : option (list num * list (list num))", to.maybe(goal))
-        stated = problem.claim.get("decay")
-        decay = self.ends([stated["rate"], stated["floor"]]) if stated else None
-        to.named("decay : option (num * num)", to.maybe(decay))
 
     def by_interval(self, name: str, problem: Funnel, entries: list[Any], made: Any) -> str:
         """Pieces of each interval, in the order in which they begin."""

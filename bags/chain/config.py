@@ -258,7 +258,7 @@ class Config(Section):
     select: Annotated[
         dict[str, Values] | None,
         Key(
-            "values of the identification's options for `nlsid select` to try",
+            "values of the identification's options for `nlsid identify --select` to try",
             example={"lags": [1, 2, 3, 4]},
         ),
     ] = None
@@ -266,7 +266,7 @@ class Config(Section):
         tuple[Identification, ...],
         Field(strict=False),
         Key(
-            "sections like `identification` that `nlsid compare` scores (default: that one)",
+            "sections like `identification` that `nlsid identify --compare` scores (default: it)",
             example=[{"lags": 2}, {"model": "monotone", "lags": 2}],
         ),
     ] = ()
@@ -386,7 +386,7 @@ def _model_refusals(config: Config) -> Iterator[str]:
         yield (
             "funnel.profile: a plan is tracked by `model: linear` with one response and one "
             f"excitation, not by {model} with {said}; leave out `profile` for a tube "
-            "around the model's simulation, or use `nlsid track` for a measured state"
+            "around the model's simulation, or give a measured state a `motion`"
         )
     if config.funnel is not None and config.funnel.profile is not None:
         for key, value in (("clock", config.clock), ("grid.resample", config.grid.resample)):

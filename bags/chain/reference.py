@@ -21,8 +21,8 @@ from nlsid_core.identification import METHODS, methods_of
 HEAD = """# The configuration of a robot, key by key
 
 Made by `python -m bags.chain.reference`; a test keeps it true. Words are in the
-[glossary](glossary.md). `nlsid config check FILE` says all that is wrong with a file at once. A key
-without a default has to be given; a key that is not here is refused.
+[glossary](glossary.md). `nlsid identify DIR BAG... --check` says all that is wrong with a file at
+once. A key without a default has to be given; a key that is not here is refused.
 """
 LIMITS = (
     (Gt, "gt", "> "),
@@ -50,7 +50,7 @@ def page() -> str:
     """The whole page."""
     lines = [HEAD]
     for title, kind in (("nlsid identify", Config),
-                        ("nlsid track", TrackingConfig)):  # fmt: skip
+                        ("a measured state and its motion", TrackingConfig)):  # fmt: skip
         lines.append(f"## The file of `{title}`\n")
         for name, section in _sections("", kind):
             lines += [*_section(name, section), ""]

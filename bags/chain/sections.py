@@ -69,6 +69,15 @@ def read_yaml(path: Path | str, kind: type[AnySection]) -> AnySection:
 
     OS errors pass through.
     """
+    content = yaml_sections(path)
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        raise DataError(f"{path}: not a valid configuration:\n{problems(error, kind)}") from error
+
+
+def yaml_sections(path: Path | str) -> dict[str, Any]:
+    """The sections of a YAML file, unread; DataError if it has none, OS errors pass through."""
     path = Path(path)
     if path.stat().st_size > MAX_CONFIG_BYTES:
         raise DataError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")
@@ -78,10 +87,7 @@ def read_yaml(path: Path | str, kind: type[AnySection]) -> AnySection:
         raise DataError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected sections (robot, signals, grid, ...), found none")
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        raise DataError(f"{path}: not a valid configuration:\n{problems(error, kind)}") from error
+    return content
 
 
 def problems(

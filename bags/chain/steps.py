@@ -309,13 +309,14 @@ def check_split(names: Sequence[str], config: Config) -> None:
 
 
 def absent_from(names: Sequence[str], config: Config) -> list[str]:
-    """Each name or pattern in the split that none of the trials called `names` has, as a reason."""
-    return [
-        f"split.{use} names {name}, and no bag is called so{did_you_mean(name, names)}"
-        for use in USES
-        for name in getattr(config.split, use)
-        if not _of_bags(names, [name])
-    ]
+    """Of each use the names and patterns in the split that none of the trials has, as a reason."""
+    reasons = []
+    for use in USES:
+        absent = [name for name in getattr(config.split, use) if not _of_bags(names, [name])]
+        if absent:
+            near = did_you_mean(absent[0], names)
+            reasons.append(f"split.{use} names {listed(absent)}, and no bag is called so{near}")
+    return reasons
 
 
 def refuse_absent(names: Sequence[str], config: Config) -> None:

@@ -6,7 +6,15 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from bags.chain.config import Clock, GridConfig
-from bags.chain.sections import Key, NonNegative, Positive, Section, SignalConfig, read_yaml
+from bags.chain.sections import (
+    Key,
+    NonNegative,
+    Positive,
+    Section,
+    SignalConfig,
+    read_yaml,
+    yaml_sections,
+)
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1, strict=False)]
 
@@ -121,18 +129,23 @@ class SimulationConfig(Section):
 
 
 class TrackingConfig(Section):
-    """One robot's configuration file for `nlsid track`."""
+    """One robot's configuration file where its state is measured and it tracks a motion."""
 
     robot: Annotated[str, Key("what people call it", example="arm")]
     signals: Annotated[StateSignals, Key("the measured state and the inputs")]
-    clock: Annotated[Clock, Key("as for `nlsid identify`", example="log")] = "header"
-    grid: Annotated[GridConfig, Key("as for `nlsid identify`")]
+    clock: Annotated[Clock, Key("as in the file without a motion", example="log")] = "header"
+    grid: Annotated[GridConfig, Key("as in the file without a motion")]
     identification: Annotated[StateIdentification, Key("which model of the measured state")]
     motion: Annotated[MotionConfig, Key("the motion to follow")]
     disturbance: Annotated[DisturbanceConfig, Key("what is assumed of the disturbance")] = (
         DisturbanceConfig()
     )
     simulation: Annotated[SimulationConfig | None, Key("only for a robot that is simulated")] = None
+
+
+def is_tracking(path: Path | str) -> bool:
+    """Whether a configuration is of a measured state and a motion; DataError if it is no YAML."""
+    return "motion" in yaml_sections(path)
 
 
 def load_tracking_config(path: Path | str) -> TrackingConfig:

@@ -1,4 +1,4 @@
-"""The steps of `nlsid track`: each takes files, returns what it made, writes it whole or not."""
+"""The steps for a measured state and its motion: each takes files and writes what it made."""
 
 import csv
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The command line `nlsid bag`: look into recordings, check, repair, convert and cut them.
+"""The command line `nlsid bag`: look into recordings, check, repair and convert them.
 
 A command imports what it runs when it is called.
 """
@@ -10,6 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from bags.commands.options import (
+    BagArgument,
+    BagsArgument,
+    Clock,
+    ClockOption,
+    DefinitionsOption,
+    ExcitationOption,
+    JsonOption,
+    ResponseOption,
+)
 from bags.commands.progress import progress_bar
 from nlsid_core.errors import BagError, DataError
 
@@ -19,11 +29,12 @@ if TYPE_CHECKING:
     from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
+PICTURE = Path("signals.png")
 PROGRESS_AFTER = 2.0  # s of work before a progress bar appears
 
 bag_app = typer.Typer(
     name="bag",
-    help="Look into recordings, check, repair, convert and cut them.",
+    help="Look into recordings, check, repair and convert them.",
     no_args_is_help=True,
 )
 out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
@@ -38,21 +49,6 @@ class Format(StrEnum):
     PARQUET = "parquet"
 
 
-class Clock(StrEnum):
-    """Which of a message's times is its stamp."""
-
-    HEADER = "header"
-    LOG = "log"
-    PUBLISH = "publish"
-
-
-class SignalClock(StrEnum):
-    """Which times signals are paired by."""
-
-    HEADER = "header"
-    LOG = "log"
-
-
 class Resampling(StrEnum):
     """How a signal is put on a grid."""
 
@@ -61,29 +57,14 @@ class Resampling(StrEnum):
     HOLD = "hold"
 
 
-BagArgument = Annotated[
-    Path, typer.Argument(help="A rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file.")
-]
-BagsArgument = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags.")]
-OutOption = Annotated[Path, typer.Option("--out", help="What to write; must not be there yet.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
 SignalsOption = Annotated[
-    list[str],
+    list[str] | None,
     typer.Option(
         "--signal",
         "-s",
         help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
-]
-DefinitionsOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--definitions",
-        help="PACKAGE/msg/Type.msg, or folders of packages: types that the bag does not define.",
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
-ClockOption = Annotated[
-    SignalClock, typer.Option(help="The signals' stamps: their header's, or of logging.")
 ]
 UnfinishedOption = Annotated[
     bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
@@ -94,7 +75,7 @@ UnfinishedOption = Annotated[
 def info(
     bags: BagsArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
 ) -> None:
-    """Topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
+    """Show topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
     from bags.commands import bag_show
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
@@ -112,7 +93,7 @@ def info(
 def signals(
     bag: BagArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
 ) -> None:
-    """Every number in the bag's messages as a signal: its range, its unit where the type says one.
+    """List every number in the bag's messages as a signal, with its range and its unit.
 
     Joints are named, orientations have a yaw, transforms their frames.
     """
@@ -134,13 +115,13 @@ def signals(
 @bag_app.command()
 def plot(
     bag: BagArgument,
-    picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")],
-    signals: SignalsOption,
-    clock: Annotated[Clock | None, typer.Option(help="Which times (default: header).")] = None,
+    signals: SignalsOption = None,
+    picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")] = PICTURE,
+    clock: ClockOption = Clock.HEADER,
     definitions: DefinitionsOption = None,
     unfinished: UnfinishedOption = False,
 ) -> None:
-    """Draw signals over time."""
+    """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
     from bags.signals.reader import read_signals
 
@@ -148,10 +129,11 @@ def plot(
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
+    drawn = signals or [signal for part in _likeliest([bag], definitions) for signal in part]
     with progress_bar("reading", after=PROGRESS_AFTER) as progress:
         samples = read_signals(
             bag,
-            signals,
+            drawn,
             clock=_clock(clock),
             unfinished=unfinished,
             definitions=_definitions(definitions),
@@ -164,25 +146,28 @@ def plot(
 @bag_app.command()
 def check(
     bags: BagsArgument,
-    excitations: Annotated[
-        list[str], typer.Option("--excitation", "-u", help="Signals that drive the robot.")
-    ],
-    responses: Annotated[
-        list[str], typer.Option("--response", "-y", help="Signals that are measured.")
-    ],
-    clock: ClockOption = SignalClock.HEADER,
+    responses: ResponseOption = None,
+    excitations: ExcitationOption = None,
+    clock: ClockOption = Clock.HEADER,
     definitions: DefinitionsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Are these bags fit for identification? Status 1 if one is not."""
+    """Say whether bags are fit for identification; status 1 if one is not.
+
+    Without -y or -u of the likeliest response, or command, which are said.
+    """
     from bags.commands import bag_show
     from bags.recordings.folders import expand_bags
     from bags.tools.fitness import Level, check_fitness
 
+    folders = expand_bags(bags)
+    y, u = _likeliest(folders, definitions, responses or (), excitations or ())
+    if not (responses and excitations) and not as_json:
+        out.print(f"of {', '.join(y)} under {', '.join(u)}", soft_wrap=True, markup=False)
     results = check_fitness(
-        expand_bags(bags),
-        excitations=excitations,
-        responses=responses,
+        folders,
+        excitations=u,
+        responses=y,
         clock=clock.value,
         definitions=_definitions(definitions),
     )
@@ -195,21 +180,21 @@ def check(
 
 
 @bag_app.command("recover")
-def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
-    """Make a whole bag of an unfinished or damaged one, verify it, and say what was lost.
+def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
+    """Make a whole bag of an unfinished or damaged one, BAG_recovered, and say what was lost.
 
-    Status 1 if something was.
+    It is verified. Status 1 if something was lost.
     """
     from bags.tools.recover import recover
 
     with progress_bar("recovering", after=PROGRESS_AFTER) as progress:
-        found = recover(bag, bag_out, progress=progress)
+        found = recover(bag, bag_out or _beside(bag, "recovered"), progress=progress)
     for topic, count in found.counts.items():
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
     for what in found.lost:
         out.print(f"lost: {what}", soft_wrap=True, markup=False)
     if found.lost:
-        verdict = f"{len(found.lost)} losses, as said above"
+        verdict = "what was lost is said above"
     elif found.statements:
         verdict = f"nothing was lost of what {' and '.join(found.statements)} state"
     else:
@@ -228,7 +213,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
 @bag_app.command("export")
 def export_command(
     bag: BagArgument,
-    target: OutOption,
+    target: OutOption = None,
     form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
     signals: Annotated[
         list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
@@ -245,13 +230,18 @@ def export_command(
     max_gap: Annotated[
         float | None, typer.Option(help="s without a sample; default 1.5 periods.")
     ] = None,
-    clock: ClockOption = SignalClock.HEADER,
+    clock: ClockOption = Clock.HEADER,
     definitions: DefinitionsOption = None,
     unfinished: UnfinishedOption = False,
 ) -> None:
-    """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid."""
+    """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid.
+
+    By default in the folder BAG_tables, or as the file BAG.csv.
+    """
     from bags.tools import export
 
+    named = Path(f"{bag.stem}.{form.value}") if period is not None else _beside(bag, "tables")
+    target = target or named
     if period is None:
         with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
             rows = export.export_topics(
@@ -290,79 +280,78 @@ def export_command(
 
 
 @bag_app.command()
-def cut(
-    bag: BagArgument,
-    bag_out: OutOption,
+def convert(
+    bags: BagsArgument,
+    bag_out: OutOption = None,
     start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0,
     end: Annotated[float | None, typer.Option(help="s after the first message.")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
-) -> None:
-    """Copy a stretch of time, or some topics, to a new bag."""
-    from bags.tools import edit
-
-    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        copied = edit.cut(
-            bag,
-            bag_out,
-            start=start,
-            end=end,
-            topics=topics or None,
-            unfinished=unfinished,
-            definitions=_definitions(definitions),
-            progress=progress,
-        )
-    out.print(f"wrote {bag_out}, {copied.messages} messages", soft_wrap=True, markup=False)
-    _say_notes(copied.notes)
-
-
-@bag_app.command()
-def merge(bags: BagsArgument, bag_out: OutOption) -> None:
-    """Copy several bags into one, by log time."""
-    from bags.recordings.folders import expand_bags
-    from bags.tools import edit
-
-    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        copied = edit.merge(expand_bags(bags), bag_out, progress=progress)
-    out.print(f"wrote {bag_out}, {copied.messages} messages", soft_wrap=True, markup=False)
-    _say_notes(copied.notes)
-
-
-@bag_app.command()
-def split(
-    bag: BagArgument,
-    bag_out: Annotated[Path, typer.Option("--out", help="OUT_01, OUT_02, ... are written.")],
-    repeats: Annotated[
-        str | None, typer.Option(help="A signal whose repetitions become the parts.")
-    ] = None,
     every: Annotated[
         float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
     ] = None,
+    repeats: Annotated[
+        str | None, typer.Option(help="A signal whose repetitions become the parts.")
+    ] = None,
+    definitions: DefinitionsOption = None,
+    unfinished: UnfinishedOption = False,
 ) -> None:
-    """Copy a bag in parts: at the repeats of an excitation, or every so many seconds."""
+    """Copy bags into a new MCAP bag: a stretch of time, some topics, several as one, or in parts.
+
+    Several are merged by log time. Parts are OUT_01, OUT_02, ... The default of --out is
+    BAG_converted.
+    """
+    from bags.recordings.folders import expand_bags
     from bags.tools import edit
 
+    folders = expand_bags(bags)
+    target = bag_out or _beside(folders[0], "converted")
+    is_part = bool(start or end is not None or topics)
+    is_split = every is not None or repeats is not None
+    if is_part + is_split + (len(folders) > 1) > 1:
+        raise DataError(
+            "one at a time: merge several bags, or take a stretch of one (--start, --end, "
+            "--topic), or cut one into parts (--every or --repeats)"
+        )
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        copied = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
+        if is_split:
+            copied = edit.split(folders[0], target, repeats=repeats, every=every, progress=progress)
+        elif len(folders) > 1:
+            copied = edit.merge(folders, target, progress=progress)
+        else:
+            copied = edit.cut(
+                folders[0],
+                target,
+                start=start,
+                end=end,
+                topics=topics or None,
+                unfinished=unfinished,
+                definitions=_definitions(definitions),
+                progress=progress,
+            )
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
+    if not copied.parts:
+        out.print(f"wrote {target}, {copied.messages} messages", soft_wrap=True, markup=False)
     _say_notes(copied.notes)
 
 
 @bag_app.command("import")
 def import_command(
     tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
-    bag_out: OutOption,
+    bag_out: OutOption = None,
     assignments: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
-            "--signal", "-s", help="signal=column: /joints:position[name=elbow]=angles[3]"
+            "--signal",
+            "-s",
+            help="signal=column: /joints:position[name=elbow]=angles[3]; default: every column "
+            "as a number on a topic of its name.",
         ),
-    ],
+    ] = None,
     types: Annotated[
-        list[str], typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState")
-    ],
+        list[str] | None,
+        typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState"),
+    ] = None,
     period: Annotated[float | None, typer.Option(help="s between rows.")] = None,
     time_column: Annotated[
         str | None, typer.Option("--time", help="The column with the rows' times in s.")
@@ -375,14 +364,19 @@ def import_command(
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
 ) -> None:
-    """Write columns of tables as a bag of standard messages."""
-    from bags.tools.importing import import_tables, said_units
+    """Write columns of tables as a bag of standard messages, named as the first table."""
+    from bags.tools.importing import every_column, import_tables, said_units
 
+    kinds = _pairs(types or (), "--type")
+    bag_out = bag_out or Path(tables[0].stem)
+    if not assignments:
+        time_column, assignments, numbers = every_column(tables, time_column, period)
+        kinds = numbers | kinds
     counts = import_tables(
         tables,
         bag_out,
         assignments,
-        types=_pairs(types, "--type"),
+        types=kinds,
         period=period,
         time=time_column,
         drop_repeats=drop_repeats,
@@ -391,7 +385,7 @@ def import_command(
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
-    if units := said_units(assignments, _pairs(types, "--type")):
+    if units := said_units(assignments, kinds):
         out.print(
             f"units by the message types, not by the table: {units}; where a column is in another, "
             "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
@@ -402,6 +396,26 @@ def import_command(
 def _say_notes(notes: "Sequence[str]") -> None:
     for note in notes:
         out.print(f"not as stated: {note}", soft_wrap=True, markup=False)
+
+
+def _beside(bag: Path, what: str) -> Path:
+    """A name for what is made of a bag, in this folder."""
+    return Path(f"{bag.stem if bag.suffix else bag.name}_{what}")
+
+
+def _likeliest(
+    bags: "Sequence[Path]",
+    definitions: list[Path] | None,
+    responses: "Sequence[str]" = (),
+    excitations: "Sequence[str]" = (),
+) -> tuple[list[str], list[str]]:
+    """The responses and the excitations, for those not named the likeliest."""
+    if responses and excitations:
+        return list(responses), list(excitations)
+    from bags.setup.candidates import look
+    from bags.setup.proposing import choose
+
+    return choose(look(bags, definitions=_definitions(definitions)), responses, excitations)
 
 
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":
@@ -420,7 +434,7 @@ def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
     return pairs
 
 
-def _clock(clock: Clock | None) -> str | None:
+def _clock(clock: Clock) -> str:
     from bags.signals.reader import CLOCKS
 
-    return None if clock is None else next(name for name in CLOCKS if name.startswith(clock.value))
+    return next(name for name in CLOCKS if name.startswith(clock.value))

@@ -1,4 +1,4 @@
-"""The command line `nlsid`: its verbs; `bag`, `track`, `config`, `fleet` have verbs of their own.
+"""The command line `nlsid`: its verbs; `bag` and `fleet` have verbs of their own.
 
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
@@ -14,10 +14,8 @@ from rich.markup import escape
 
 from bags.commands import designs_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
-from bags.commands.config_cli import config_app
 from bags.commands.fleet_cli import fleet_app
 from bags.commands.options import err
-from bags.commands.tracking_cli import app as track_app
 from nlsid_core.errors import NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -29,28 +27,24 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-app.add_typer(track_app, name="track")
-app.add_typer(bag_app)
-app.add_typer(config_app)
-app.add_typer(fleet_app)
-for verb in (
-    models_cli.init,
-    models_cli.identify,
-    models_cli.select,
-    models_cli.compare,
-    designs_cli.funnel,
-    designs_cli.push,
-    designs_cli.compose,
-    designs_cli.check,
-    designs_cli.report,
-    running_cli.monitor,
-    designs_cli.tolerances,
-    running_cli.live,
-    running_cli.call,
-    running_cli.view,
-    running_cli.demo,
-):
-    app.command()(verb)
+GROUPS = {
+    "The steps": (
+        models_cli.init,
+        models_cli.identify,
+        designs_cli.funnel,
+        designs_cli.check,
+        designs_cli.report,
+        running_cli.monitor,
+        designs_cli.export,
+    ),
+    "Live": (running_cli.run, running_cli.view),
+    "More": (running_cli.demo,),
+}
+for group, verbs in GROUPS.items():
+    for verb in verbs:
+        app.command(rich_help_panel=group)(verb)
+app.add_typer(bag_app, rich_help_panel="More")
+app.add_typer(fleet_app, rich_help_panel="More")
 
 
 def _say_version(wanted: bool) -> None:

@@ -20,6 +20,7 @@ from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags, what_a_funnel_catches
 from bags.commands import show
+from bags.commands.options import CONFIG
 from bags.commands.progress import progress_bar
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
@@ -90,9 +91,9 @@ class _Demo:
 
     def identify(self) -> None:
         self._heading("1  identify a model from the recordings")
-        self._command(
-            f"identify {self.bags[0].parent} --config {self.config_path} --out {self.out}"
-        )
+        self._command(f"identify {self.out} {self.bags[0].parent}")
+        self.out.mkdir(parents=True, exist_ok=True)
+        shutil.copy(self.config_path, self.out / CONFIG)
         with progress_bar("identifying") as progress:
             result = identify_bags(self.bags, self.config, self.out, progress=progress)
         self.console.print(show.methods_table(result.fit, result.test))
@@ -102,7 +103,7 @@ class _Demo:
     def funnel(self) -> None:
         self._heading("2  design a tube, and see what it would catch")
         model = self.out / documents.MODEL
-        self._command(f"funnel --model {model} --config {self.config_path} --out {self.out}")
+        self._command(f"funnel {self.out}")
         with progress_bar("designing policy, observer and tube"):
             design = design_funnel_files(model, self.config, self.out)
             catching = what_a_funnel_catches(model, self.config, design)
@@ -113,16 +114,14 @@ class _Demo:
 
     def check(self) -> None:
         self._heading("3  check both proofs, exactly and without a solver")
+        self._command(f"check {self.out}")
         for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
-            self._command(f"check {self.out / name}")
             self._say(str(check(self.out / name)))
 
     def monitor(self) -> bool:
         self._heading("4  hold unseen recordings against the tube")
         test = [bag for bag in self.bags if bag.name in self.config.split.test]
-        self._command(
-            f"monitor --funnel {self.out / documents.FUNNEL} --replay BAG... ({len(test)} trials)"
-        )
+        self._command(f"monitor {self.out} BAG... ({len(test)} trials)")
         with progress_bar("replaying"):
             replays = self._replay(test)
             if report_available():

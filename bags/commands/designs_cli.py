@@ -1,5 +1,4 @@
-"""From a model, or equations, to what is proved of it: `nlsid funnel`, `push`, `compose`, `check`,
-`report` and `tolerances`.
+"""From a model, or equations, to what is proved of it: `nlsid funnel`, `check`, `report`, `export`.
 
 A command imports what it runs when it is called.
 """
@@ -11,43 +10,116 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bags.commands.fleet_cli import SchedulerOption, WorkersOption
-from bags.commands.options import BagsArgument, OutOption, out
+from bags.commands.options import (
+    ConfigOption,
+    DesignArgument,
+    ExcitationOption,
+    PeriodOption,
+    ResponseOption,
+    SchedulerOption,
+    SomeBagsArgument,
+    WorkersOption,
+    config_of,
+    out,
+    settings_if_any,
+)
 from bags.commands.progress import progress_bar
 from nlsid_core import deciding
 from nlsid_core import second as second_kernel
 from nlsid_core.errors import CertificateRejected
 
 if TYPE_CHECKING:
+    from bags.chain.problems import FunnelProblem
     from bags.fleet.workers import Workers
 
 
 def funnel(
-    out_dir: OutOption,
-    model: Annotated[
-        Path | None, typer.Option(help="The model.json that `nlsid identify` wrote.")
-    ] = None,
-    config: Annotated[Path | None, typer.Option(help="The robot's YAML configuration.")] = None,
-    problem: Annotated[
-        Path | None,
-        typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
-    ] = None,
+    folder: DesignArgument,
+    bags: SomeBagsArgument = None,
+    config: ConfigOption = None,
     require: Annotated[
         float | None,
         typer.Option(
             min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
         ),
     ] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Option(help="Dynamics, nominal and goal in a file, in the place of a model."),
+    ] = None,
+    response: ResponseOption = None,
+    excitation: ExcitationOption = None,
+    period: PeriodOption = 0.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
+    ] = 0.0,
+    safety_factor: Annotated[
+        float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
+    ] = 1.5,
+    compose: Annotated[
+        list[Path] | None,
+        typer.Option(help="Bind the funnels of these folders, in the order of time; repeat."),
+    ] = None,
     workers: WorkersOption = 0,
     scheduler: SchedulerOption = "",
 ) -> None:
-    """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
+    """Design a proved funnel in DIR: funnel.json, funnel.proof.json, policy.json if it has one.
 
-    Around the simulation of an identified model of any class, and a plan of a linear one (--model,
-    --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
-    it says what it catches: faults put into the test trials, through the monitor. --workers and
-    --scheduler share the L-steps of a --problem of shape P.
+    Around the simulation of the model in DIR, and a plan of a linear one; around the motion of a
+    measured state, whose disturbance is measured on BAG...; around a trajectory of given equations
+    (--problem), which BAG... with -y and -u show to be off by a push; or of funnels that follow
+    each other (--compose). Of an identified model it says what the funnel catches.
     """
+    from bags.chain.tracking_config import is_tracking
+    from bags.fleet.workers import Workers
+
+    if compose:
+        from nlsid_core.design import compose_funnels
+
+        path = compose_funnels([_proof_in(stage) for stage in compose], folder)
+        out.print(f"wrote {path} and {4 * len(compose)} files of its stages", soft_wrap=True)
+        return
+    if problem is not None:
+        from bags.chain.problems import FunnelProblem
+
+        if config is not None or require is not None:
+            raise typer.BadParameter("--problem takes no --config and no --require")
+        given = FunnelProblem.load(problem)
+        if bags:
+            from bags.chain.problems import measured
+            from bags.commands import show
+            from bags.recordings.folders import expand_bags
+
+            given, broken = measured(
+                problem, expand_bags(bags), responses=response or (), excitations=excitation or (),
+                period=period or None, seconds=seconds or None, safety_factor=safety_factor,
+            )  # fmt: skip
+            out.print(show.breaking_table(broken))
+        _funnel_around_trajectory(given, folder, Workers(workers, scheduler))
+        return
+    if workers or scheduler:
+        raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
+
+    path = config_of(folder, config)
+    if is_tracking(path):
+        from bags.commands import track
+
+        if not bags:
+            raise typer.BadParameter("give the bags on which the disturbance is measured")
+        track.funnel(bags, folder, path)
+    else:
+        _tube(folder, path, require)
+
+
+def _proof_in(path: Path) -> Path:
+    """The proof of a design's folder, or the file that was named."""
+    from bags.designs import documents
+
+    return path / documents.FUNNEL_PROOF if path.is_dir() else path
+
+
+def _tube(folder: Path, config: Path, require: float | None) -> None:
+    """A tube around the model in a folder, and what it catches."""
     from bags.chain.config import load_config
     from bags.chain.steps import (
         design_funnel_files,
@@ -56,24 +128,12 @@ def funnel(
     )
     from bags.commands import show
     from bags.designs import documents
-    from bags.fleet.workers import Workers
     from bags.pictures.report import write_catching
 
-    if problem is not None:
-        if not (model is None and config is None and require is None):
-            raise typer.BadParameter(
-                "--problem stands alone; it takes no --model, no --config and no --require"
-            )
-        _funnel_around_trajectory(problem, out_dir, Workers(workers, scheduler))
-        return
-    if workers or scheduler:
-        raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
-    if model is None or config is None:
-        raise typer.BadParameter("give --model and --config, or --problem")
-    settings = load_config(config)
+    settings, model = load_config(config), folder / documents.MODEL
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
-        design = design_funnel_files(model, settings, out_dir)
+        design = design_funnel_files(model, settings, folder)
         progress("sabotaging the test trials", 0.7)
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
@@ -87,95 +147,43 @@ def funnel(
     for line in what_a_monitor_would_not_judge(model, settings, design):
         show.warn(out, line)
     for path in (
-        *(out_dir / name for name in design.documents()),
-        *([] if catching is None else write_catching(out_dir, catching)),
+        *(folder / name for name in design.documents()),
+        *([] if catching is None else write_catching(folder, catching)),
     ):
         out.print(f"wrote {path}", soft_wrap=True)
     if catching is not None and require is not None and not catching.widest.share <= require:
         raise typer.Exit(1)
 
 
-def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) -> None:
-    from bags.chain.problems import FunnelProblem
+def _funnel_around_trajectory(given: FunnelProblem, folder: Path, workers: Workers) -> None:
+    """A funnel for given equations, and the push that was measured beside it."""
     from bags.designs import documents
     from bags.pictures.report import report_available
     from nlsid_core import files
 
-    given = FunnelProblem.load(problem)
     with progress_bar("designing") as progress, workers.sharing() as executor:
         design = given.design(progress, executor=executor)
-    for path in design.save(out_dir):
+    for path in design.save(folder):
         out.print(f"wrote {path}", soft_wrap=True)
     if report_available():
         from bags.pictures.funnel_plots import write_funnel_picture
 
-        picture = out_dir / documents.FUNNEL_PLOT
+        picture = folder / documents.FUNNEL_PLOT
         write_funnel_picture(picture, design)
         out.print(f"wrote {picture}", soft_wrap=True)
     out.print(str(design), soft_wrap=True)
     if given.push is not None:
-        path = out_dir / documents.PUSH
+        path = folder / documents.PUSH
         files.write_document(path, given.push.document())
         out.print(f"wrote {path}", soft_wrap=True)
         out.print(f"measured, not proved: {given.push}", soft_wrap=True, markup=False)
 
 
-def push(
-    bags: BagsArgument,
-    problem: Annotated[Path, typer.Option(help="The problem whose equations are compared.")],
-    out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
-    response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
-    command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
-    period: Annotated[
-        float, typer.Option(help="Seconds between samples; default: as they come.")
-    ] = 0.0,
-    seconds: Annotated[
-        float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
-    ] = 0.0,
-    safety_factor: Annotated[
-        float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
-    ] = 1.5,
-    resample: Annotated[
-        str, typer.Option(help="none, last or linear: see grid.resample.")
-    ] = "none",
-) -> None:
-    """Measure on bags how far a problem's equations are off; `nlsid funnel` proves with that.
-
-    States and inputs in the equations' order and units. The problem that is written has a member
-    `push`: the largest of each trial with its digest.
-    """
-    from bags.chain.problems import measured
-    from bags.commands import show
-    from bags.recordings.folders import expand_bags
-    from nlsid_core import files
-
-    given, broken = measured(
-        problem, expand_bags(bags), responses=response, excitations=command, period=period or None,
-        seconds=seconds or None, safety_factor=safety_factor, resample=resample,
-    )  # fmt: skip
-    files.write_document(out_file, given.document())
-    assert given.push is not None  # `measured` has just measured it
-    out.print(str(given.push), soft_wrap=True, markup=False)
-    out.print(show.breaking_table(broken))
-    out.print(f"wrote {out_file}", soft_wrap=True)
-
-
-def compose(
-    proofs: Annotated[
-        list[Path],
-        typer.Argument(help="funnel.proof.json files, in the order of time."),
-    ],
-    out_dir: OutOption,
-) -> None:
-    """Bind proofs of funnels that follow each other into one claim, for `check`."""
-    from nlsid_core.design import compose_funnels
-
-    path = compose_funnels(proofs, out_dir)
-    out.print(f"wrote {path} and {4 * len(proofs)} files of its stages", soft_wrap=True)
-
-
 def check(
-    proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Designs' folders, or files (FILE.proof.json)."),
+    ],
     second: Annotated[
         bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
     ] = False,
@@ -193,6 +201,7 @@ def check(
     from bags.designs.provenance import of_proof
 
     status = 0
+    proofs = [proof for path in paths for proof in _proofs(path)]
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
@@ -219,16 +228,15 @@ def check(
     raise typer.Exit(status)
 
 
+def _proofs(path: Path) -> list[Path]:
+    """The proofs in a folder; the path itself if it is none, or has none."""
+    return (sorted(path.glob("*.proof.json")) if path.is_dir() else []) or [path]
+
+
 def report(
-    folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
-    bags: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Their losses are listed; those that made no part of it are judged."),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="Takes `split.validation` (bags that are not judged) and `monitor`."),
-    ] = None,
+    folder: DesignArgument,
+    bags: SomeBagsArgument = None,
+    config: ConfigOption = None,
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
     ] = None,
@@ -241,7 +249,6 @@ def report(
     The proofs are decided again. Of the bags, those are held against the funnel that it was not
     made with. The page needs nothing else, and prints.
     """
-    from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
     from bags.monitoring.replay import replay_bag, to_judge
@@ -251,7 +258,7 @@ def report(
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
 
-    settings = load_config(config) if config is not None else None
+    settings = settings_if_any(folder, config)
     target = page or folder / documents.DESIGN_REPORT
     recordings, replays, drawn = [], [], ""
     used: list[str] = []
@@ -273,7 +280,8 @@ def report(
         out.print(show.replay_table(replays))
         for line in used:
             out.print(line, soft_wrap=True, markup=False, highlight=False)
-        if report_available() and all(entry.half_width for entry in replays):
+        is_judged = any(entry.judged for entry in replays)
+        if is_judged and report_available() and all(entry.half_width for entry in replays):
             from bags.pictures import plots
 
             drawn = plots.svg(plots.margins(replays))
@@ -286,8 +294,8 @@ def report(
         out.print(f"wrote {target.with_suffix('.pdf')}", soft_wrap=True)
 
 
-def tolerances(
-    folder: Annotated[Path, typer.Argument(help="Folder of a design: funnel.json, its proof, ...")],
+def export(
+    folder: DesignArgument,
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; default the design's.")
     ] = None,

@@ -17,6 +17,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bags.commands.options import (
+    BagsArgument,
+    ConfigOption,
+    DesignArgument,
+    PatienceOption,
+    SchedulerOption,
+    WorkersOption,
+    config_of,
+    settings_if_any,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -37,19 +48,9 @@ fleet_app = typer.Typer(
 )
 console = Console()
 
-BagsArgument = Annotated[
-    list[Path], typer.Argument(help="Bags, folders of bags, URLs and patterns (quote them).")
-]
 ManifestOption = Annotated[
     Path | None,
     typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
-]
-WorkersOption = Annotated[
-    int,
-    typer.Option("--workers", min=0, help="Processes that share the work; 0: this one."),
-]
-SchedulerOption = Annotated[
-    str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
 ]
 RobotOption = Annotated[
     int | None,
@@ -58,21 +59,13 @@ RobotOption = Annotated[
         "the first that is no date and not the same for all."
     ),
 ]
-StrictOption = Annotated[
-    bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
-]
-PatienceOption = Annotated[
-    float,
-    typer.Option(
-        min=1.0, help="Seconds that a bag may lose with failing requests before it is left out."
-    ),
-]
 
 
 @fleet_app.command()
 def check(
+    folder: DesignArgument,
     bags: BagsArgument,
-    config: Annotated[Path, typer.Option(help="The robot's YAML configuration: its signals.")],
+    config: ConfigOption = None,
     table: Annotated[
         Path | None, typer.Option("--out", help="A .parquet file for all rows and findings.")
     ] = None,
@@ -82,7 +75,7 @@ def check(
     scheduler: SchedulerOption = "",
     patience: PatienceOption = 60.0,
 ) -> None:
-    """Fitness, clock trouble and losses of every bag as one table.
+    """Say of every bag what its fitness, its clocks and its losses are, as one table.
 
     bad: `nlsid identify` leaves it out, or it is not fit; look: there is something to mend.
     Status 1 if a bag is bad, 2 if none is and one was not read.
@@ -93,7 +86,7 @@ def check(
     from bags.fleet.check import BAD, SERIOUS, check_fleet, write_parquet
     from bags.fleet.workers import Workers
 
-    settings = load_config(config)
+    settings = load_config(config_of(folder, config))
     named = named_bags(bags, patience=patience)
     with progress_bar("checking") as progress:
         found = check_fleet(
@@ -139,11 +132,9 @@ def _checked_table(rows: Sequence[Checked]) -> Table:
 
 @fleet_app.command()
 def monitor(
+    folder: DesignArgument,
     bags: BagsArgument,
-    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
-    config: Annotated[
-        Path | None, typer.Option(help="Takes `monitor.nominal` and `definitions`.")
-    ] = None,
+    config: ConfigOption = None,
     table: Annotated[
         Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
     ] = None,
@@ -159,7 +150,6 @@ def monitor(
     whether the newest month is like the calibration. Status 0 if all are inside with the assumption
     kept, 1 if one is not, 2 if one was not judged whole.
     """
-    from bags.chain.config import load_config
     from bags.commands import show
     from bags.commands.progress import progress_bar
     from bags.designs import documents
@@ -170,7 +160,7 @@ def monitor(
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
 
-    settings = load_config(config) if config is not None else None
+    settings, funnel = settings_if_any(folder, config), documents.funnel_of(folder)
     proved = documents.load_proved(funnel)
     named = named_bags(bags, patience=patience)
     with progress_bar("judging") as progress:
@@ -188,7 +178,7 @@ def monitor(
         worst = named[found.worst[0].bag]
         centre = f" --config {config}" if config else ""
         console.print(
-            f"look at the first: nlsid view {worst} --page --funnel {funnel}{centre}",
+            f"look at the first: nlsid view {folder} {worst}{centre}",
             soft_wrap=True, markup=False, highlight=False,
         )  # fmt: skip
     if table is not None:
@@ -361,19 +351,18 @@ def select(
     config: Config,
     out_dir: Path,
     reading: Reading,
-    options: Mapping[str, Sequence[object]] | None,
 ) -> None:
     """Read by workers, which then try the combinations; say what was left out and why."""
     from bags.chain.choosing import sections_to_try, select_trials
     from bags.commands import show
     from bags.commands.progress import progress_bar
 
-    sections_to_try(config, options)
+    sections_to_try(config, None)
     found = _read(out, bags, config, out_dir, reading)
     with progress_bar("selecting") as progress, reading.workers.sharing() as executor:
         result = select_trials(
             found.trials, config, out_dir,
-            options=options, executor=executor, progress=progress,
+            executor=executor, progress=progress,
         )  # fmt: skip
     show.say_selected(out, result)
 

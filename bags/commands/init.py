@@ -91,6 +91,7 @@ def run_init(
         proposal.content["definitions"] = [
             os.path.relpath(path, target.parent) for path in definitions
         ]
+    target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, yaml_text(proposal).encode())
     roles = ("excitation", "response")
     taken = [signal["path"] for role in roles for signal in proposal.content["signals"][role]]
@@ -114,16 +115,16 @@ def run_init(
         )  # fmt: skip
         said = ", ".join(topics)
         console.print(
-            "  python -m nlsid_ros.trajectory_recorder --ros-args "
-            f"-p \"topics:=[{said}]\" -p bag:=TRIALS/trial_1",
+            f"  nlsid run record \"topics:=[{said}]\" bag:=TRIALS/trial_1",
             soft_wrap=True, markup=False, highlight=False,
         )  # fmt: skip
-    steps = [f"nlsid identify {given} --config {target} --out out"]
+    folder = shlex.quote(str(target.parent))
+    steps = [f"nlsid identify {folder} {given}"]
     if "funnel" in proposal.content:
         steps += [
-            f"nlsid funnel --model out/model.json --config {target} --out out",
-            "nlsid check out/model.proof.json out/funnel.proof.json",
-            f"nlsid monitor --replay {given} --funnel out/funnel.json --config {target}",
+            f"nlsid funnel {folder}",
+            f"nlsid check {folder}",
+            f"nlsid monitor {folder} {given}",
         ]
     for step in steps:
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)

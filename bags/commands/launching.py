@@ -19,9 +19,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from bags.chain.shipped import shipped_file
 from nlsid_core.errors import DataError
 
-WORKFLOWS = ("monitor", "closed_loop", "identify")  # that `nlsid live` lists
+WORKFLOWS = ("monitor", "record", "control", "excite", "identify")  # that `nlsid run` lists
 LOOK = 0.2  # s between looks at whether all still run
 PATIENCE = 20.0  # s for a node to end when asked to
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -82,6 +83,11 @@ class LaunchFile:
             for a in self.arguments
         ]
         return "\n".join([f"{self.path.name}:", *lines])
+
+
+def launch_file(workflow: str) -> LaunchFile:
+    """The shipped launch file of a workflow; DataError if it was not installed."""
+    return LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
 
 
 def in_one_process(commands: Sequence[Sequence[str]]) -> list[str]:

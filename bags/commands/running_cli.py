@@ -1,4 +1,4 @@
-"""A robot held against its funnel: `nlsid monitor`, `live`, `call`, `view` and `demo`.
+"""A robot held against its funnel: `nlsid monitor`, `run`, `view` and `demo`.
 
 A command imports what it runs when it is called.
 """
@@ -7,46 +7,45 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from bags.commands.bag_cli import JsonOption
 from bags.commands.options import (
     BagsArgument,
-    CommandOption,
+    ConfigOption,
+    DefinitionsOption,
+    DesignArgument,
+    ExcitationOption,
+    JsonOption,
     PeriodOption,
     ResponseOption,
     err,
     out,
+    settings_if_any,
+    wiring_of,
 )
 from bags.commands.progress import progress_bar
 
 
 def monitor(
+    folder: DesignArgument,
     bags: BagsArgument,
-    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Replay the bags (live monitoring is funnel_monitor).")
+    config: ConfigOption = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Judge the bags too that the design was made with.")
     ] = False,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="Takes `monitor.nominal`, `definitions`; without it all are judged."),
-    ] = None,
-    definitions: Annotated[
-        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
+    definitions: DefinitionsOption = None,
+    picture: Annotated[
+        Path | None, typer.Option("--out", help="The picture; default DIR/monitor.png.")
     ] = None,
     forecast: Annotated[
         float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
     ] = 0.0,
     response: ResponseOption = None,
-    command: CommandOption = None,
+    excitation: ExcitationOption = None,
     period: PeriodOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
@@ -54,31 +53,26 @@ def monitor(
 
     Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside, breaks the
     assumption or raises the CUSUM alarm, 2 if something was not judged. A tube of one output is
-    drawn too.
+    drawn too. Bags that the design was made with are left out where others are given, as are those
+    of `split.validation`. -y, -u and --period: where state and input of a continuous funnel are.
     """
-    from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
-    from bags.designs.design import Wiring
     from bags.fleet.monitor import judged_of
     from bags.monitoring.replay import replay_bag, to_judge
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
     from bags.recordings.folders import expand_bags
 
-    if not replay:
-        raise typer.BadParameter(
-            "give --replay; a live robot is watched by the node funnel_monitor"
-        )
-    settings = load_config(config) if config is not None else None
-    wiring = Wiring.parse_if_any(response or [], command or [], period)
-    proved = documents.load_proved(funnel, wiring=wiring)
+    settings = settings_if_any(folder, config)
+    wiring = wiring_of(response, excitation, period)
+    proved = documents.load_proved(documents.funnel_of(folder), wiring=wiring)
     folders = expand_bags(bags)
-    if settings is not None:
+    if settings is not None and not every:
         chosen = to_judge(proved.design, folders, validation=settings.split.validation)
         folders = list(chosen.judged)
         for line in chosen.said:
-            err.print(f"{line}; without --config all are judged", soft_wrap=True, markup=False)
+            err.print(f"{line}; with --all these are judged too", soft_wrap=True, markup=False)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
@@ -89,11 +83,11 @@ def monitor(
                 replay_bag(proved, bag, centre=centre, definitions=types, forecast=forecast)
             )
         progress("drawing", 1.0)
-        picture = plot or funnel.with_name(documents.MARGIN_PLOT)
+        target = picture or folder / documents.MARGIN_PLOT
         is_judged = any(entry.judged for entry in replays)
         drawn = report_available() and is_judged and all(entry.half_width for entry in replays)
         if drawn:
-            write_margins(picture, replays)
+            write_margins(target, replays)
     if as_json:
         pairs = zip(replays, folders, strict=True)
         typer.echo(json.dumps([asdict(judged_of(entry, bag, entry.name)) for entry, bag in pairs]))
@@ -106,100 +100,95 @@ def monitor(
     for line in () if as_json else show.paced_lines(replays):
         out.print(line, soft_wrap=True, markup=False, highlight=False)
     if drawn and not as_json:
-        out.print(f"wrote {picture}", soft_wrap=True)
+        out.print(f"wrote {target}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)
     if any(entry.unjudged or not entry.judged for entry in replays):
         raise typer.Exit(2)
 
 
-def live(
+def run(
     workflow: Annotated[
-        str, typer.Argument(help="monitor, closed_loop or identify; none: lists their arguments.")
+        str,
+        typer.Argument(
+            metavar="WORKFLOW",
+            help="monitor, record, control, excite or identify; none: lists their arguments.",
+        ),
     ] = "",
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
+        typer.Argument(
+            metavar="[DIR] [NAME:=VALUE]...",
+            help="A design's folder for monitor and control; the rest as for `ros2 launch`.",
+        ),
     ] = None,
     one_process: Annotated[
         bool, typer.Option("--one-process", help="All nodes in one process, on one executor.")
     ] = False,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
-    from bags.chain.shipped import shipped_file
-    from bags.commands.launching import WORKFLOWS, LaunchFile, in_one_process, run_together
+    from bags.commands.launching import WORKFLOWS, in_one_process, launch_file, run_together
 
-    if importlib.util.find_spec("rclpy") is None:
-        raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    _refuse_without_rclpy()
     if not workflow:
         for name in WORKFLOWS:
-            typer.echo(str(LaunchFile(shipped_file("launch", f"{name}.launch.xml"))))
+            typer.echo(str(launch_file(name)))
         raise typer.Exit(2)
     if workflow not in WORKFLOWS:
         raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
-    launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
-    commands = launch.commands(arguments or [])
+    commands = launch_file(workflow).commands(_launch_arguments(arguments or []))
     raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
 
 
-def call(
-    service: Annotated[
-        str, typer.Argument(help="As /excitation/start; none: lists what there is.")
-    ] = "",
-) -> None:
-    """Call a service of a running node (std_srvs/Trigger), as `ros2 service call` does.
+def _launch_arguments(given: list[str]) -> list[str]:
+    """NAME:=VALUE as they are; a design's folder in front of them as its funnel."""
+    from bags.designs import documents
 
-    Status 0: done, 1: refused, 2: nobody answered.
-    """
-    from bags.commands.launching import run_together
+    if not given or ":=" in given[0]:
+        return given
+    return [f"funnel:={documents.funnel_of(Path(given[0]))}", *given[1:]]
 
+
+def _refuse_without_rclpy() -> None:
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
-    given = [service] if service else []
-    raise typer.Exit(run_together([[sys.executable, "-m", "nlsid_ros.calling", *given]]))
 
 
 def view(
-    bag: Annotated[
-        Path | None, typer.Argument(help="A recording to replay; none: the live robot.")
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DIR]", help="A recording's design; none: the live robot."),
     ] = None,
+    bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="What is replayed.")] = None,
+    config: ConfigOption = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port; 0: one that is free.", min=0, max=65535)] = 8080,
     monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
-    funnel: Annotated[
-        Path | None, typer.Option(help="For a recording: the funnel it is held against.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="For a recording: takes `monitor.nominal`.")
-    ] = None,
     rate: Annotated[
         float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
     ] = 1.0,
     response: ResponseOption = None,
-    command: CommandOption = None,
+    excitation: ExcitationOption = None,
     period: PeriodOption = 0.0,
 ) -> None:
     """Serve a page of tube, signals, margin and events, live or of a recording, until Ctrl-C."""
     from bags.commands.viewing import view_live, view_recording
 
-    if bag is None:
-        if importlib.util.find_spec("rclpy") is None:
-            raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    if folder is None:
+        _refuse_without_rclpy()
         raise typer.Exit(view_live(monitor, host=host, port=port))
-    if funnel is None:
-        raise typer.BadParameter("a recording is held against a funnel: give --funnel")
-    from bags.chain.config import load_config
+    if bag is None:
+        raise typer.BadParameter("give a recording that is held against the design, or neither")
     from bags.commands import show
     from bags.designs import documents
-    from bags.designs.design import Wiring
     from bags.viewing.replay import Recording
 
-    centre = show.centre_of(load_config(config) if config is not None else None)
-    wiring = Wiring.parse_if_any(response or [], command or [], period)
-    recording = Recording(documents.load_proved(funnel, wiring=wiring), bag, centre=centre)
-    view_recording(recording, rate, host=host, port=port)
+    centre = show.centre_of(settings_if_any(folder, config))
+    wiring = wiring_of(response, excitation, period)
+    proved = documents.load_proved(documents.funnel_of(folder), wiring=wiring)
+    view_recording(Recording(proved, bag, centre=centre), rate, host=host, port=port)
 
 
 def demo(
@@ -207,11 +196,24 @@ def demo(
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
     robot: Annotated[
-        str, typer.Option(help="f1tenth, a car's speed; dart, a car's yaw rate on three floors.")
+        str,
+        typer.Option(
+            help="f1tenth, a car's speed; dart, a car's yaw rate on three floors; pendulum or arm, "
+            "simulated in MuJoCo (extra `sim`), or the YAML of another that is."
+        ),
     ] = "f1tenth",
 ) -> None:
-    """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
-    from bags.commands.demo import run_demo
+    """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there.
 
-    if not run_demo(out_dir, out, robot):
+    Of a simulated robot: bags, model, policy, runs that measure the disturbance, funnel, monitor.
+    """
+    from bags.commands.demo import DEMOS, run_demo
+
+    if robot in DEMOS:
+        came_out = run_demo(out_dir, out, robot)
+    else:
+        from bags.commands import track
+
+        came_out = track.demo(robot, out_dir)
+    if not came_out:
         raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""What the commands of `nlsid track` do and print."""
+"""What the commands do and print of a robot whose state is measured and that tracks a motion."""
 
 from pathlib import Path
 
@@ -8,13 +8,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from bags.chain import tracking_steps
-from bags.chain.tracking_config import load_tracking_config
+from bags.chain.shipped import config_file
+from bags.chain.tracking_config import is_tracking, load_tracking_config
 from bags.commands.progress import progress_bar
 from bags.commands.show import breaking_table
 from bags.designs import documents
 from bags.pictures.report import report_available
 from bags.recordings.folders import expand_bags
 from nlsid_core.design.sampled.design import TrackingDesign
+from nlsid_core.errors import DataError
 from nlsid_core.identification.states import StateFit
 from nlsid_core.proofs import check
 from nlsid_core.running.reading import Reading, Status
@@ -38,8 +40,9 @@ def identify(bags: list[Path], config: Path, out_dir: Path) -> None:
     _wrote(out_dir, documents.MODEL, picture=documents.FREE_RUN_PLOT)
 
 
-def plan(model: Path, config: Path, out_dir: Path) -> None:
+def plan(config: Path, out_dir: Path) -> None:
     """The configured motion, and a policy around it."""
+    model = out_dir / documents.MODEL
     policy = tracking_steps.plan_tracking(model, load_tracking_config(config), out_dir)
     seconds = len(policy) * policy.period
     out.print(f"motion of {seconds:g} s in {len(policy)} steps, inside the box of the data")
@@ -109,11 +112,14 @@ def monitor(bags: list[Path], funnel: Path) -> bool:
     return inside == len(runs)
 
 
-def run(config: Path, out_dir: Path) -> bool:
-    """All steps on the configured robot; whether its runs are inside the funnel."""
+def demo(robot: str, out_dir: Path) -> bool:
+    """All steps on a simulated robot, shipped or of a YAML; whether its runs are inside."""
+    config = Path(robot) if robot.endswith(".yaml") else config_file(f"{robot}.yaml")
+    if not is_tracking(config):
+        raise DataError(f"{config}: no motion and no simulation; demos are of simulated robots")
     simulate(config, out_dir / EXCITATIONS)
     identify([out_dir / EXCITATIONS], config, out_dir)
-    plan(out_dir / documents.MODEL, config, out_dir)
+    plan(config, out_dir)
     drive(out_dir, config, out_dir / RUNS)
     funnel([out_dir / RUNS], out_dir, config)
     out.print(str(check(out_dir / documents.FUNNEL_PROOF)), soft_wrap=True)

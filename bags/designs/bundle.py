@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bags.designs.design import AnyDesign, Wiring, read_design
+from bags.designs.provenance import of_funnel
 from nlsid_core import designs, files
 from nlsid_core.arrays import Json
 from nlsid_core.deciding import Deciding
@@ -186,7 +187,10 @@ def _design(parts: Mapping[str, bytes], proof: bytes, wiring: Wiring | None) -> 
         for role, content in parts.items()
     }
     claim = files.parse_document(proof, source=PROOF).get("claim")
-    return read_design(documents, wiring=wiring, claim=claim)
+    design = read_design(documents, wiring=wiring, claim=claim)
+    if wrong := of_funnel(documents["model"], documents["funnel"]).wrong:
+        raise CertificateRejected(f"what was measured contradicts the design: {'; '.join(wrong)}")
+    return design
 
 
 def _beside(folder: Path, proof: bytes) -> dict[str, bytes]:

@@ -97,7 +97,7 @@ def load_proved_funnel(path: Path | str) -> Proved[WiredTube]:
     """`load_proved` for a tube; DocumentError if it is another."""
     proved: Proved[Any] = load_proved(path)
     if not isinstance(proved.design.funnel, TubeFunnel):
-        raise DocumentError(f"{path}: not a tube; `nlsid track` reads sampled funnels")
+        raise DocumentError(f"{path}: not a tube; this reads tubes only")
     return cast(Proved[WiredTube], proved)
 
 

@@ -3,7 +3,7 @@
 import os
 import re
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -17,9 +17,11 @@ from nlsid_core.errors import BagError
 METADATA: Final = "metadata.yaml"
 ROS1: Final = ".bag"
 DATA_FILES: Final = (".mcap", ".db3", ROS1)
+ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MOST_LOOKED_AT: Final = 50  # folders, for bags that lie deeper than what was given
+MOST_PARTS: Final = 10_000  # of one recording; a greater number is a date
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 
 # The C loader where PyYAML has it: ten thousand topics are seconds in Python.
@@ -60,7 +62,7 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
         inside = sorted(
             p
             for p in path.iterdir()
-            if (p.is_dir() and _is_bag(p)) or (p.is_file() and p.suffix in DATA_FILES)
+            if (p.is_dir() and _is_bag(p)) or (p.is_file() and _is_data(p))
         )
         if not inside:
             raise BagError(
@@ -117,14 +119,32 @@ def bag_files(path: Path) -> BagFiles:
         return _described(path, _metadata(path / METADATA))
     if not (there := data_files(path)):
         raise BagError(f"{path} is not a bag: it holds no {' or '.join(DATA_FILES)} file")
-    return BagFiles(there, finished=False)
+    return BagFiles(there, finished=False, notes=_missing_parts(there))
+
+
+def _missing_parts(files: Sequence[Path]) -> tuple[str, ...]:
+    """Which parts are not there of a recording whose parts are numbered from 0."""
+    numbered = [re.search(r"_(\d+)\.", file.name) for file in files]
+    numbers = {int(match[1]) for match in numbered if match}
+    if 0 not in numbers or max(numbers) > MOST_PARTS:
+        return ()
+    missing = set(range(max(numbers))) - numbers
+    return tuple(f"part {number} of the recording is not there" for number in sorted(missing))
 
 
 def data_files(folder: Path) -> tuple[Path, ...]:
     """The data files in a folder; part 2 before part 10."""
-    suffixes = (*DATA_FILES, COMPRESSED)
-    there = [p for p in folder.iterdir() if p.suffix in suffixes and p.is_file()]
+    there = [p for p in folder.iterdir() if _is_data(p) and p.is_file()]
     return tuple(sorted(there, key=_by_number))
+
+
+def _data_name(path: Path) -> Path:
+    """The name before it was compressed, or with which its recorder was killed."""
+    return Path(path.name.removesuffix(COMPRESSED).removesuffix(ACTIVE))
+
+
+def _is_data(path: Path) -> bool:
+    return _data_name(path).suffix in DATA_FILES
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
@@ -217,7 +237,7 @@ def _bad(file: Path, what: str) -> BagError:
 def _is_bag(folder: Path) -> bool:
     if (folder / METADATA).is_file():
         return True
-    stems = sorted(p.stem for p in folder.iterdir() if p.suffix in DATA_FILES)
+    stems = sorted(_data_name(p).stem for p in folder.iterdir() if _is_data(p))
     if len(stems) > 1 and any(p.suffix == ROS1 for p in folder.iterdir()):
         return False  # each is whole, also where one recording was split
     if len(stems) < 2:

@@ -5,9 +5,12 @@ beside it, or half a transaction is in a -journal: then a copy of both is opened
 merges them when it opens a file, and a bag is never changed by reading it.
 """
 
+import os
 import shutil
 import sqlite3
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -22,7 +25,8 @@ from bags.recordings.quality import KEY
 from nlsid_core.errors import BagError
 
 BESIDE: Final = ("-wal", "-journal")
-COUNTED_TOGETHER: Final = 16  # messages: SQLite adds up what so many have
+SALVAGED_BYTES: Final = 2**16  # of messages that are lost together where a page is damaged
+ROWS: Final = "SELECT id, topic_id, timestamp, length(data) FROM messages"
 OLD_RELEASE: Final = "galactic"  # which, like those before it, names no release in its files
 
 
@@ -41,11 +45,16 @@ class SqliteFile:
         beside = [Path(f"{path}{end}") for end in BESIDE]
         beside = [file for file in beside if file.is_file() and file.stat().st_size]
         address = f"file:{quote(str(path.resolve()))}?immutable=1"
-        if beside:
+        missing = _stated_bytes(path) - path.stat().st_size if salvage else 0
+        if beside or missing > 0:
             self._folder = TemporaryDirectory()
             for file in (path, *beside):
                 shutil.copy(file, self._folder.name)
-            address = f"file:{quote(str(Path(self._folder.name) / path.name))}"
+            copy = Path(self._folder.name) / path.name
+            address = f"file:{quote(str(copy))}"
+            if missing > 0:  # SQLite refuses a file that is shorter than it says
+                self.contents.lost.append(f"its last {missing} bytes are not there")
+                os.truncate(copy, path.stat().st_size + missing)
         self._base = sqlite3.connect(address, uri=True)
         try:
             self._look_into(beside)
@@ -69,10 +78,9 @@ class SqliteFile:
         )
         try:
             for topic, log_ns, data in self._base.execute(query, (block.offset, block.end)):
-                if not isinstance(data, bytes) or not 0 <= log_ns < 2**63:
-                    raise BagError(f"a message on topic {topic} with log time {log_ns} ns")
-                rows.setdefault(topic, []).append((log_ns, data))
-        except (sqlite3.Error, BagError) as error:
+                if self._is_message(log_ns, data):
+                    rows.setdefault(topic, []).append((log_ns, data))
+        except sqlite3.Error as error:
             if not self._salvage:
                 raise
             self.contents.lost.append(f"messages {block.offset} to {block.end - 1}: {error}")
@@ -85,20 +93,20 @@ class SqliteFile:
         if beside and self._rows("PRAGMA wal_checkpoint")[0][1] == 0:
             names = " and ".join(file.name for file in beside)
             self.contents.lost.append(f"nothing in {names} belongs to this file")
-        for table in ("topics", "messages"):
-            if not self._columns(table):
-                raise BagError(f"it has no table of {table}")
+        tables = self._rows("SELECT name FROM sqlite_master WHERE type = 'table'")
+        if not {("topics",), ("messages",)} <= set(tables):
+            raise BagError("it has no tables of topics and messages")
         release = OLD_RELEASE
         if "ros_distro" in self._columns("schema"):
             release = str(next(iter(self._rows("SELECT ros_distro FROM schema")), ("",))[0])
         self.contents.metadata.append(Metadata(ROSBAG2, {"ROS_DISTRO": release}))
         self._add_channels()
         try:
-            self._add_blocks()
+            self._add_blocks(self._base.execute(f"{ROWS} ORDER BY id"))
         except sqlite3.Error as error:
             if not self._salvage:
                 raise
-            self.contents.lost.append(str(error))
+            self._add_behind_damage(error)
 
     def _add_channels(self) -> None:
         definitions: dict[str, tuple[str, str]] = {}
@@ -121,36 +129,66 @@ class SqliteFile:
                 number, topic["name"], topic["serialization_format"], said, number
             )
 
-    def _add_blocks(self) -> None:
-        """Runs of messages with about BATCH_BYTES, and how many each topic has in each."""
-        query = (
-            "SELECT min(id), max(id), topic_id, count(*), min(timestamp), sum(length(data)) "
-            f"FROM messages GROUP BY id / {COUNTED_TOGETHER}, topic_id ORDER BY 1"
-        )
-        found, size = self.contents, BATCH_BYTES
-        for first, last, topic, count, start_ns, length in self._base.execute(query):
-            if topic not in found.channels:
-                if not self._salvage:
-                    raise BagError(f"messages on topic {topic}, which nothing declares")
-                found.lost.append(f"{count} messages of unknown topic {topic}")
-                continue
-            if size >= BATCH_BYTES and not (found.blocks and first < found.blocks[-1].end):
-                found.blocks.append(Block(first, 0, start_ns=start_ns, index={}))
-                size = 0
-            block = found.blocks[-1]
-            index = {**(block.index or {})}
-            index[topic] = 0, index.get(topic, (0, 0))[1] + count
-            found.blocks[-1] = Block(
-                block.offset,
-                max(block.end, last + 1) - block.offset,
-                start_ns=min(block.start_ns, start_ns),
-                index=index,
-            )
-            found.counts[topic] = found.counts.get(topic, 0) + count
-            size += length
+    def _add_blocks(self, rows: Iterable[tuple[int, int, int, int]]) -> None:
+        """Runs of messages with about BATCH_BYTES; rows: (id, topic, ns, bytes) of each message."""
+        most = SALVAGED_BYTES if self._salvage else BATCH_BYTES
+        run: list[tuple[int, int, int, int]] = []
+        size = 0
+        try:
+            for row in rows:
+                if size > most:
+                    self._add_block(run)
+                    run, size = [], 0
+                if self._is_message(row[2], b"" if isinstance(row[3], int) else None):
+                    run.append(row)
+                    size += row[3]
+        finally:
+            self._add_block(run)
+
+    def _is_message(self, log_ns: object, data: object) -> bool:
+        """Whether a row has a time and data; BagError if not, unless it is salvaged."""
+        if isinstance(data, bytes) and isinstance(log_ns, int) and log_ns >= 0:
+            return True
+        if not self._salvage:
+            raise BagError(f"a message with log time {log_ns} ns and {type(data).__name__} as data")
+        return False
+
+    def _add_block(self, run: Sequence[tuple[int, int, int, int]]) -> None:
+        counts = Counter(topic for _, topic, _, _ in run)
+        for topic in counts.keys() - self.contents.channels.keys():
+            if not self._salvage:
+                raise BagError(f"messages on topic {topic}, which nothing declares")
+            self.contents.lost.append(f"{counts.pop(topic)} messages of unknown topic {topic}")
+        if counts:
+            first, last = run[0][0], run[-1][0]
+            index = {topic: (0, count) for topic, count in counts.items()}
+            start_ns = min(log_ns for _, _, log_ns, _ in run)
+            block = Block(first, last + 1 - first, start_ns=start_ns, index=index)
+            self.contents.blocks.append(block)
+            self.contents.counts = dict(Counter(self.contents.counts) + counts)
+
+    def _add_behind_damage(self, error: sqlite3.Error) -> None:
+        """The messages behind a damaged page, which are found from the end."""
+        blocks = self.contents.blocks
+        begin = blocks[-1].end if blocks else 0
+        rows: list[tuple[int, int, int, int]] = []
+        with suppress(sqlite3.Error):
+            for row in self._base.execute(f"{ROWS} WHERE id >= {begin} ORDER BY id DESC"):
+                rows.append(row)  # noqa: PERF402 - those before the error count
+        self._add_blocks(reversed(rows))
+        end = f"before {rows[-1][0]}" if rows else "the end"
+        self.contents.lost.append(f"messages from {begin} to {end}: {error}")
 
     def _columns(self, table: str) -> list[str]:
         return [row[1] for row in self._rows(f"PRAGMA table_info({table})")]
 
     def _rows(self, query: str) -> list[Any]:
         return self._base.execute(query).fetchall()
+
+
+def _stated_bytes(path: Path) -> int:
+    """How long the file says it is, as SQLite's format puts it into its first bytes."""
+    with path.open("rb") as stream:
+        head = stream.read(32)
+    page = int.from_bytes(head[16:18], "big")
+    return (2**16 if page == 1 else page) * int.from_bytes(head[28:32], "big")

@@ -161,7 +161,7 @@ class Storage:
         if start.startswith(MAGIC):
             return McapFile(path, salvage=salvage)
         what = f"starts with {start[:8].hex(' ')}" if start else "is empty"
-        raise BagError(f"{path} is not an MCAP, SQLite or ROS 1 file: it {what}")
+        raise BagError(f"it is no MCAP, SQLite or ROS 1 file: it {what}")
 
     def _unzipped(self, path: Path, stream: BinaryIO, *, salvage: bool) -> Path:
         """A file that was compressed whole, unpacked for as long as this is open."""

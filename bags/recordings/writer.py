@@ -18,6 +18,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.storage import Channel, Raw
 from nlsid_core.errors import BagError
 
+MAX_COUNT: Final = 2**32  # an MCAP file counts the messages of a topic in 32 bits
 RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
 
 
@@ -167,7 +168,7 @@ class BagWriter:
             raise BagError(f"{self.path}: {topic}: times {log_time_ns}, {publish_time_ns} ns")
         self.add_topic(topic, msgtype)
         number = self._numbers[topic]
-        count = self.counts[topic] if sequence is None else sequence
+        count = self.counts[topic] if sequence is None else sequence % MAX_COUNT
         self._write(number, data, log_time_ns, publish_time_ns, count)
 
     def copy(self, number: int, raw: Raw) -> None:

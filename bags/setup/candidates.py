@@ -72,7 +72,9 @@ SAYS_COMMAND: Final = re.compile(
 SAYS_RESPONSE: Final = re.compile(
     r"odom|imu|state|measured|vicon|mocap|encoder|pose|gps|dvl|depth|feedback|sensor|actual|(^|/)tf"
 )
-IGNORED_TOPICS: Final = re.compile(r"/(rosout|parameter_events|clock|tf_static|diagnostics\w*)$")
+IGNORED_TOPICS: Final = re.compile(
+    r"(^|/)(rosout|parameter_events|clock|tf_static|diagnostics\w*)$"
+)
 IGNORED_FIELDS: Final = re.compile(
     r"header|stamp|covariance|variance|layout|status|(^|\.)(id|seq|sec|nanosec|width|height)(\.|$)"
     r"|orientation\.[xyzw]$|rotation\.[xyzw]$"

@@ -52,10 +52,10 @@ def choose(
     if responses and excitations:
         return list(responses), list(excitations)
     constant = {each.text for each in found.constant}
-    still = [text for text in excitations if text in constant]
-    if still := still or ([] if excitations else _unmoved(found)):
+    unmoved = [u for u in excitations if u in constant] if excitations else _unmoved(found)
+    if unmoved:
         raise Unfit(
-            f"the command never varies ({', '.join(still)}): a model is identified from how a "
+            f"the command never varies ({', '.join(unmoved)}): a model is identified from how a "
             "robot answers to one that does; if another number drives it, name that with -u"
         )
     best = []
@@ -420,7 +420,7 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
         proposal.walls.append(
             "one bag: a tube is designed on one trial and its level measured on another; record "
-            "more, or cut it: nlsid bag split BAG --out PART --every 5"
+            "more, or cut it: nlsid bag convert BAG --every 5"
         )
 
 

@@ -18,13 +18,17 @@ SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
 
 
 class Arrival(NamedTuple):
-    """One serialised message as it came; times in ns since the epoch."""
+    """One serialised message as it came; times in ns since the epoch.
+
+    sequence: its publisher's count; None where the middleware does not say it.
+    """
 
     topic: str
     msgtype: str
     data: bytes
     log_time_ns: int
     publish_time_ns: int
+    sequence: int | None = None
 
 
 @dataclass
@@ -102,7 +106,7 @@ class Sequence:
         """Take the next message's number."""
         last, self._last = self._last, number
         self._since_back += 1
-        if last is None:
+        if last is None or number == last:  # always the same where the middleware does not count
             return
         if number > last:
             self.missing += number - last - 1
@@ -156,5 +160,6 @@ class Recent:
                     arrival.data,
                     log_time_ns=arrival.log_time_ns,
                     publish_time_ns=arrival.publish_time_ns,
+                    sequence=arrival.sequence,
                 )
         return len(self._arrivals)

@@ -23,7 +23,6 @@ class Recording:
     def __init__(self, bag: BagWriter, *, least_free: float) -> None:
         self.bag = bag
         self.ended = ""
-        self.paused = False
         self._least_free = least_free  # MB
         self._lost: dict[str, int] = {}
         self._sequence: dict[str, Sequence] = {}
@@ -43,20 +42,17 @@ class Recording:
         self.expect(topic)
         self.bag.add_topic(topic, definition.msgtype, definition=definition, offered=offered)
 
-    def add(self, arrival: Arrival, stamp_ns: int, number: int | None = None) -> None:
-        """Take a message; `stamp_ns` is what its regularity is judged by, `number` its publisher's
-        count.
-        """
+    def add(self, arrival: Arrival, stamp_ns: int) -> None:
+        """Take a message; `stamp_ns` is what its regularity is judged by."""
         if self._closed:
             return
-        topic, msgtype, data, log_ns, publish_ns = arrival
+        topic, msgtype, data, log_ns, publish_ns, number = arrival
         self._regularity[topic].update(stamp_ns)
         if number is not None:
             self._sequence[topic].update(number)
-        if self.paused:
-            return
+        times = {"log_time_ns": log_ns, "publish_time_ns": publish_ns}
         try:
-            self.bag.write(topic, msgtype, data, log_time_ns=log_ns, publish_time_ns=publish_ns)
+            self.bag.write(topic, msgtype, data, **times, sequence=number)
         except OSError as error:
             self._end(str(error))
 

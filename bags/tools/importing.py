@@ -24,6 +24,7 @@ from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
+TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
 MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
 _COLUMN: Final = re.compile(
     r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
@@ -152,6 +153,26 @@ def _labels(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
         while count < len(parts) and sum(o[-count:] == parts[-count:] for o in whole) > 1:
             count += 1
         yield path, "/".join(parts[-count:])
+
+
+def every_column(
+    files: Sequence[Path | str], time: str | None, period: float | None
+) -> tuple[str | None, list[str], dict[str, str]]:
+    """The time column, and every other column as a number on a topic of its name.
+
+    Returns the time column (None: rows are `period` s apart), the assignments and the topics'
+    types. Raises DataError if two columns would be one topic.
+    """
+    tables = read_tables(files)
+    names = [name for name, owners in tables.files.items() if len(owners) == 1]
+    if time is None and period is None:
+        time = next((name for name in names if name.lower() in TIMES), None)
+    columns = [n for n in names if n != time and tables.arrays[tables.whole_name(n)].ndim == 1]
+    topics = [f"/{re.sub(r'^(?=[0-9])|[^A-Za-z0-9_]', '_', name)}" for name in columns]
+    if twice := next((topic for topic in topics if topics.count(topic) > 1), None):
+        raise DataError(f"two columns would be {twice}; name them with --signal")
+    assignments = [f"{t}:data={name}" for t, name in zip(topics, columns, strict=True)]
+    return time, assignments, dict.fromkeys(topics, "std_msgs/msg/Float64")
 
 
 def import_tables(

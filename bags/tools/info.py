@@ -15,6 +15,7 @@ from bags.recordings.batch import Batch
 from bags.recordings.cdr import Gatherer, UnreadableMessageError
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
+from bags.signals.arrivals import SOON
 from bags.signals.columns import STAMP
 from bags.signals.timing import ClockRelation, clock_relation
 from nlsid_core.arrays import IntArray
@@ -231,8 +232,17 @@ class _Collector:
 
 
 def missing(sequence: IntArray) -> int | None:
-    """Numbers left out by a recorder that counted up from message to message; None otherwise."""
-    steps = np.diff(np.sort(sequence))
+    """Numbers left out by a recorder that counted up from message to message; None otherwise.
+
+    A publisher that came back counts anew: far below, and then for itself.
+    """
+    counts = [np.diff(np.sort(part)) for part in np.split(sequence, anew(sequence))]
+    steps = np.concatenate(counts)
     if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
         return None
     return int(np.maximum(steps - 1, 0).sum())
+
+
+def anew(sequence: IntArray) -> IntArray:
+    """Where a count goes back by more than messages overtake each other."""
+    return np.flatnonzero(np.diff(sequence) < -SOON) + 1

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bags.recordings.bag import Bag
-from bags.recordings.message_types import decode
+from bags.recordings.message_types import decode, types_in_bag
+from bags.recordings.storage import Channel
 from bags.recordings.writer import BagWriter
 from bags.tools.copying import copy_messages
 from bags.tools.info import missing
@@ -55,12 +56,15 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -
 def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
     """What the new bag says of losses; BagError unless it reads back as it was written."""
     found: dict[str, tuple[int, int]] = {}
+    looked_into: set[int] = set()
     sequences: dict[tuple[str, int], list[IntArray]] = {}
     with Bag(out) as bag:
         for channel, batch in bag.batches():
             topic = channel.topic
-            if topic not in found and (why := _unreadable(bag, topic, batch.data(0))):
-                yield f"{topic}: its messages are kept, and cannot be read: {why}"
+            if channel.encoding == "cdr" and channel.key not in looked_into:
+                looked_into.add(channel.key)
+                if why := _unreadable(channel, batch.data(0)):
+                    yield f"{topic}: its messages are kept, and cannot be read: {why}"
             count, total = found.get(topic, (0, 0))
             total += sum(zlib.crc32(batch.data(k)) for k in range(len(batch)))
             found[topic] = count + len(batch), total
@@ -73,9 +77,14 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             yield f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
 
 
-def _unreadable(bag: Bag, topic: str, data: bytes) -> str:
+def _unreadable(channel: Channel, data: bytes) -> str:
+    """Why a message is none of its type; empty if it is, or if its type is not known."""
     try:
-        decode(data, *bag.types_on(topic))
+        types = types_in_bag(channel.msgtype, channel.definition)
+    except BagError:
+        return ""
+    try:
+        decode(data, channel.msgtype, types)
     except BagError as error:
         return str(error)
     return ""

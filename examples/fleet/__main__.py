@@ -96,12 +96,11 @@ def run(out: Path) -> dict[str, int]:
             stack.enter_context(started(command, port, out / log))
         print(f"{upload()} bags in s3://{BUCKET}, scheduler at {address}, logs in {out}")
         by, config = ["--scheduler", address], ["--config", str(CONFIG)]
-        model, funnel = str(out / "model.json"), str(out / "funnel.json")
         return {
-            "identify": nlsid("identify", PATTERN, *config, "--out", str(out), *by),
-            "funnel": nlsid("funnel", "--model", model, *config, "--out", str(out)),
-            "check": nlsid("fleet", "check", PATTERN, *config, *by),
-            "monitor": nlsid("fleet", "monitor", PATTERN, "--funnel", funnel, *config, *by),
+            "identify": nlsid("identify", str(out), PATTERN, *config, *by),
+            "funnel": nlsid("funnel", str(out), *config),
+            "check": nlsid("fleet", "check", str(out), PATTERN, *config, *by),
+            "monitor": nlsid("fleet", "monitor", str(out), PATTERN, *config, *by),
         }
 
 

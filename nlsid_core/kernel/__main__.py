@@ -35,7 +35,7 @@ def limited(seconds: int, memory: int) -> None:
     except ImportError:
         print("no limits of time and memory on this system", file=sys.stderr)
         return
-    until = int(time.process_time()) + 1 + seconds
+    until = int(time.process_time()) + max(1, seconds)
     resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, memory * 2**20))
     resource.setrlimit(resource.RLIMIT_CPU, (until, resource.getrlimit(resource.RLIMIT_CPU)[1]))
 

@@ -20,9 +20,9 @@ from typing import Any
 
 from . import text
 from .decision import Decision
-from .equations import ImplicitModel, derivative, read_implicit_model
 from .exact import definite
 from .files import Node, Read, Terms, bound_files, refuse_if
+from .implicit_models import ImplicitModel, derivative, read_implicit_model
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import WITNESS, positive_on
 

@@ -114,10 +114,13 @@ class PlanComparison:
         self.model, self._funnels = model, tuple(funnels)
         self.period, self.lags = model.period, len(model)
         self._plans = [policy.plan(model) for policy in policies]
+        self._hidden: list[list[float]] = []  # of each plan's tubes, what rounding can hide
         for plan, funnel in zip(self._plans, funnels, strict=True):
-            for tube in funnel.tubes:
-                hidden = tube.hidden(np.abs(plan.x).max(axis=0), np.abs(plan.y).max(keepdims=True))
-                refuse_coarse(hidden, tube.half_widths, "the plan")
+            most_x, most_y = np.abs(plan.x).max(axis=0), np.abs(plan.y).max(keepdims=True)
+            hidden = [tube.hidden(most_x, most_y) for tube in funnel.tubes]
+            for tube, part in zip(funnel.tubes, hidden, strict=True):
+                refuse_coarse(part, tube.half_widths, "the plan")
+            self._hidden.append([float(part[0]) for part in hidden])
         self.last = [
             min(plan.last, funnel.last) for plan, funnel in zip(self._plans, funnels, strict=True)
         ]
@@ -189,7 +192,9 @@ class PlanComparison:
             spent[j] = (tube.rho * spent[j] + tube.R[0, 0] * e * e) * (1.0 + 8.0 * UNIT)
             if tube.samples is not None and k >= tube.samples:
                 continue
-            size = max(size, abs(away) / (float(tube.half_widths[0]) * (1.0 - ROUNDING)))
+            size = max(
+                size, (abs(away) + self._hidden[i][j]) / (tube.half_widths[0] * (1.0 - ROUNDING))
+            )
             part = spent[j] / (tube.level * (1.0 - ROUNDING))
             if not part <= used:
                 used, most = part, j

@@ -36,7 +36,7 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
-PACE = 0.01  # of a stamp's drift by which the mean follows: over some 100 samples
+PACE = 0.01  # of what a gap is too long, by which the mean follows: over some 100 samples
 OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
 COARSE = "float64 cannot tell where the simulation is"
 WATCHED = "watched as well, not needed for the tube's sentence"
@@ -179,6 +179,9 @@ class TubeRun:
         lost = round(late)
         if lost < 0:
             return early(t, self._last, self.period)
+        if self._last < t:
+            since = (t - self._last) / self.period
+            self._pace += PACE * (since - max(1, round(since)) - self._pace)
         if abs(late - lost) > TOLERANCE:
             self._due, self._last = t + self.period, t
             off = (
@@ -189,7 +192,6 @@ class TubeRun:
             return f"{off}; a new run starts"
         self._last = t
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
-        self._pace += PACE * (FOLLOW * (late - lost) - self._pace)
         if abs(self._pace) > OTHER_PACE:
             mean = (1.0 + self._pace) * self.period
             paced = f"samples come every {mean:.5g} s on average, not every {self.period:g} s"

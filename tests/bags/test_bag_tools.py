@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from mcap.writer import Writer as McapWriter
 from typer.testing import CliRunner
 
@@ -63,22 +64,29 @@ def bag(tmp_path: Path) -> Path:
     return speed_bag(tmp_path / "trial", np.sin(t), np.repeat(np.arange(40.0), 10))
 
 
-def test_every_command_has_help() -> None:
-    output = CliRunner().invoke(app, ["bag", "--help"]).output
-    for name in (
-        "info",
-        "signals",
-        "plot",
-        "check",
-        "recover",
-        "export",
-        "cut",
-        "merge",
-        "split",
-        "import",
-    ):
-        assert name in output
-        assert "--help" in run(name, "--help")
+def leaves(command: Any, name: str = "nlsid") -> dict[str, Any]:
+    """Every verb below a command, by its whole name."""
+    if not hasattr(command, "commands"):
+        return {name: command}
+    inside = command.commands.items()
+    return {k: v for word, verb in inside for k, v in leaves(verb, f"{name} {word}").items()}
+
+
+def test_verbs_are_few_and_an_option_means_the_same_in_all_of_them() -> None:
+    verbs = leaves(typer.main.get_command(app))
+    assert 15 <= len(verbs) <= 20, sorted(verbs)
+    said: dict[str, set[str]] = {}
+    for name, verb in verbs.items():
+        assert verb.help, name
+        for parameter in verb.params:
+            if parameter.param_type_name == "option":
+                assert not parameter.required, f"{name} {parameter.name} has to be given"
+                for flag in parameter.opts:
+                    said.setdefault(flag, set()).add(parameter.opts[0])
+                if parameter.opts[0] in ("--response", "--excitation", "--clock", "--json"):
+                    said.setdefault(f"help of {parameter.opts[0]}", set()).add(parameter.help)
+    assert {"-y", "-u", "--clock", "--json", "--out"} <= set(said)
+    assert not {flag: names for flag, names in said.items() if len(names) > 1}
 
 
 @pytest.mark.slow
@@ -219,7 +227,7 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path:
     assert "throttle" in run("signals", bare, *given)
     run("export", bare, "--out", tmp_path / "tables", *given)
     run("info", bare, *given)
-    run("cut", bare, "--out", tmp_path / "defined", *given)
+    run("convert", bare, "--out", tmp_path / "defined", *given)
     values = read_signals(tmp_path / "defined", [signal])[signal].values
     assert values.tolist() == np.arange(50.0).tolist()
 
@@ -235,7 +243,7 @@ def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: Path) -> None:
-    run("cut", bag, "--out", tmp_path / "part", "--start", "1", "--end", "2", "-t", ODOM)
+    run("convert", bag, "--out", tmp_path / "part", "--start", "1", "--end", "2", "-t", ODOM)
     with Bag(tmp_path / "part") as part, Bag(bag) as whole:
         expected = [
             m
@@ -245,9 +253,9 @@ def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: P
         assert list(part.messages()) == expected
         assert len(expected) == 40
     with pytest.raises(BagError, match="exists already"):
-        run("cut", bag, "--out", tmp_path / "part")
+        run("convert", bag, "--out", tmp_path / "part")
     with pytest.raises(BagError, match="has no message from 99 s"):
-        run("cut", bag, "--out", tmp_path / "none", "--start", "99")
+        run("convert", bag, "--out", tmp_path / "none", "--start", "99")
     assert not (tmp_path / "none").exists()
 
 
@@ -256,10 +264,10 @@ def test_parts_of_a_bag_merge_to_the_whole(
     bag: Path, tmp_path: Path, every: str, count: int
 ) -> None:
     """The bag lasts 9.975 s; a rest of less than half a part is no part of its own."""
-    run("split", bag, "--out", tmp_path / "part", "--every", every)
+    run("convert", bag, "--out", tmp_path / "part", "--every", every)
     parts = sorted(tmp_path.glob("part_*"))
     assert len(parts) == count
-    run("merge", *reversed(parts), "--out", tmp_path / "again")
+    run("convert", *reversed(parts), "--out", tmp_path / "again")
     with Bag(tmp_path / "again") as again, Bag(bag) as whole:
         assert list(again.messages()) == list(whole.messages())
 
@@ -268,9 +276,9 @@ def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
     for name, text in (("a", "float64 x"), ("b", "float64 x"), ("c", "float32 x")):
         write_mcap(tmp_path / f"{name}.mcap", {"/x": ("pkg/msg/X", text)})
     a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
-    run("merge", a, b, "--out", tmp_path / "ab")
+    run("convert", a, b, "--out", tmp_path / "ab")
     with pytest.raises(BagError, match="two definitions of 'pkg/msg/X'; keep them in two bags"):
-        run("merge", a, c, "--out", tmp_path / "ac")
+        run("convert", a, c, "--out", tmp_path / "ac")
     assert not (tmp_path / "ac").exists()
 
 
@@ -278,14 +286,14 @@ def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     once = np.repeat(rng.standard_normal(12), 5)
     bag = speed_bag(tmp_path / "runs", np.tile(once, 5), np.tile(once, 5))
-    run("split", bag, "--out", tmp_path / "run", "--repeats", COMMAND)
+    run("convert", bag, "--out", tmp_path / "run", "--repeats", COMMAND)
     parts = sorted(tmp_path.glob("run_*"))
     assert [p.name for p in parts] == [f"run_{k:02d}" for k in range(1, 6)]
     for part in parts:
         assert read_signals(part, [COMMAND])[COMMAND].values.tolist() == once.tolist()
     assert len({bag_metadata(part)["repeat_group"] for part in parts}) == 1
     with pytest.raises(BagError, match="does not repeat itself"):
-        run("split", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
+        run("convert", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
 
 
 def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: Path) -> None:
@@ -293,7 +301,7 @@ def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: 
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     output = run("recover", damaged, "--out", tmp_path / "whole", status=1)
-    assert "losses, as said above" in output
+    assert "what was lost is said above" in output
     run("recover", bag, "--out", tmp_path / "copy")
 
 
@@ -302,7 +310,7 @@ def test_custom_types_survive_cutting_and_recovery(tmp_path: Path) -> None:
     if not cougars.is_dir():
         pytest.skip("needs cougars_auv in ../shared/data")
     fin = "/coug2/controls/command:fin[0]"
-    run("cut", cougars, "--out", tmp_path / "part", "--end", "20")
+    run("convert", cougars, "--out", tmp_path / "part", "--end", "20")
     part = read_signals(tmp_path / "part", [fin])[fin].values
     np.testing.assert_array_equal(part, read_signals(cougars, [fin])[fin].values[: len(part)])
     output = run("recover", cougars, "--out", tmp_path / "whole")

@@ -116,10 +116,8 @@ def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
 
 
 def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
-    out, model = str(tmp_path / "again"), str(chain / documents.MODEL)
-    made = CliRunner().invoke(
-        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", out]
-    )
+    again = shutil.copytree(chain, tmp_path / "again")
+    made = CliRunner().invoke(app, ["funnel", str(again), "--config", str(CONFIG)])
     said = " ".join(made.output.replace("│", " ").split())
     tube = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.tubes[0]
     level, measured = re.search(r"E <= (\S+) .*? taken whole, (\S+), safety", said).groups()  # type: ignore[union-attr]
@@ -133,8 +131,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
     out = tmp_path / "copy"
     shutil.copytree(chain, out)
-    model = str(out / documents.MODEL)
-    arguments = ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
+    arguments = ["funnel", str(out), "--config", str(CONFIG)]
     made = CliRunner().invoke(app, arguments)
     assert made.exit_code == 0, made.output
     lines = {line[:20].strip(): line[20:].split() for line in made.output.splitlines()}
@@ -161,10 +158,9 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
 def test_a_tube_wider_than_required_ends_with_status_1(
     chain: Path, tmp_path: Path, require: str, status: int
 ) -> None:
-    model, out = str(chain / documents.MODEL), str(tmp_path)
+    again = shutil.copytree(chain, tmp_path / "again")
     made = CliRunner().invoke(
-        app,
-        ["funnel", "--model", model, "--config", str(CONFIG), "--out", out, "--require", require],
+        app, ["funnel", str(again), "--config", str(CONFIG), "--require", require]
     )
     assert made.exit_code == status
     assert ("error: the half-width of speed" in made.output) == bool(status)
@@ -178,11 +174,11 @@ def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     for name in (documents.MODEL, documents.TRAINING):
         shutil.copy(chain / name, tmp_path)
     yaml_file = edited(tmp_path, split__calibration=[])
-    arguments = ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(yaml_file)]
-    made = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
+    arguments = ["funnel", str(tmp_path), "--config", str(yaml_file)]
+    made = CliRunner().invoke(app, arguments)
     assert made.exit_code == 0, made.output
     assert "what it catches is not known" in made.output
-    required = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--require", "0.9"])
+    required = CliRunner().invoke(app, [*arguments, "--require", "0.9"])
     assert required.exit_code == 2, "not measured is neither yes nor no"
 
 
@@ -191,11 +187,10 @@ def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_
     path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
     content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
     path.write_text(json.dumps(content))
-    common = ["--config", str(path), "--out", str(tmp_path)]
-    made = CliRunner().invoke(app, ["identify", str(trial("41")), *common])
+    common = ["--config", str(path)]
+    made = CliRunner().invoke(app, ["identify", str(tmp_path), str(trial("41")), *common])
     assert made.exit_code == 0, made.output
-    model = str(tmp_path / documents.MODEL)
-    made = CliRunner().invoke(app, ["funnel", "--model", model, *common])
+    made = CliRunner().invoke(app, ["funnel", str(tmp_path), *common])
     assert made.exit_code == 0, made.output
     assert "of 1 held-back trial," in made.output
     proved = documents.load_proved_funnel(tmp_path / documents.FUNNEL)
@@ -271,19 +266,15 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     path = edited(tmp_path, funnel={"safety_factor": 1.5})
     for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
-    done = CliRunner().invoke(
-        app,
-        ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(path),
-         "--out", str(tmp_path)],
-    )  # fmt: skip
+    done = CliRunner().invoke(app, ["funnel", str(tmp_path), "--config", str(path)])
     assert done.exit_code == 0, done.output
     assert "for ever" in done.output
     assert not (tmp_path / documents.POLICY).exists()
     done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
     assert done.exit_code == 0, done.output
     bags = [str(trial("05")), str(trial("11"))]
-    held = ["monitor", *bags, "--replay", "--funnel", str(tmp_path / documents.FUNNEL)]
-    done = CliRunner().invoke(app, held)
+    held = ["monitor", str(tmp_path)]
+    done = CliRunner().invoke(app, [*held, *bags])
     assert done.exit_code == 0, done.output
     proved = documents.load_proved(tmp_path / documents.FUNNEL)
     replayed = replay_bag(proved, trial("05"), centre=Centre.COMMAND)
@@ -293,7 +284,7 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     write_faulty_copy(
         trial("05"), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS["zero after 1 s"]
     )
-    done = CliRunner().invoke(app, [held[0], str(tmp_path / "bag"), *held[3:]])
+    done = CliRunner().invoke(app, [*held, str(tmp_path / "bag")])
     assert done.exit_code == 1, done.output
 
 
@@ -468,9 +459,7 @@ def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
 @pytest.mark.pictures
 def test_monitor_command_summarises_draws_and_ends_with_status_0(chain: Path) -> None:
     bags = [str(trial(name)) for name in TEST]
-    done = CliRunner().invoke(
-        app, ["monitor", "--funnel", str(chain / documents.FUNNEL), "--replay", *bags]
-    )
+    done = CliRunner().invoke(app, ["monitor", str(chain), *bags])
     assert done.exit_code == 0, done.output
     assert done.output.count("inside") == len(TEST)
     picture = (chain / documents.MARGIN_PLOT).read_bytes()
@@ -483,10 +472,8 @@ def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
     write_faulty_copy(
         trial("05"), tmp_path / "bad", "/odom:twist.twist.linear.x", FAULTS["scaled by 0.6"]
     )
-    funnel, plot = str(chain / documents.FUNNEL), str(tmp_path / "plot.png")
-    done = CliRunner().invoke(
-        app, ["monitor", "--funnel", funnel, "--plot", plot, "--replay", str(tmp_path / "bad")]
-    )
+    plot = str(tmp_path / "plot.png")
+    done = CliRunner().invoke(app, ["monitor", str(chain), str(tmp_path / "bad"), "--out", plot])
     assert done.exit_code == 1
     assert "innovation energy" in done.output
 
@@ -529,22 +516,18 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
 @pytest.mark.parametrize(
     "verb",
     [
-        ("monitor", "--replay", "BAG", "--funnel", "FUNNEL"),
-        ("check", "FUNNEL_PROOF"),
+        ("monitor", "DIR", "BAG"),
+        ("check", "DIR"),
         ("bag", "info", "BAG"),
         ("bag", "signals", "BAG", "--json"),
-        ("fleet", "monitor", "BAG", "--funnel", "FUNNEL"),
+        ("fleet", "monitor", "DIR", "BAG"),
     ],
 )
 def test_the_status_is_the_same_where_nobody_reads_what_is_said(
     chain: Path, verb: tuple[str, ...]
 ) -> None:
     """As in `nlsid ... | head`: status 1 means outside, bad or rejected, and nothing is."""
-    words = {
-        "BAG": trial("05"),
-        "FUNNEL": chain / documents.FUNNEL,
-        "FUNNEL_PROOF": chain / documents.FUNNEL_PROOF,
-    }
+    words = {"DIR": chain, "BAG": trial("05")}
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "bags.commands.cli", *(str(words.get(w, w)) for w in verb)]
@@ -562,8 +545,8 @@ def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_
             target.write(message.topic, kind, message.data, **times)
     picture = tmp_path / "monitor.png"
     picture.write_bytes(b"of another run")
-    arguments = ["monitor", "--replay", str(tmp_path / "short"), "--plot", str(picture)]
-    done = CliRunner().invoke(app, [*arguments, "--funnel", str(chain / documents.FUNNEL)])
+    arguments = ["monitor", str(chain), str(tmp_path / "short"), "--out", str(picture)]
+    done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 2
     assert picture.read_bytes() == b"of another run"
 
@@ -628,8 +611,8 @@ def test_bad_input_ends_in_one_message_and_leaves_nothing_behind(
     out = tmp_path / "out"
     paths = [str(trial(b)) if b.isdigit() else str(tmp_path / b) for b in bags]
     split = {"split__test": ["trial_05"], "split__calibration": []}
-    arguments = ["identify", *paths, "--config", str(edited(tmp_path, **(split | changes)))]
-    done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+    config = str(edited(tmp_path, **(split | changes)))
+    done = CliRunner().invoke(app, ["identify", str(out), *paths, "--config", config])
     assert isinstance(done.exception, NlsidError)
     assert reason in str(done.exception)
     assert not out.exists()

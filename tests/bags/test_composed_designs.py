@@ -83,9 +83,8 @@ def test_it_is_driven_from_stage_to_stage_and_held_against_each(
         r for _, r, _ in replay_messages(design, tmp_path / "bag") if r.status.value != "unknown"
     ]
     assert [r.margin for r in replayed] == [r.margin for r in readings]
-    runner, where = CliRunner(), ["--funnel", str(folder / designs.COMPOSITION)]
-    where += ["--response", RESPONSE, "--command", COMMAND, "--period", "0.05"]
-    said = runner.invoke(app, ["monitor", "--replay", *where, str(tmp_path / "bag")])
+    where = ["-y", RESPONSE, "-u", COMMAND, "--period", "0.05"]
+    said = CliRunner().invoke(app, ["monitor", str(folder), str(tmp_path / "bag"), *where])
     assert (said.exit_code, "inside" in said.output) == (0, True), said.output
     scene = Scene("a recording", "replay")
     recording = Recording(

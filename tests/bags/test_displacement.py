@@ -61,10 +61,9 @@ def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path
     config.write_text(CONFIG)
     out, run = str(tmp_path / "out"), CliRunner()
     bags = [str(bag) for bag in f1tenth() if bag.name >= "trial_34"]
-    result = run.invoke(app, ["identify", *bags, "--config", str(config), "--out", out])
+    result = run.invoke(app, ["identify", out, *bags, "--config", str(config)])
     assert result.exit_code == 0, result.output
-    model = f"{out}/model.json"
-    result = run.invoke(app, ["funnel", "--model", model, "--config", str(config), "--out", out])
+    result = run.invoke(app, ["funnel", out, "--config", str(config)])
     assert result.exit_code == 0, result.output
     said = " ".join(re.sub(r"[│\n]", " ", result.output).split())
     found = re.search(r"half-width (\S+) m of position, for ever", said)
@@ -73,5 +72,5 @@ def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path
     assert moves
     assert 3 * float(found[1]) <= float(moves[1]) * 1.0001 < 0.5
     unseen = [bag for bag in bags if bag.endswith(("trial_37", "trial_41"))]
-    held = run.invoke(app, ["monitor", "--funnel", f"{out}/funnel.json", "--replay", *unseen])
+    held = run.invoke(app, ["monitor", out, *unseen])
     assert held.exit_code == 0, held.output

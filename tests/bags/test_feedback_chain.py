@@ -8,7 +8,6 @@ from typer.testing import CliRunner
 
 from bags.chain.config import load_config
 from bags.commands.cli import app
-from bags.designs import documents
 from tests.duffing import trials
 from tests.identified_bags import FUNNEL, write_bag, write_config
 
@@ -19,9 +18,9 @@ RUNS, SAMPLES = 8, 240
 def test_init_proposes_feedback_where_linear_models_say_little(tmp_path: Path) -> None:
     for k, trial in enumerate(trials([0.1, 0.15, 0.2, 0.25] * 3, samples=400, damping=0.25)):
         write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
-    config = tmp_path / "robot.yaml"
+    config = tmp_path / "out" / "robot.yaml"
     drive, answer = ("/joint_commands:effort[name=joint_0]", "/joint_states:position[name=joint_0]")
-    given = ["init", str(tmp_path / "bags"), "-u", drive, "-y", answer, "--out", str(config)]
+    given = ["init", str(config.parent), str(tmp_path / "bags"), "-u", drive, "-y", answer]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
     assert load_config(config).identification.given["model"] == "feedback"
@@ -48,16 +47,13 @@ def test_feedback_goes_from_bags_to_a_monitor(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, list(given))
         return result.exit_code, result.output
 
-    code, said = done("identify", *bags, "--config", str(config), "--out", str(out))
+    code, said = done("identify", str(out), *bags, "--config", str(config))
     assert code == 0, said
-    code, said = done(
-        "funnel", "--model", str(out / documents.MODEL), "--config", str(config), "--out", str(out)
-    )
+    code, said = done("funnel", str(out), "--config", str(config))
     assert code == 0, said
-    proofs = (str(out / name) for name in ("model.proof.json", documents.FUNNEL_PROOF))
-    code, said = done("check", *proofs)
+    code, said = done("check", str(out))
     assert (code, said.count("PROVED")) == (0, 2), said
-    held = ("monitor", "--funnel", str(out / documents.FUNNEL), "--replay")
+    held = ("monitor", str(out))
     code, said = done(*held, bags[5])
     assert code == 0, said
     code, said = done(*held, str(tmp_path / "bags" / "broken"))

@@ -107,7 +107,7 @@ def made(
     """A class's name, the folder that `nlsid identify` wrote, and what it said."""
     out = tmp_path_factory.mktemp(request.param)
     config = write_config(out / "robot.yaml", CLASSES[request.param][0])
-    done = nlsid("identify", folder, "--config", config, "--out", out)
+    done = nlsid("identify", out, folder, "--config", config)
     assert done.exit_code == 0, done.output
     return request.param, out, done.output
 
@@ -194,7 +194,7 @@ def test_select_takes_the_order_with_the_least_validation_error(
 ) -> None:
     orders = [[1, 1], [2, 1], [0, 2]]
     config = write_config(tmp_path / "robot.yaml", CASCADE, select={"orders": orders})
-    made = nlsid("select", folder, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", folder, "--config", config, "--select")
     assert made.exit_code == 0, made.output
     model = BlockCascade.from_document(files.load_document(tmp_path / "out" / documents.MODEL))
     assert (len(model.a1), len(model.a2)) == (2, 1)
@@ -250,7 +250,7 @@ def test_a_selection_that_makes_no_sense_says_why(
 def test_a_selection_needs_validation_bags(folder: Path, tmp_path: Path) -> None:
     split = {"test": ["run_5"]}
     config = write_config(tmp_path / "c.yaml", {"lags": 1}, split=split, select={"lags": [1]})
-    made = nlsid("select", folder, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", folder, "--config", config, "--select")
     assert isinstance(made.exception, NlsidError)
     assert "validation trials" in str(made.exception)
 
@@ -265,7 +265,7 @@ def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
 ) -> None:
     section = {"model": "state_affine", "lags": 2, "right_degree": 2}
     config = write_config(tmp_path / "c.yaml", section, outputs=2, inputs=2)
-    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", coupled, "--config", config)
     assert made.exit_code == 0, made.output
     assert "simulation error of each output:" in made.output
     checked = nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
@@ -279,7 +279,7 @@ def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
 def test_several_inputs_of_one_output_are_proved(coupled: Path, tmp_path: Path) -> None:
     section = {"model": "state_affine", "lags": 2, "input_range": [[-3.0, 3.0], [-2.5, 2.5]]}
     config = write_config(tmp_path / "c.yaml", section, outputs=1, inputs=2)
-    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", coupled, "--config", config)
     assert made.exit_code == 0, made.output
     assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0
     model = files.load_document(tmp_path / "out" / documents.MODEL)
@@ -290,7 +290,7 @@ def test_a_class_of_one_output_refuses_two_and_names_the_class_for_them(
     coupled: Path, tmp_path: Path
 ) -> None:
     config = write_config(tmp_path / "c.yaml", {"lags": 2}, outputs=2, inputs=2)
-    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", coupled, "--config", config)
     assert "take state_affine or implicit, or leave out signals" in str(made.exception)
 
 
@@ -313,11 +313,11 @@ def test_nan_and_missing_samples_are_skipped_with_a_count(tmp_path: Path) -> Non
     }
     config, bags = tmp_path / "c.yaml", tmp_path / "bags"
     write_config(config, {"lags": 2}, **sections)
-    refused = nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    refused = nlsid("identify", tmp_path / "out", bags, "--config", config)
     assert "nan in message 100" in str(refused.exception)
     sections["grid"]["split_gaps"] = True
     write_config(config, {"lags": 2}, **sections)
-    made = nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    made = nlsid("identify", tmp_path / "out", bags, "--config", config)
     assert made.exit_code == 0, made.output
     assert "10 samples skipped in gaps" in made.output
     names = files.load_document(tmp_path / "out" / documents.MODEL)["bags"]
@@ -383,14 +383,14 @@ def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
 ) -> None:
     unproved = {"lags": 2, "method": "least_squares", "max_rate": 0.01}
     config = write_config(tmp_path / "c.yaml", {"lags": 2})
-    assert nlsid("identify", coupled, "--config", config, "--out", tmp_path).exit_code == 0
+    assert nlsid("identify", tmp_path, coupled, "--config", config).exit_code == 0
     assert (tmp_path / documents.MODEL_PROOF).exists()
     config = write_config(tmp_path / "c.yaml", unproved)
-    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path)
+    made = nlsid("identify", tmp_path, coupled, "--config", config)
     assert isinstance(made.exception, Infeasible)
     assert (tmp_path / documents.MODEL_PROOF).exists(), "nothing was written"
     config = write_config(tmp_path / "c.yaml", unproved | {"allow_unproved": True})
-    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path)
+    made = nlsid("identify", tmp_path, coupled, "--config", config)
     assert made.exit_code == 0, made.output
     assert "NOT PROVED stable" in made.output
     assert not (tmp_path / documents.MODEL_PROOF).exists()
@@ -413,10 +413,10 @@ def test_every_example_of_the_how_to_runs(
 ) -> None:
     content = dict(example)
     config = write_config(tmp_path / "robot.yaml", content.pop("identification"), **content)
-    command = next((c for c in ("select", "compare") if c in content), "identify")
-    made = nlsid(command, folder, "--config", config, "--out", tmp_path / "out")
+    options = [f"--{option}" for option in ("select", "compare") if option in content]
+    made = nlsid("identify", tmp_path / "out", folder, "--config", config, *options)
     assert made.exit_code == 0, made.output
-    if command == "compare":
+    if options == ["--compare"]:
         assert "proved" in made.output
     else:
         assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0

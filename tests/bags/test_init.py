@@ -61,16 +61,12 @@ def nlsid(*arguments: object, status: int | None = 0) -> str:
 
 def whole_way(bags: Path, config: Path, out: Path) -> str:
     """Check, identify, design, decide, replay: what the last of them says."""
-    assert "nothing is wrong" in nlsid("config", "check", config, bags)
-    nlsid("identify", bags, "--config", config, "--out", out)
-    model = out / documents.MODEL
-    nlsid("funnel", "--model", model, "--config", config, "--out", out)
-    said = nlsid("check", out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF)
+    assert "nothing is wrong" in nlsid("identify", out, bags, "--config", config, "--check")
+    nlsid("identify", out, bags, "--config", config)
+    nlsid("funnel", out, "--config", config)
+    said = nlsid("check", out)
     assert said.count("PROVED ") == 2
-    funnel = out / documents.FUNNEL
-    done = CliRunner().invoke(
-        app, ["monitor", "--replay", str(bags), "--funnel", str(funnel), "--config", str(config)]
-    )
+    done = CliRunner().invoke(app, ["monitor", str(out), str(bags), "--config", str(config)])
     assert done.exit_code in (0, 1), done.exception
     assert "unknown" not in done.output
     return done.output
@@ -86,7 +82,7 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     tmp_path: Path, options: tuple[str, ...], response: str, excitation: str
 ) -> None:
     bags, config = f1tenth()[0].parent, tmp_path / "robot.yaml"
-    said = nlsid("init", bags, "--yes", "--out", config, *options)
+    said = nlsid("init", config.parent, bags, "--yes", *options)
     settings = load_config(config)
     assert settings.signals.response[0].path == response
     assert settings.signals.excitation[0].path == excitation
@@ -99,7 +95,7 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
 
 
 def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
-    nlsid("init", *f1tenth()[:6], "--yes", "--out", tmp_path / "robot.yaml")
+    nlsid("init", tmp_path, *f1tenth()[:6], "--yes")
     lines = (tmp_path / "robot.yaml").read_text().splitlines()
     keys = [k for k, line in enumerate(lines) if re.match(r" *[a-z_]+:", line)]
     assert len(keys) >= 15
@@ -123,7 +119,7 @@ def test_unstamped_commands_are_paired_by_log_times_and_said(tmp_path: Path) -> 
                 times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
                 target.write(message.topic, kind, data, **times)
     config = tmp_path / "robot.yaml"
-    said = nlsid("init", tmp_path / "bags", "--yes", "--out", config, "-u", "/cmd_vel:linear.x")
+    said = nlsid("init", config.parent, tmp_path / "bags", "--yes", "-u", "/cmd_vel:linear.x")
     assert load_config(config).clock == "log"
     assert "mind: /cmd_vel (geometry_msgs/msg/Twist) has no header stamp" in said
     assert "inside" in whole_way(tmp_path / "bags", config, tmp_path / "out")
@@ -172,7 +168,7 @@ def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> No
     bags, package = boat(tmp_path)
     config = tmp_path / "config" / "robot.yaml"
     config.parent.mkdir()
-    said = nlsid("init", bags, "--yes", "--out", config, "--definitions", package)
+    said = nlsid("init", config.parent, bags, "--yes", "--definitions", package)
     settings = load_config(config)
     assert settings.signals.excitation[0].path == "/boat/left:thrust[0]"
     assert settings.signals.response[0].path == "/boat/nav:surge"
@@ -206,9 +202,14 @@ def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path)
                     writer.write(topics[topic], START_NS + k * 50_000_000, data)
     config = tmp_path / "robot.yaml"
     nlsid(
-        "init", tmp_path / "bags", "--out", config,
-        "-u", "/cmd_vel:linear.x", "-y", "/odom_twist:linear.x",
-    )  # fmt: skip
+        "init",
+        config.parent,
+        tmp_path / "bags",
+        "-u",
+        "/cmd_vel:linear.x",
+        "-y",
+        "/odom_twist:linear.x",
+    )
     assert load_config(config).split.test == ("run_2",)
     said = whole_way(tmp_path / "bags", config, tmp_path / "out")
     left_out = [line for line in said.splitlines() if line.startswith("not judged: ")]
@@ -244,9 +245,8 @@ def test_simulated_time_at_another_pace_than_the_log_is_said(
                     topic, kind, bytes(standard_types().serialize_cdr(message, kind)), **times
                 )
     said = nlsid(
-        "init", tmp_path / "run", "--out", tmp_path / "robot.yaml",
-        "-u", "/cmd_vel:linear.x", "-y", "/base_state:linear.x",
-    )  # fmt: skip
+        "init", tmp_path, tmp_path / "run", "-u", "/cmd_vel:linear.x", "-y", "/base_state:linear.x"
+    )
     assert ("mind: simulated time on /clock runs at 0.5 times" in said) is is_said
     assert "has no header stamp" in said
 
@@ -282,7 +282,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
     named += [argument for u in excitations for argument in ("-u", u)]
-    nlsid("init", *f1tenth()[:6], "--out", config, *named)
+    nlsid("init", config.parent, *f1tenth()[:6], *named)
     signals = load_config(config).signals
     assert [signal.unit for signal in signals.response] == ["m/s", "cm/s", "m"]
     assert [signal.name for signal in signals.response] == [
@@ -290,9 +290,7 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     ]  # fmt: skip
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
-    again = nlsid(
-        "init", *f1tenth()[:6], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
-    )
+    again = nlsid("init", tmp_path / "b", *f1tenth()[:6], "-u", CMD, "-y", CMD, status=None)
     assert "is named twice" in again
 
 
@@ -306,7 +304,7 @@ def test_a_measured_effort_drives_where_nothing_commands() -> None:
 @pytest.mark.slow
 def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
-    nlsid("init", schunk()[0].parent, "--yes", "--out", config)
+    nlsid("init", config.parent, schunk()[0].parent, "--yes")
     grid = load_config(config).grid
     assert grid.resample == "last"
     assert grid.period == pytest.approx(10 * 0.004)
@@ -319,9 +317,18 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
     config = tmp_path / "robot.yaml"
     steering = "/steering_command:position[name=steering]"
     nlsid(
-        "init", f1tenth()[0].parent, "--out", config,
-        "-u", CMD, "-u", steering, "-y", SPEED, "-y", YAW,
-    )  # fmt: skip
+        "init",
+        config.parent,
+        f1tenth()[0].parent,
+        "-u",
+        CMD,
+        "-u",
+        steering,
+        "-y",
+        SPEED,
+        "-y",
+        YAW,
+    )
     content = yaml.safe_load(config.read_text())
     assert content["identification"]["model"] == "state_affine"
     assert content["identification"]["input_range"] == [[0.0, 0.4], [-0.2, 0.2]]
@@ -335,16 +342,7 @@ def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
     config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
     nlsid(
-        "init",
-        folder,
-        "--out",
-        config,
-        "-u",
-        CMD,
-        "-y",
-        SPEED,
-        "-y",
-        f"{POSITION}|derivative(0.2 s)",
+        "init", config.parent, folder, "-u", CMD, "-y", SPEED, "-y", f"{POSITION}|derivative(0.2 s)"
     )
     assert len(load_config(config).signals.response) == 2
     assert whole_way(folder, config, tmp_path / "out").count("inside") >= 6
@@ -376,7 +374,7 @@ def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> No
                 )
                 way += 0.05 * speed
                 speed += 0.05 * (force - speed)
-    said = nlsid("init", bags, "--yes", "--out", config, "-u", CMD, "-y", position)
+    said = nlsid("init", config.parent, bags, "--yes", "-u", CMD, "-y", position)
     [response] = load_config(config).signals.response
     assert (response.path, response.name) == (
         f"{position}|washout(2 s)",
@@ -384,6 +382,7 @@ def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> No
     )
     assert f"{position} seems to add up its command, so |washout(2 s) of it is proposed" in said
     assert "is in no model class" not in said
+    assert "named by you" not in said, "nobody named what is proposed"
     assert re.search(r"expect [0-9.]+ % error in simulation .*: good", said)
     assert "inside" in whole_way(bags, config, tmp_path / "out")
 
@@ -428,7 +427,7 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
                     data = bytes(standard_types().serialize_cdr(number(value), kind))
                     stamp = START_NS + k * 100_000_000
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
-    said = nlsid("init", bags, "--out", config, "-u", "/cmd:data", "-y", "/speed:data")
+    said = nlsid("init", config.parent, bags, "-u", "/cmd:data", "-y", "/speed:data")
     assert "commands end up to 4.9 s before the responses do" in said
     expected = re.search(
         r"expect [\d.e-]+ % error in simulation \(of trials held back, in which (.+) varies by "
@@ -445,7 +444,7 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     grid = load_config(config).grid
     assert grid.hold is None
     assert grid.split_gaps
-    nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    nlsid("identify", tmp_path / "out", bags, "--config", config)
     trained = decoded((tmp_path / "out" / documents.TRAINING).read_bytes(), source="it")["training"]
     assert all(trial.u.min() > 0.4 for trial in trained)
     spread = np.std(np.concatenate([t.y for t in trained if t.name.startswith("run_1")]))
@@ -484,10 +483,10 @@ def test_what_seems_wrong_is_asked_before_anything_is_written(
 ) -> None:
     bags, config = lagging(tmp_path / "bags", period=period), tmp_path / "robot.yaml"
     if question:
-        refused = nlsid("init", bags, "--out", config, *named, status=None)
+        refused = nlsid("init", config.parent, bags, *named, status=None)
         assert question in refused
         assert not config.exists()
-    said = nlsid("init", bags, "--out", config, *named, *(["--yes"] if question else []))
+    said = nlsid("init", config.parent, bags, *named, *(["--yes"] if question else []))
     assert said.count("mind: ") == 1 + bool(question), "and that they have no stamps"
     assert question in said
     assert ("if the question above is answered" in said) is bool(question)
@@ -497,7 +496,7 @@ def test_a_command_that_by_its_type_is_measured_is_asked_about(tmp_path: Path) -
     rng = np.random.default_rng(0)
     speeds = [np.cumsum(rng.standard_normal(100)) for _ in range(2)]
     bag = speed_bag(tmp_path / "run", *speeds)
-    said = nlsid("init", bag, "--out", tmp_path / "a.yaml", "-u", SPEED, "-y", CMD, status=None)
+    said = nlsid("init", tmp_path / "a", bag, "-u", SPEED, "-y", CMD, status=None)
     assert f"by type and name {CMD} drives and {SPEED} is measured" in said
 
 
@@ -509,7 +508,7 @@ def test_a_command_that_never_varies_is_an_answer_and_no_configuration(
     for k, speed in enumerate(speeds):
         speed_bag(tmp_path / "bags" / f"run_{k}", speed, np.full(200, 0.3))
     config = tmp_path / "robot.yaml"
-    said = nlsid("init", tmp_path / "bags", "--yes", "--out", config, *named, status=1)
+    said = nlsid("init", config.parent, tmp_path / "bags", "--yes", *named, status=1)
     assert said.count("nothing was written: ") == 1
     assert CMD in said
     assert not config.exists()
@@ -525,7 +524,7 @@ def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) 
         speed += 0.01 * rng.standard_normal(300)
         speed_bag(tmp_path / "bags" / f"run_{k}", speed, command, stamps_ns=stamps.tolist())
     config = tmp_path / "robot.yaml"
-    nlsid("init", tmp_path / "bags", "--out", config, "-u", CMD, "-y", SPEED)
+    nlsid("init", config.parent, tmp_path / "bags", "-u", CMD, "-y", SPEED)
     grid = load_config(config).grid
     assert grid.period == pytest.approx(0.0213333, rel=1e-3)
     assert grid.resample == "none"
@@ -534,9 +533,8 @@ def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) 
     config.write_text(median)
     out = tmp_path / "median"
     told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 33 new runs"
-    assert told in nlsid("identify", tmp_path / "bags", "--config", config, "--out", out)
-    model = out / documents.MODEL
-    assert told in nlsid("funnel", "--model", model, "--config", config, "--out", out)
+    assert told in nlsid("identify", out, tmp_path / "bags", "--config", config)
+    assert told in nlsid("funnel", out, "--config", config)
 
 
 def two_axes(folder: Path) -> None:
@@ -567,7 +565,7 @@ def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: 
 def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(tmp_path: Path) -> None:
     bag, config = tmp_path / "bag", tmp_path / "robot.yaml"
     two_axes(bag)
-    said = nlsid("init", bag, "--yes", "--out", config)
+    said = nlsid("init", config.parent, bag, "--yes")
     [chosen] = load_config(config).signals.response
     other = "b" if chosen.path.startswith("/speed_a") else "a"
     assert f"there are others like it: /speed_{other}:data follows /cmd_{other}:data (+" in said
@@ -636,8 +634,7 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
     u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
     assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
-    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", u, "-y", y,
-                 "--out", tmp_path / "robot.yaml")  # fmt: skip
+    said = nlsid("init", tmp_path, tmp_path / "a", tmp_path / "b", "-u", u, "-y", y)
     assert ": good" in said
     assert "if a trial begins near half a turn" in said
 
@@ -652,7 +649,7 @@ def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
         y += 0.01 * rng.standard_normal(len(y))
         speed_bag(tmp_path / name, y, u, stamps_ns=[0] * len(u))
     config = tmp_path / "robot.yaml"
-    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", CMD, "-y", SPEED, "--out", config)
+    said = nlsid("init", config.parent, tmp_path / "a", tmp_path / "b", "-u", CMD, "-y", SPEED)
     assert load_config(config).clock == "log"
     assert "/odom (nav_msgs/msg/Odometry) has header stamps that are all 0" in said
 
@@ -662,30 +659,28 @@ def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(
     tmp_path: Path,
 ) -> None:
     bags, config = thrusters(tmp_path / "bags"), tmp_path / "robot.yaml"
-    said = nlsid("init", bags, "--out", config, "--yes")
+    said = nlsid("init", config.parent, bags, "--yes")
     assert {signal.path for signal in load_config(config).signals.excitation} == {
         "/left_cmd:data", "/right_cmd:data",
     }  # fmt: skip
     [without] = re.findall(r"without it models are off by (\S+) %", said)
     assert float(without) > 50.0
     assert "nothing that was tried" not in said
-    named = tmp_path / "named.yaml"  # who names one gets that one, and reads of the other
-    said = nlsid("init", bags, "--out", named, "-u", "/left_cmd:data", "--yes")
+    named = tmp_path / "named" / "robot.yaml"  # who names one gets that one, and reads of the other
+    said = nlsid("init", named.parent, bags, "-u", "/left_cmd:data", "--yes")
     assert len(load_config(named).signals.excitation) == 1
     assert "it follows /right_cmd:data" in said
 
 
 def test_without_a_terminal_somebody_has_to_choose(tmp_path: Path) -> None:
-    said = nlsid("init", f1tenth()[0].parent, "--out", tmp_path / "robot.yaml", status=None)
+    said = nlsid("init", tmp_path, f1tenth()[0].parent, status=None)
     assert "name them with --response and --excitation" in said
     assert not (tmp_path / "robot.yaml").exists()
 
 
 def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text("mine")
-    said = nlsid(
-        "init", f1tenth()[0].parent, "--yes", "--out", tmp_path / "robot.yaml", status=None
-    )
+    said = nlsid("init", tmp_path, f1tenth()[0].parent, "--yes", status=None)
     assert "exists already" in said
     assert (tmp_path / "robot.yaml").read_text() == "mine"
 
@@ -701,10 +696,10 @@ def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
 def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
     """A real pseudo-terminal: the second command, then what follows it best."""
     keyboard, terminal = os.openpty()
-    command = [sys.executable, "-m", "bags.commands.cli", "init", *map(str, f1tenth()[:6])]
+    command = [sys.executable, "-m", "bags.commands.cli", "init", str(tmp_path)]
     os.write(keyboard, b"99\n2\n\n")
     done = subprocess.run(
-        [*command, "--out", str(tmp_path / "robot.yaml")], stdin=terminal, capture_output=True,
+        [*command, *map(str, f1tenth()[:6])], stdin=terminal, capture_output=True,
         text=True, check=False, timeout=120,
     )  # fmt: skip
     os.close(terminal)
@@ -732,12 +727,12 @@ def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seco
     bag, parts = SHARED / robot, tmp_path / "parts"
     if not bag.exists():
         pytest.skip(f"needs {robot} in ../shared/data")
-    said = nlsid("init", bag, "--yes", "--out", tmp_path / "one.yaml")
+    said = nlsid("init", tmp_path / "one", bag, "--yes")
     assert "mind: one bag" in said
     parts.mkdir()
-    nlsid("bag", "split", bag, "--out", parts / "part", "--every", seconds)
+    nlsid("bag", "convert", bag, "--out", parts / "part", "--every", seconds)
     config = tmp_path / "robot.yaml"
-    nlsid("init", parts, "--yes", "--out", config)
+    nlsid("init", config.parent, parts, "--yes")
     assert load_config(config).clock == "header"
     whole_way(parts, config, tmp_path / "out")
 
@@ -752,8 +747,9 @@ def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: P
             times = {"log_time_ns": stamp, "publish_time_ns": stamp}
             writer.write("/pump", CMD_TYPE, command(stamp, value), **times)
             writer.write("/level", "sensor_msgs/msg/JointState", joints(stamp, [level]), **times)
-    said = nlsid("init", bag, "--out", tmp_path / "robot.yaml", "-u", "/pump:twist.linear.x",
-                 "-y", "/level:position[name=joint_0]")  # fmt: skip
+    said = nlsid(
+        "init", tmp_path, bag, "-u", "/pump:twist.linear.x", "-y", "/level:position[name=joint_0]"
+    )
     assert "looking into 1 bag\n" in said
     assert "take |derivative(2.5 s) of it" in " ".join(said.split())
 
@@ -789,7 +785,7 @@ SLOW = ("-u", "/power:data", "-y", "/temperature:data", "--yes")  # a sample a s
 @pytest.mark.slow
 def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Path) -> None:
     bags, config = heater(tmp_path / "bags", trials=5), tmp_path / "robot.yaml"
-    said = nlsid("init", bags, "--out", config, *SLOW)
+    said = nlsid("init", config.parent, bags, *SLOW)
     settings = load_config(config)
     assert settings.grid.period == 1.0
     assert settings.monitor.stale_after is None, "the nodes take it from the period"
@@ -802,7 +798,7 @@ def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Pa
 @pytest.mark.slow
 def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
     bags = heater(tmp_path / "bags", trials=5, kelvin=2)
-    said = nlsid("init", bags, "--out", tmp_path / "robot.yaml", *SLOW)
+    said = nlsid("init", tmp_path, bags, *SLOW)
     assert said.count("is it in another unit") == 1
     assert "mind: run_02: temperature is 29" in said
 
@@ -811,17 +807,17 @@ def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
 def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None:
     """Two motions in turn, ten bags: every fifth by name would test one of them twice as often."""
     bags, config = heater(tmp_path / "bags", trials=10, motions=2), tmp_path / "robot.yaml"
-    nlsid("init", bags, "--out", config, *SLOW)
+    nlsid("init", config.parent, bags, *SLOW)
     split = load_config(config).split
     assert (split.calibration, split.test) == (("run_04", "run_05"), ("run_08", "run_09"))
 
 
 def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
-    said = nlsid("init", *f1tenth()[:6], "--yes", "--out", config, "-u", CMD, "-y", SPEED)
+    said = nlsid("init", config.parent, *f1tenth()[:6], "--yes", "-u", CMD, "-y", SPEED)
     [reason] = re.findall(r"identification will refuse \((.*?)\); a response", said)
     assert "rank 1" in reason
-    refused = nlsid("identify", *f1tenth()[:6], "--config", config, "--out", tmp_path, status=None)
+    refused = nlsid("identify", tmp_path, *f1tenth()[:6], "--config", config, status=None)
     assert reason in refused
 
 
@@ -835,7 +831,7 @@ def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_pat
             speeds[k] = 0.8 * speeds[k - 1] + 0.2 * given[k - 1]
         speed_bag(tmp_path / f"run_{run}", speeds + 1e-3 * rng.standard_normal(300), given)
     config = tmp_path / "robot.yaml"
-    said = nlsid("init", tmp_path, "--yes", "--out", config, "-u", CMD, "-y", SPEED)
+    said = nlsid("init", config.parent, tmp_path, "--yes", "-u", CMD, "-y", SPEED)
     assert "will refuse" not in said
     assert "of what it was fitted to" in said
-    nlsid("identify", tmp_path, "--config", config, "--out", tmp_path / "out")
+    nlsid("identify", tmp_path / "out", tmp_path, "--config", config)

@@ -10,6 +10,7 @@ import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from bags.commands.bag_cli import bag_app
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types, types_in_bag
 from bags.signals.reader import read_signals
+from bags.tools.info import bag_info
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import CMD_TYPE, START_NS, command, speed_bag
@@ -32,6 +34,8 @@ from tests.conftest import SHARED
 CASES = SHARED.parent / "cases" / "bags"
 STEP_NS = 20_000_000
 needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="needs cases/bags in ../shared")
+
+COPIES = [("convert", []), ("convert", ["--every", "10"]), ("recover", [])]
 
 
 def run(*arguments: object) -> tuple[int, str]:
@@ -153,7 +157,7 @@ def test_integers_keep_every_digit_and_their_types(tmp_path: Path) -> None:
 @needs_cases
 def test_what_else_the_known_recordings_are_to_say(tmp_path: Path) -> None:
     assert "100 messages, 60 are there" in run("info", CASES / "counts_disagree" / "a")[1]
-    cut = run("cut", CASES / "counts_disagree" / "a", "--out", tmp_path / "c")
+    cut = run("convert", CASES / "counts_disagree" / "a", "--out", tmp_path / "c")
     assert "100 messages, 60 are there" in cut[1]
     signals = run("signals", CASES / "no_slash" / "a.bag")[1]
     assert "speed:data" in signals
@@ -173,23 +177,22 @@ def test_what_else_the_known_recordings_are_to_say(tmp_path: Path) -> None:
 @needs_cases
 def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path) -> None:
     source = CASES / "two_definitions" / "a.mcap"
-    run("cut", source, "--out", tmp_path / "cut", "--end", "0.1")
+    run("convert", source, "--out", tmp_path / "cut", "--end", "0.1")
     assert exported(tmp_path / "cut", tmp_path / "e", "t", "a") == [1.0] * 5
-    run("split", source, "--out", tmp_path / "part", "--every", "0.2")
+    run("convert", source, "--out", tmp_path / "part", "--every", "0.2")
     for copy in (tmp_path / "part_01", tmp_path / "part_02"):
         values = read_signals(copy, ["/t:a", "/t:b"])
         assert set(values["/t:a"].values) == {1.0}
         assert set(values["/t:b"].values) == {2.0}
-    run("merge", source, "--out", tmp_path / "all")
+    run("convert", source, "--out", tmp_path / "all")
     assert "parts with different definitions" in run("info", tmp_path / "all")[1]
 
 
 @needs_cases
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str) -> None:
-    more = ["--every", "10"] if how == "split" else []
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str, more: list[str]) -> None:
     run(how, CASES / "what_a_copy_loses" / "a.mcap", "--out", tmp_path / "copy", *more)
-    copy = tmp_path / ("copy_01" if how == "split" else "copy")
+    copy = tmp_path / ("copy_01" if more else "copy")
     said = run("info", copy)[1]
     for word in ("/quiet", "3 sequence numbers are missing", "robot: x"):
         assert word in said
@@ -364,7 +367,8 @@ def test_a_message_that_cannot_be_unpacked_is_named_and_left_out_of_copies(tmp_p
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
 def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: str) -> None:
-    plain = tmp_path / f"a{suffix}"
+    plain = tmp_path / "run" / f"a{suffix}"
+    plain.parent.mkdir()
     rows = [float_message(k) for k in range(20)]
     if suffix == ".mcap":
         mcap_bag(plain, [FLOAT], ((0, START_NS + k, data) for k, data in enumerate(rows)))
@@ -372,10 +376,12 @@ def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: 
         sqlite_bag(plain, [("/x", FLOAT[1], data) for data in rows])
     else:
         ros1_bag(plain, [(0, data[4:]) for data in rows])
-    packed = tmp_path / f"a{suffix}.zstd"
+    packed = plain.with_name(f"{plain.name}.zstd")
     packed.write_bytes(zstd(plain.read_bytes()))
+    plain.unlink()
     signal = "speed:data" if suffix == ".bag" else "/x:data"
     assert read_signals(packed, [signal])[signal].values.tolist() == ramp(20)
+    assert "20 messages" in run("info", packed.parent)[1]
     packed.write_bytes(packed.read_bytes()[:-40])
     with pytest.raises(BagError, match=packed.name):
         read_signals(packed, [signal])
@@ -429,7 +435,7 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
     data = bytes(types.serialize_cdr(message, kind))
     bag = sqlite_bag(tmp_path / "a.db3", [("/x", kind, data)] * 3, release=release)
     assert read_signals(bag, [signal], clock="log time")[signal].values == pytest.approx(wanted)
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     assert read_signals(tmp_path / "cut", [signal], clock="log time")[signal].values[0] == wanted
 
 
@@ -451,7 +457,7 @@ def test_definitions_are_read_whatever_their_lines_end_with(
     data = b"\0\1\0\0" + struct.pack("<iId", 1, 2, 0.5)
     bag = mcap_bag(tmp_path / "a.mcap", [("/x", "p/msg/L", form, text, "cdr")], [(0, 5, data)])
     assert read_signals(bag, ["/x:i.a"])["/x:i.a"].values.tolist() == [0.5]
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     assert read_signals(tmp_path / "cut", ["/x:i.a"])["/x:i.a"].values.tolist() == [0.5]
 
 
@@ -508,7 +514,7 @@ def test_definitions_and_padding_of_ros_1_are_read_as_they_come(
     channel = ("/x", f"{package}/{name}", "ros1msg", text, "ros1")
     mcap = mcap_bag(tmp_path / "a.mcap", [channel], [(0, 5, data)])
     assert read_signals(mcap, [f"/x:{field}"])[f"/x:{field}"].values.tolist() == [0.5]
-    run("merge", mcap, "--out", tmp_path / "copy")
+    run("convert", mcap, "--out", tmp_path / "copy")
     assert read_signals(tmp_path / "copy", [f"/x:{field}"])[f"/x:{field}"].values[0] == 0.5
 
 
@@ -519,12 +525,12 @@ def test_one_damaged_topic_of_ros_1_does_not_spoil_the_others(tmp_path: Path) ->
     assert "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1" in run("info", bad)[1]
     status, said = run("export", bad, "--out", tmp_path / "out")
     assert (status, "nothing was exported" in said) == (2, True)
-    run("merge", good, bad, "--out", tmp_path / "all")
+    run("convert", good, bad, "--out", tmp_path / "all")
     assert read_signals(tmp_path / "all", ["speed:data"])["speed:data"].values.tolist() == ramp(10)
 
 
-@pytest.mark.parametrize("how", ["cut", "merge", "split", "recover"])
-def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize(("how", "more"), COPIES)
+def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str, more: list[str]) -> None:
     channels = [
         ("/t", "p/msg/V", "ros2msg", text, "cdr")
         for text in ("float64 a\nfloat64 b", "float64 b\nfloat64 a")
@@ -535,10 +541,9 @@ def test_a_copy_keeps_two_definitions_apart(tmp_path: Path, how: str) -> None:
         for k in range(10)
     ]
     bag = mcap_bag(tmp_path / "a.mcap", channels, rows)
-    more = ["--every", "10"] if how == "split" else []
     run(how, bag, "--out", tmp_path / "copy", *more)
     found = []
-    with Bag(tmp_path / ("copy_01" if how == "split" else "copy")) as copy:
+    with Bag(tmp_path / ("copy_01" if more else "copy")) as copy:
         for channel, batch in copy.batches():
             types = types_in_bag(channel.msgtype, channel.definition)
             messages = [decode(batch.data(k), channel.msgtype, types) for k in range(len(batch))]
@@ -551,7 +556,7 @@ def test_a_schema_that_is_not_read_is_copied_as_it_is(tmp_path: Path) -> None:
     bag = mcap_bag(
         tmp_path / "a.mcap", [channel, FLOAT], [(0, 1, b"xyz"), (1, 2, float_message(0))]
     )
-    run("cut", bag, "--out", tmp_path / "cut")
+    run("convert", bag, "--out", tmp_path / "cut")
     with Bag(bag) as before, Bag(tmp_path / "cut") as after:
         assert [c.definition for c in before.channels] == [c.definition for c in after.channels]
         assert [m.data for m in before.messages()] == [m.data for m in after.messages()]
@@ -584,6 +589,10 @@ def test_parts_are_read_in_the_order_of_time(tmp_path: Path, suffix: str, listed
             f"  relative_file_paths:\n{names}"
         )
     assert exported(folder, tmp_path / "out", "x", "data") == ramp(36)
+    (folder / f"run_5{suffix}").unlink()
+    status, said = run("recover", folder, "--out", tmp_path / "whole")
+    assert (status, "nothing was lost" in said) == (1, False)
+    assert ("run_5" if listed else "part 5 of the recording is not there") in said
 
 
 def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) -> None:
@@ -656,7 +665,7 @@ def test_nothing_was_lost_is_not_said_where_counts_differ(tmp_path: Path, stated
         lambda text: text.replace("message_count: 50", f"message_count: {stated}"),
         tmp_path / "trial",
     )
-    for how in ("cut", "export", "recover", "info"):
+    for how in ("convert", "export", "recover", "info"):
         out = [] if how == "info" else ["--out", tmp_path / how]
         status, said = run(how, bag, *out)
         assert f"states {stated} messages, 50 are there" in said
@@ -692,11 +701,54 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
         writer.add_metadata("calibration", {"k": "1"})
         writer.finish()  # type: ignore[no-untyped-call]
     assert channel[0] == "/cmd"
-    run("cut", file, "--out", tmp_path / "one")
-    run("merge", tmp_path / "one", "--out", tmp_path / "two")
+    run("convert", file, "--out", tmp_path / "one")
+    run("convert", tmp_path / "one", "--out", tmp_path / "two")
     assert "4 sequence numbers are missing" in run("info", tmp_path / "two")[1]
     with Bag(tmp_path / "two") as bag:
         assert len(list(bag.kept_beside)) == 2
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
-    run("merge", tmp_path / "one", merged, "--out", tmp_path / "both")
+    run("convert", tmp_path / "one", merged, "--out", tmp_path / "both")
     assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
+
+
+def test_of_a_damaged_sqlite_file_both_ends_come_back(tmp_path: Path) -> None:
+    rows = [("/x", FLOAT[1], float_message(k)) for k in range(3000)]
+    file = sqlite_bag(tmp_path / "a.db3", rows)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2 // 4096 * 4096
+    content[middle : middle + 8192] = b"\xab" * 8192
+    file.write_bytes(content)
+    with pytest.raises(BagError, match=file.name):
+        read_signals(file, ["/x:data"])
+    found = recover(file, tmp_path / "whole")
+    assert 2500 < found.messages < 3000
+    assert "messages from" in found.lost[0]
+    values = read_signals(tmp_path / "whole", ["/x:data"])["/x:data"].values
+    assert {0.0, 2999.0} < set(values) < set(ramp(3000))
+    file.write_bytes(content[: middle - 100])
+    cut = recover(file, tmp_path / "cut")
+    assert 1000 < cut.messages < 2000
+    assert any("bytes are not there" in what for what in cut.lost)
+
+
+@pytest.mark.parametrize("form", ["sqlite", "ros1", "mcap", "zstd"])
+def test_any_changed_byte_ends_in_a_reading_or_an_error_that_names_the_file(
+    tmp_path: Path, form: str
+) -> None:
+    rows = [float_message(k) for k in range(30)]
+    plain = tmp_path / "a.mcap"
+    if form == "sqlite":
+        sqlite_bag(plain, [("/x", FLOAT[1], data) for data in rows])
+    elif form == "ros1":
+        ros1_bag(plain, [(0, data[4:]) for data in rows], compression="bz2")
+    else:
+        mcap_bag(plain, [FLOAT], ((0, START_NS + k, data) for k, data in enumerate(rows)))
+    content = plain.read_bytes() if form != "zstd" else zstd(plain.read_bytes())
+    rng = np.random.default_rng(2)
+    for k in range(60):
+        changed = bytearray(content)
+        changed[int(rng.integers(len(content)))] ^= int(rng.integers(1, 256))
+        plain.write_bytes(changed)
+        for act in (lambda: bag_info(plain), lambda k=k: recover(plain, tmp_path / f"out_{k}")):
+            with suppress(BagError):
+                act()

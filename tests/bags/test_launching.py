@@ -1,4 +1,4 @@
-"""The launch files, as `nlsid live` reads them: nothing in them that does not exist."""
+"""The launch files, as `nlsid run` reads them: nothing in them that does not exist."""
 
 import itertools
 import re
@@ -53,9 +53,9 @@ def test_every_argument_is_described_and_used_and_nothing_else_is(path: Path) ->
 
 def test_arguments_fill_parameters_names_and_remappings_and_conditions_choose_nodes() -> None:
     given = ["funnel:=f.json", "highest:=0.4", "namespace:=/a", "odom:=/a/odom"]
-    without = commands("closed_loop", *given)
+    without = commands("control", *given)
     assert set(without) == {"funnel_publisher", "tracking_controller", "funnel_monitor"}
-    within = commands("closed_loop", *given, "plant:=true", "model:=m.json")
+    within = commands("control", *given, "plant:=true", "model:=m.json")
     assert set(within) - set(without) == {"plant"}
     assert flags(within["plant"], "-p")["model"] == "m.json"
     assert flags(within["tracking_controller"], "-p")["highest"] == "0.4"
@@ -85,16 +85,16 @@ def test_what_only_ros_launch_understands_is_refused(tmp_path: Path) -> None:
         LaunchFile(path)
 
 
-def test_live_without_a_workflow_lists_every_one_with_its_arguments() -> None:
+def test_run_without_a_workflow_lists_every_one_with_its_arguments() -> None:
     pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
-    done = CliRunner().invoke(app, ["live"])
+    done = CliRunner().invoke(app, ["run"])
     assert done.exit_code == 2
     for name in WORKFLOWS:
         assert f"{name}.launch.xml:" in done.output
 
 
-def test_live_with_a_workflow_that_does_not_exist_names_those_that_do() -> None:
+def test_run_with_a_workflow_that_does_not_exist_names_those_that_do() -> None:
     pytest.importorskip("rclpy")
-    done = CliRunner().invoke(app, ["live", "../monitor"])
+    done = CliRunner().invoke(app, ["run", "../monitor"])
     assert done.exit_code == 2
     assert "no workflow '../monitor'; there are: monitor" in done.output

@@ -6,10 +6,12 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
+from bags.designs.bundle import Bundle
 from bags.designs.provenance import of_funnel
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from tests.core.kernel.mutations import CORPUS
+from nlsid_core.errors import CertificateRejected
+from tests.core.kernel.mutations import CORPUS, bind_again, corpus, encoded
 
 FOLDER = CORPUS / "tube" / "following"
 
@@ -59,6 +61,22 @@ def test_trials_are_counted_once_and_said_to_be_worth_what_they_are(
     found = of_funnel(model if fitted is None else model | {"bags": fitted}, funnel)
     assert says in found.said[0]
     assert not found.wrong
+
+
+def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
+    documents: tuple[Json, Json],
+) -> None:
+    _, funnel = documents
+    funnel["tubes"][0]["assumption"]["measured"] = 1.0
+    case = next(case for case in corpus() if (case.kind, case.name) == ("tube", "following"))
+    forged = case.copied()
+    forged.about["funnel.json"] = funnel
+    bind_again(forged)
+    contents = {name.removesuffix(".json"): encoded(d) for name, d in forged.about.items()}
+    bundle = Bundle({**contents, "proof": encoded(forged.document)})
+    assert str(bundle.decided()).startswith("PROVED")
+    with pytest.raises(CertificateRejected, match=r"contradicts the design: .* its level is below"):
+        bundle.design()
 
 
 @pytest.mark.parametrize(

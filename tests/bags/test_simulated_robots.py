@@ -67,9 +67,7 @@ def test_an_unknown_simulated_robot_is_an_error(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     text = (ROOT / "config" / "pendulum.yaml").read_text()
     config.write_text(text.replace("  robot: pendulum\n", "  robot: pendulums\n"))
-    result = CliRunner().invoke(
-        app, ["track", "simulate", "--config", str(config), "--out", str(tmp_path)]
-    )
+    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(tmp_path)])
     assert isinstance(result.exception, DataError)
     assert "there are: pendulum, arm" in str(result.exception)
 
@@ -89,16 +87,14 @@ def test_the_whole_chain_runs_from_one_configuration(tmp_path: Path) -> None:
         text = text.replace(given, shorter)
     config.write_text(text)
     out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["track", "run", "--config", str(config), "--out", str(out)])
+    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert "PROVED funnel" in result.output
     checked = CliRunner().invoke(app, ["check", str(out / "funnel.proof.json")])
     assert checked.output.startswith("PROVED")
-    bags = ["track", "monitor", str(out / "runs"), "--funnel", str(out / "funnel.json")]
+    bags = ["monitor", str(out), str(out / "runs")]
     monitored = CliRunner().invoke(app, bags)
     assert monitored.exit_code == 0, monitored.output
-    fitted = [
-        "track", "funnel", str(out / "excitations"), "--config", str(config), "--design", str(out),
-    ]  # fmt: skip
+    fitted = ["funnel", str(out), str(out / "excitations"), "--config", str(config)]
     refused = CliRunner().invoke(app, fitted)
     assert "fitted on" in str(refused.exception)

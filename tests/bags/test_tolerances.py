@@ -71,7 +71,7 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
     design: OutputTubeDesign, tmp_path: Path
 ) -> None:
     design.save(tmp_path)
-    done = CliRunner().invoke(app, ["tolerances", str(tmp_path), "--out", str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["export", str(tmp_path), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert f"no {CONTROLLER}: no signal is in rad or m" in done.output
     content = yaml.safe_load((tmp_path / "out" / VALIDATOR).read_text())

@@ -1,4 +1,4 @@
-"""Pictures of `nlsid track` show what was identified, planned, proved and watched."""
+"""Pictures of a measured state show what was identified, planned, proved and watched."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -222,9 +222,7 @@ def test_every_step_draws_beside_its_files_and_says_so(tmp_path: Path) -> None:
         text = text.replace(given, shorter)
     config = tmp_path / "pendulum.yaml"
     config.write_text(text)
-    result = CliRunner().invoke(
-        app, ["track", "run", "--config", str(config), "--out", str(tmp_path)]
-    )
+    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(tmp_path)])
     assert result.exit_code == 0, (result.output, result.exception)
     for name in ("free_run.png", "motion.png", "funnel.png", "monitor.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

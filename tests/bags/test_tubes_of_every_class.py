@@ -100,7 +100,7 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     y[:, 0] = 0.01 * np.random.default_rng(0).standard_normal(300)
     gap = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gap")
     bag = write_joint_bag(tmp_path, gap)
-    held = ["monitor", "--replay", "--funnel", str(linear_funnel), str(bag)]
+    held = ["monitor", str(linear_funnel.parent), str(bag)]
     done = CliRunner().invoke(app, held)
     assert done.exit_code == 2, done.output
     lost = "3 samples from 1.000 to 1.020 s: 3 samples are missing"
@@ -126,7 +126,7 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
 def test_forecasts_of_a_bag_are_counted_and_a_faulty_output_leaves_them(
     one: Path, linear_funnel: Path, tmp_path: Path
 ) -> None:
-    held = ["monitor", "--replay", "--funnel", str(linear_funnel), "--forecast", "0.2"]
+    held = ["monitor", str(linear_funnel.parent), "--forecast", "0.2"]
     done = CliRunner().invoke(app, [*held, str(one / "run_5")])
     said = re.search(r"under the commands that came, hold (\d+) of (\d+) samples", done.output)
     assert said is not None, done.output

@@ -168,7 +168,7 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
     files.write_document(problem, spoil(fair()))
     with pytest.raises(NlsidError, match=message):
         FunnelProblem.load(problem).design()
-    given = ["nlsid", "funnel", "--problem", str(problem), "--out", str(out)]
+    given = ["nlsid", "funnel", str(out), "--problem", str(problem)]
     monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit) as stopped:
         cli.main()

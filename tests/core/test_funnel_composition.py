@@ -79,7 +79,8 @@ def test_three_stages_are_one_funnel_and_each_is_still_its_own(
 
 def test_the_command_line_composes_and_checks(proofs: list[Path], tmp_path: Path) -> None:
     runner = CliRunner()
-    made = runner.invoke(app, ["compose", *map(str, proofs[:2]), "--out", str(tmp_path)])
+    stages = [option for proof in proofs[:2] for option in ("--compose", str(proof))]
+    made = runner.invoke(app, ["funnel", str(tmp_path), *stages])
     assert made.exit_code == 0, made.output
     assert "8 files" in made.output
     checked = runner.invoke(app, ["check", str(tmp_path / "composition.proof.json")])

@@ -156,15 +156,11 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     config: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    made = CliRunner().invoke(app, ["identify", *BAGS, "--config", str(config), "--out", str(out)])
+    made = CliRunner().invoke(app, ["identify", str(out), *BAGS, "--config", str(config)])
     assert made.exit_code == 0, made.output
     verdict = check(out / documents.MODEL_PROOF)
     assert "clips its inputs" in verdict.statement
-    refused = CliRunner().invoke(
-        app,
-        ["funnel", "--model", str(out / documents.MODEL), "--config", str(config),
-         "--out", str(out)],
-    )  # fmt: skip
+    refused = CliRunner().invoke(app, ["funnel", str(out), "--config", str(config)])
     assert refused.exit_code != 0
     assert "has no section 'funnel'" in str(refused.exception)
 
@@ -172,13 +168,16 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_the_command_line_compares_methods_on_the_same_bags(
-    config: Path, monkeypatch: pytest.MonkeyPatch
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    content = yaml.safe_load(config.read_text())
+    content["compare"] = [content["identification"] | {"lags": lags} for lags in (1, 2)]
+    both = tmp_path / "both.yaml"
+    both.write_text(yaml.safe_dump(content))
     # A console that was made by an earlier test keeps the width it found.
     monkeypatch.setattr("bags.commands.options.out._width", 80)
-    made = CliRunner().invoke(
-        app, ["compare", *BAGS, "--config", str(config), "--lags", "1", "--lags", "2"]
-    )
+    given = ["identify", str(tmp_path), *BAGS, "--config", str(both), "--compare"]
+    made = CliRunner().invoke(app, given)
     assert made.exit_code == 0, made.output
     for method in (LeastSquares, Rie, Rse, CertifiedRse):
         rows = re.findall(rf"^ {method.name} .*", made.output, re.MULTILINE)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from bags.chain.shipped import config_file
 from bags.chain.tracking_config import load_tracking_config
 from bags.chain.tracking_steps import plan_tracking
-from benchmarks.swing import swing, swing_config
 from nlsid_core import files
 from nlsid_core.design.sampled.motion import (
     NEARNESS,
@@ -19,6 +19,16 @@ from nlsid_core.design.sampled.motion import (
 )
 from nlsid_core.errors import DataError, Infeasible, ShapeError
 from tests.tracked import PERIOD, pendulum
+
+
+def swing_config(folder: Path) -> Path:
+    """config/pendulum.yaml with samples in the place of its motion's two ends."""
+    np.savetxt(folder / "swing.csv", given(), delimiter=",", header="angle,rate", comments="")
+    text = config_file("pendulum.yaml").read_text()
+    start, end = text.index("  start:"), text.index("  input_weight:")
+    path = folder / "swing.yaml"
+    path.write_text(text[:start] + "  samples: swing.csv\n" + text[end:])
+    return path
 
 
 def given(height: float = 0.4, seconds: float = 1.6) -> np.ndarray:
@@ -93,7 +103,6 @@ def test_samples_that_cannot_be_followed_say_why(
 def test_a_configuration_takes_its_samples_from_a_file_beside_it(tmp_path: Path) -> None:
     config = load_tracking_config(swing_config(tmp_path))
     assert config.motion.samples == tmp_path / "swing.csv"
-    np.savetxt(tmp_path / "swing.csv", given(), delimiter=",", header="angle,rate", comments="")
     files.write_document(tmp_path / "model.json", pendulum().document())
     policy = plan_tracking(tmp_path / "model.json", config, tmp_path)
     assert len(policy) == len(given()) - 1
@@ -121,7 +130,3 @@ def test_a_motion_is_either_samples_or_two_ends(tmp_path: Path, extra: str | Non
     path.write_text(text.replace(line, line + extra if extra else ""))
     with pytest.raises(DataError, match="samples"):
         load_tracking_config(path)
-
-
-def test_the_swing_begins_and_ends_at_rest_at_the_same_place() -> None:
-    np.testing.assert_allclose(swing()[[0, -1]], 0.0, atol=1e-12)

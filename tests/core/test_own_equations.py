@@ -66,7 +66,7 @@ def test_the_page_writes_a_problem_for_the_command_line(
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
     (code,) = (block for block in blocks if "spring.json" in block)
     exec(code, {})
-    ended = CliRunner().invoke(app, ["funnel", "--problem", "spring.json", "--out", "spring"])
+    ended = CliRunner().invoke(app, ["funnel", "spring", "--problem", "spring.json"])
     assert ended.exit_code == 0, ended.output
     assert "is applied every 0.0452548" in ended.output
     assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in ended.output

@@ -315,7 +315,7 @@ def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> No
     )  # fmt: skip
     file = tmp_path / "problem.json"
     documents.write_document(file, asked.document())
-    made = CliRunner().invoke(app, ["funnel", "--problem", str(file), "--out", str(tmp_path)])
+    made = CliRunner().invoke(app, ["funnel", str(tmp_path), "--problem", str(file)])
     assert made.exit_code == 0, made.output
     assert ContinuousPolicy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "funnel.proof.json")])

@@ -304,7 +304,7 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     asked = FunnelProblem(field, nominal, np.eye(2), np.eye(1), goal)
     files.write_document(problem_file, asked.document())
     runner = CliRunner()
-    made = runner.invoke(app, ["funnel", "--problem", str(problem_file), "--out", str(tmp_path)])
+    made = runner.invoke(app, ["funnel", str(tmp_path), "--problem", str(problem_file)])
     assert made.exit_code == 0, made.output
     assert "pieces of time decided" in made.output
     assert "found and proved in" in made.output
@@ -313,5 +313,5 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
     assert checked.exit_code == 0
     assert "PROVED funnel" in checked.output
-    neither = runner.invoke(app, ["funnel", "--out", str(tmp_path)])
+    neither = runner.invoke(app, ["funnel", str(tmp_path)])
     assert neither.exit_code != 0

@@ -88,7 +88,7 @@ def test_what_states_the_source_of_its_formula_is_linked_from_the_page_that_deri
 
 def test_figures_of_pages_are_what_the_benchmarks_wrote(tmp_path: Path) -> None:
     (tmp_path / "satellite.json").write_text(json.dumps({"result": {"n1": {"rho": 11.26}}}))
-    page = "{{satellite n1.rho .1f}} s, {{satellite n1.other d}}, {{lstep n1 d}}"
+    page = "{{satellite n1.rho .1f}} s, {{satellite n1.other d}}, {{kernel n1 d}}"
     assert measured.filled(page, tmp_path) == "11.3 s, -, -"
 
 
@@ -100,9 +100,9 @@ def test_figures_that_are_alike_stand_side_by_side(tmp_path: Path) -> None:
         "rows": [{"robot": "arm|left", "widths": [0.1, 0.2]}],
         "differ": {}, "peers": {"drake": "1.51.1"},
     }  # fmt: skip
-    written = {"command": ["python", "-m", "benchmarks.lstep"], "date": "2026-11-23T09:00",
+    written = {"command": ["python", "-m", "benchmarks.kernel"], "date": "2026-11-23T09:00",
                "machine": "one", "commit": "0" * 40, "seconds": 2, "result": result}  # fmt: skip
-    (tmp_path / "lstep.json").write_text(json.dumps(written))
+    (tmp_path / "kernel.json").write_text(json.dumps(written))
     tables = measured.page(tmp_path, ROOT / "benchmarks").partition("on one:")[2]
     rows = [line for line in tables.splitlines() if line and not line.startswith("|---")]
     assert rows == [

@@ -245,12 +245,12 @@ def test_the_face_hands_names_on_and_loads_nothing_before_one_is_used() -> None:
         there = getattr(thing, "__name__", name)
         assert getattr(import_module(said[there]), there) is thing, name
     with pytest.raises(AttributeError, match="no attribute 'Kalman'"):
-        nlsid.Kalman  # type: ignore[attr-defined]  # noqa: B018
+        nlsid.Kalman  # noqa: B018
 
 
 def test_help_and_check_start_without_numpy(tmp_path: Path) -> None:
     (tmp_path / "x.proof.json").write_text("{}")
-    for arguments in (["--help"], ["track", "--help"], ["check", str(tmp_path / "x.proof.json")]):
+    for arguments in (["--help"], ["bag", "--help"], ["check", str(tmp_path / "x.proof.json")]):
         loaded = modules_loaded_by(
             "from contextlib import redirect_stdout, suppress\n"
             "import io; from bags.commands.cli import app\n"

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from bags.chain.shipped import config_file
 from bags.commands.cli import app
-from bags.designs import documents
 from bags.samples import f1tenth
 from tests.house.sources import ROOT
 
@@ -47,11 +46,10 @@ def test_every_file_of_a_walk_runs_on_it(tmp_path: Path) -> None:
     walks: list[set[str]] = [set(), set(), set()]
     for name in ("f1tenth", "f1tenth_driven"):  # around a plan, and around the model's simulation
         config, out = config_file(f"{name}.yaml"), tmp_path / name
-        walks[0] |= files_run_by("identify", *bags, "--config", config, "--out", out)
-        model = out / documents.MODEL
-        walks[1] |= files_run_by("funnel", "--model", model, "--config", config, "--out", out)
-        walks[2] |= files_run_by("check", out / documents.FUNNEL_PROOF)
-        walks[2] |= files_run_by("monitor", "--funnel", out / documents.FUNNEL, "--replay", bags[4])
+        walks[0] |= files_run_by("identify", out, *bags, "--config", config)
+        walks[1] |= files_run_by("funnel", out, "--config", config)
+        walks[2] |= files_run_by("check", out)
+        walks[2] |= files_run_by("monitor", out, bags[4])
     pages = (ROOT / "docs" / "architecture.md").read_text().split("\n## Walk ")[1:]
     for page, ran in zip(pages, walks, strict=True):
         named = set(re.findall(r"`((?:nlsid_core|bags|nlsid_ros)/[\w/]+\.py)`", page))

@@ -52,7 +52,8 @@ class Driven(Robot):
         self.commands[stamp_ns_of(message)] = message.twist.linear.x
 
     def _begun(self, message: String) -> None:
-        self.run = Run.from_document(files.parse_document(message.data)).name
+        run = Run.from_document(files.parse_document(message.data))
+        self.run = f"{run.funnel} {WAITING}" if run.ended else run.name
 
     def call(self, service: str) -> Trigger.Response:
         """The answer of a service of the controller."""
@@ -213,23 +214,17 @@ OTHER = "sha256:" + 64 * "0"
         ("odom", "funnel_monitor judges the funnel odom, not sha256:"),
         (f"{OTHER} {WAITING}", f"funnel_monitor judges the funnel {OTHER}, not sha256:"),
         (f"{{digest}} {UNANNOUNCED}", "funnel_monitor judges no run: set its controller"),
+        ("{digest} 7", "funnel_monitor has judged nothing for 1 s"),
     ],
 )
-def test_verdicts_of_another_funnel_or_of_no_run_end_it_before_it_moves(
+def test_verdicts_of_another_funnel_or_run_end_it_before_it_moves(
     stack: ExitStack, funnel: Path, judging: str, because: str
 ) -> None:
-    robot = Driven(stack, funnel, require_monitor=True)
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
     robot.watch()
-    robot.feed(40, margin_at=0.0, judging=judging.format(digest=robot.bundle.digest))
+    robot.feed(80, margin_at=0.0, judging=judging.format(digest=robot.bundle.digest))
     robot.expect_stop(because)
     assert set(robot.commands.values()) <= {0.0}
-
-
-def test_verdicts_of_another_run_are_none(stack: ExitStack, funnel: Path) -> None:
-    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE, stop_within=0.1)
-    robot.watch()
-    robot.feed(80, margin_at=0.0, judging=f"{robot.bundle.digest} 7")
-    robot.expect_stop("funnel_monitor has judged nothing for 1 s")
 
 
 def test_a_second_node_that_publishes_verdicts_ends_it(stack: ExitStack, funnel: Path) -> None:
@@ -262,6 +257,8 @@ def test_without_the_monitor_it_requires_it_neither_starts_nor_goes_on(
     assert robot.commands == {}
     watching = {"nominal": "profile", "controller": NAME, "command_wait": 0.5, "stale_after": LATE}
     plant = {"model": funnel.with_name("model.json")}
+    for publisher in (robot.odom, robot.command):  # the plant is the only robot
+        robot.node.destroy_publisher(publisher)
     stack.enter_context(process("nlsid_ros.plant", **plant))
     monitor = stack.enter_context(process("nlsid_ros.funnel_monitor", **watching))
     robot.spin_until(lambda: robot.has_said("waiting for the controller"))

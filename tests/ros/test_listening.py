@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 
 
 def init_live(config: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "bags.commands.cli", "init", "--live", "--out", str(config)]
+    command = [sys.executable, "-m", "bags.commands.cli", "init", str(config.parent), "--live"]
     return subprocess.run(
         [*command, "--yes", *options], capture_output=True, text=True,
         timeout=200, check=False,

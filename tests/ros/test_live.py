@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from bags.chain.config import load_config
+from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
@@ -32,6 +33,25 @@ def test_live_nodes_agree_with_the_offline_replay(funnel: Path, tmp_path: Path) 
     assert abs(seen["alarm_ms"]) <= 50
     assert "above the level" in seen["expected"]
     assert seen["expected"] in seen["alarm"]
+
+
+def test_a_demonstration_whose_fault_would_not_be_flagged_is_refused_by_name(
+    funnel: Path, tmp_path: Path
+) -> None:
+    config = load_config(config_file("f1tenth.yaml"))
+    assert config.funnel is not None
+    wide = config.model_copy(
+        update={"funnel": config.funnel.model_copy(update={"safety_factor": 100.0})}
+    )
+    design_funnel_files(funnel.with_name(documents.MODEL), wide, tmp_path)
+    command = [sys.executable, "-m", "nlsid_ros.demo.live", "--out", str(tmp_path / "live")]
+    options = ["--funnel", str(tmp_path / documents.FUNNEL), "--bag", str(f1tenth()[4])]
+    done = subprocess.run(
+        command + options, capture_output=True, text=True, timeout=STARTED, check=False
+    )
+    assert done.returncode == 1
+    [said] = done.stderr.splitlines()
+    assert "live: trial_05 with its sensor scaled by 0.6 is not flagged: inside" in said
 
 
 def played_live(funnel: Path, folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Fields of a command that are not the signal: never zero without a word, and limits per input."""
 
+import math
 import re
 import time
 
@@ -79,8 +80,17 @@ def test_others_in_lists_are_held_to_their_type_too(others: str, said: str) -> N
 
 @pytest.mark.parametrize("module", ["excitation", "tracking_controller"])
 def test_a_node_refuses_others_that_do_not_fit_when_it_is_configured(module: str) -> None:
-    said = refusal(f"nlsid_ros.{module}", highest=0.4, slew=1.0, others='{"twist": {"angular": 1}}')
+    others = '\'{"twist": {"angular": 1}}\''  # quoted, or ROS reads it itself
+    said = refusal(f"nlsid_ros.{module}", highest=0.4, slew=1.0, others=others)
     assert "twist: angular: 1 should be an object of its fields" in said
+
+
+def test_fields_on_a_topic_that_are_not_finite_are_not_passed_on() -> None:
+    made, message = SignalMessage(SPEED, TWIST, "/teleop"), TwistStamped()
+    for z, lacking in ((0.5, ""), (math.nan, "on /teleop, twist.angular.z is nan"), (0.5, "")):
+        message.twist.angular.z = z
+        made._on_other(message)
+        assert made.lacking() == lacking
 
 
 def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:

@@ -212,7 +212,7 @@ def test_what_a_node_cannot_do_it_says_and_exits_with_status_1(
     assert message in refusal(module, **parameters)
 
 
-def test_patterns_pauses_and_snapshots(tmp_path: Path) -> None:
+def test_patterns_and_snapshots(tmp_path: Path) -> None:
     bag = tmp_path / "patterned"
     settings: dict[str, object] = {"topics": "['/robot/*']", "bag": bag, "snapshot": 60.0}
     with (
@@ -232,20 +232,16 @@ def test_patterns_pauses_and_snapshots(tmp_path: Path) -> None:
         for publisher in (a, b):
             publisher.publish(String(data="before"))
         time.sleep(0.3)
-        ask("pause")
-        a.publish(String(data="while paused"))
-        time.sleep(0.3)
-        ask("resume")
+        assert ask("stop") == f"{bag} is closed"
         a.publish(String(data="after"))
         time.sleep(0.3)
-        assert ask("snapshot").startswith("4 messages in ")
+        assert ask("snapshot").startswith("3 messages in ")
         stop(recorder)
-    assert [m[8:].rstrip(b"\0") for m in messages_on(bag, "/robot/a")] == [b"before", b"after"]
+    assert [m[8:].rstrip(b"\0") for m in messages_on(bag, "/robot/a")] == [b"before"]
     assert len(messages_on(bag, "/robot/b")) == 1
     snapshot = tmp_path / "patterned_snapshot_1"
-    assert [m[8:].rstrip(b"\0") for m in messages_on(snapshot, "/robot/a")] == [
-        b"before", b"while paused", b"after",
-    ]  # fmt: skip
+    texts = [m[8:].rstrip(b"\0") for m in messages_on(snapshot, "/robot/a")]
+    assert texts == [b"before", b"after"]
 
 
 def test_in_simulated_time_log_times_are_the_simulations(tmp_path: Path) -> None:

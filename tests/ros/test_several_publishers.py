@@ -18,6 +18,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from bags.recordings.bag import Bag
+from bags.signals.publishers import counted_in_turn
 from nlsid_ros import graph, qos
 from tests.ros.processes import ROOT, call, node_here, process, ros_test, stop
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Ear, Robot
@@ -214,3 +215,5 @@ def test_a_recorder_names_publishers_in_turn_and_one_that_says_nothing_and_follo
         stop(recorder)
     with Bag(bag) as source:
         assert source.count("/driver") == 1
+        [counts] = [batch.sequence for _, batch in source.batches(["/odom"])]
+    assert counted_in_turn(counts), "the bag shows it too"

@@ -349,8 +349,8 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, config: Path) -> None
     pattern = fleet(tmp_path / "fleet", 30) / "*" / "*.mcap"
     out = tmp_path / "out"
     command = [
-        sys.executable, "-m", "bags.commands.cli", "identify", str(pattern),
-        "--config", str(config), "--out", str(out), "--workers", "1",
+        sys.executable, "-m", "bags.commands.cli", "identify", str(out), str(pattern),
+        "--config", str(config), "--workers", "1",
     ]  # fmt: skip
     started = subprocess.Popen(command)
     deadline = time.monotonic() + 60.0

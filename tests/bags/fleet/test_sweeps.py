@@ -34,11 +34,11 @@ select: {seed: [0, 1]}"""
 
 
 def selected(folder: Path, identification: str, *who: str) -> tuple[str, list[bytes]]:
-    """What `nlsid select` says of all that it tried, and what it writes."""
+    """What `nlsid identify --select` says of all that it tried, and what it writes."""
     (folder / "robot.yaml").write_text(CONFIG.replace("IDENTIFICATION", identification))
     bags = [str(path) for path in f1tenth()]
-    given = ["--config", str(folder / "robot.yaml"), "--out", str(folder / "out"), *who]
-    done = CliRunner().invoke(app, ["select", *bags, *given])
+    given = [*bags, "--config", str(folder / "robot.yaml"), "--select", *who]
+    done = CliRunner().invoke(app, ["identify", str(folder / "out"), *given])
     assert done.exit_code == 0, done.output
     written = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
     _, chosen, rest = done.output.partition("chosen by")  # workers say first what they read

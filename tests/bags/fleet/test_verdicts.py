@@ -154,12 +154,12 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     (tmp_path / "fleet" / "robot_2" / "cut.mcap").write_bytes(b"no bag")
     pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
     table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
-    given = ["--funnel", str(design), "--out", str(table), "--manifest", str(kept)]
-    done = CliRunner().invoke(app, ["fleet", "monitor", pattern, *given])
+    given = ["--out", str(table), "--manifest", str(kept)]
+    done = CliRunner().invoke(app, ["fleet", "monitor", str(design.parent), pattern, *given])
     assert done.exit_code == 1, done.output
     assert "robot_2/cut: " in done.output
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
-    assert f"nlsid view {worst} --page --funnel {design}" in done.output
+    assert f"nlsid view {design.parent} {worst}" in done.output
     assert "is not an MCAP file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
@@ -222,9 +222,10 @@ def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: P
     drive(fleet / "a[bold][/red]\x1b[2J.mcap", samples=117)
     (fleet / "b[").mkdir()  # the rest of the name is after a slash
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
-    check, monitor = ["check", "--config", str(CONFIG)], ["monitor", "--funnel", str(design)]
+    where = [str(design.parent), str(fleet)]
+    check, monitor = ["check", *where, "--config", str(CONFIG)], ["monitor", *where]
     for given, status in ((check, 2), (monitor, 2)):  # one was not read
-        done = CliRunner().invoke(app, ["fleet", *given, str(fleet)], env={"COLUMNS": "200"})
+        done = CliRunner().invoke(app, ["fleet", *given], env={"COLUMNS": "200"})
         assert done.exit_code == status, done.output
         assert "a[bold][" in done.output
         assert "red]\N{REPLACEMENT CHARACTER}[2J" in done.output
@@ -282,7 +283,7 @@ def fleet_command(verb: str, *given: str, columns: int = 80) -> tuple[int, list[
 
 @pytest.mark.parametrize("columns", [80, 140])
 def test_check_puts_first_what_the_next_step_refuses(spoiled: Path, columns: int) -> None:
-    given = (str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
+    given = ("DIR", str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
     status, lines = fleet_command("check", *given, columns=columns)
     assert status == 1
     assert lines[0] == "15 bags: 3 not read, 2 bad, 1 copy, 0 look, 9 good"
@@ -325,7 +326,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     spoiled: Path, design: Path, tmp_path: Path
 ) -> None:
     pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
-    given = (pattern, "--funnel", str(design), "--manifest", kept)
+    given = (str(design.parent), pattern, "--manifest", kept)
     _, lines = fleet_command("monitor", *given, columns=80)
     said = "\n".join(lines)
     assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
@@ -374,7 +375,7 @@ def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_p
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     for k in range(2):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, held=0.25)
-    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines == [
         "2 bags: 0 not read, 0 bad, 0 copies, 0 look, 2 good",
@@ -387,7 +388,7 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
 ) -> None:
     for k, lost in enumerate((3, 0, None)):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, lost=lost)
-    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
     assert lines[1].split() == [

@@ -20,23 +20,22 @@ def hostile() -> dict[str, Claim]:
 
 def equal_hashes(pairs: int) -> Claim:
     """2^pairs monomials whose packed exponents are equal modulo 2^61 - 1: x_j or x_(j+10)²."""
-    n = 30
+    n, m = 10, 40
     rows = []
     for choice in product((0, 1), repeat=pairs):
-        exponents = [0] * (1 + n)
-        for j, other in enumerate(choice):
-            j += 1 + (j // 10) * 10
-            exponents[j + 10 * other] = 1 + other
+        exponents = [0] * (1 + n + m)
+        for pair, other in enumerate(choice):
+            exponents[1 + pair + pair // 10 * 10 + 10 * other] = 1 + other
         rows.append(exponents)
     model = {
         "format": "nlsid/model", "version": 2, "kind": "implicit", "period": 1, "monotonicity": 1,
-        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]", "inputs": [],
+        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]", "inputs": [f"u{i}" for i in range(m)],
         "states": [f"x{i}" for i in range(n)],
         "h": {"exponents": rows, "coefficients": [[1]] * len(rows)},
-        "shift": {"exponents": [[int(i == j) for j in range(n)] for i in range(n)],
+        "shift": {"exponents": [[int(i == j) for j in range(n + m)] for i in range(n)],
                   "coefficients": [[int(i == j) for j in range(n - 1)] for i in range(n)]},
     }  # fmt: skip
-    witness = {"basis": [[0] * 125], "columns": [0], "squares": {"unit": 0, "factors": [[]]}}
+    witness = {"basis": [[0] * 83], "columns": [0], "squares": {"unit": 0, "factors": [[]]}}
     return bound("stable_set", model, {}, {"inequalities": {"monotone": witness}})
 
 

@@ -111,6 +111,9 @@ def down(value: float) -> str:
 
 
 def rounded(value: float, mode: str) -> str:
+    own = Decimal(repr(value)).normalize()
+    if len(own.as_tuple().digits) <= 6:
+        return f"{own:f}"
     number = Context(prec=4, rounding=mode).create_decimal(Decimal(value)).normalize()
     return f"{number:f}"
 
