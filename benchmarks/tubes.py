@@ -34,6 +34,7 @@ from benchmarks.recorded import block_means
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import OutputTube
 from nlsid_core.design.levels import followed
 from nlsid_core.design.tube import design_output_tube, energy, innovations, scaled_to
 from nlsid_core.errors import NlsidError
@@ -228,10 +229,10 @@ def measure(case: Case) -> dict[str, float | int]:
     model = identify(case.train, case.model_class, **(case.options or {})).model
     keys: dict[str, float | int] = {"identify_s": time.process_time() - started}
     started = time.process_time()
+    horizon = case.horizon * model.period
     made = design_output_tube(
-        model, case.train, case.calibration,
-        safety_factor=FACTOR, horizon=case.horizon * model.period,
-    )  # fmt: skip
+        OutputTube(model, case.train, case.calibration, safety_factor=FACTOR, horizon=horizon)
+    )
     keys["design_s"] = time.process_time() - started
     seconds = []
     for _ in range(CHECKS):
@@ -289,7 +290,7 @@ def lasting(samples: int) -> dict[str, float]:
     """
     case = f1tenth_case(Polynomial(4))
     model = identify(case.train, case.model_class).model
-    made = design_output_tube(model, case.train, case.calibration)
+    made = design_output_tube(OutputTube(model, case.train, case.calibration))
     monitor, k = Monitor(model, None, made.funnel), 0
     tenths: list[list[float]] = [[] for _ in range(10)]
     grown = [0.0] * 10
