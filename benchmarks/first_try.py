@@ -304,31 +304,6 @@ def judged(
     }
 
 
-def show(results: dict[str, Any], indent: str = "") -> None:
-    """A line for each figure."""
-    for key, value in results.items():
-        if isinstance(value, dict):
-            print(f"{indent}{key}")
-            show(value, indent + "  ")
-            continue
-        if isinstance(value, list):
-            value = ", ".join(f"{entry:.3g}" for entry in value)
-        name = f"{indent}{key}"
-        print(f"{name:26} {value:.5g}" if isinstance(value, float) else f"{name:26} {value}")
-
-
-def line(name: str, told: dict[str, Any]) -> str:
-    """One row of the table: what was proved and how long it took, without and with a hold."""
-    row = f"{name:14}"
-    for key, part in (("", told), ("held ", told.get("held"))):
-        if part is None:
-            continue
-        row += f" {key}{'proved' if part['proved'] else 'not proved'} in {part['seconds']:.1f} s"
-        if part["proved"]:
-            row += f", {part['left']} of {part['starts']} left;"
-    return row
-
-
 def summary(results: dict[str, Any]) -> dict[str, Any]:
     """The figures over all problems that were tried, and what became of each."""
     held = [told["held"] for told in results.values() if "held" in told]
@@ -355,7 +330,7 @@ def main() -> None:
     results: dict[str, Any] = {}
     for name in arguments.only:
         results[name] = run(name, arguments.starts, arguments.limit)
-        print(line(name, results[name]), flush=True)
+        print(name, results[name], flush=True)
         if arguments.out is not None:
             written = json.dumps(summary(results), indent=1) + "\n"
             files.write_atomically(arguments.out, written.encode())

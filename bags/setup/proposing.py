@@ -135,11 +135,13 @@ def propose(
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
     if len(responses) > 1:
-        section["method"] = "sem_certified"
+        section |= {"method": "sem", "certified": True}
         proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
-    _refuse_constant(excitations, _ranges(trials.train), "drives", "the training trials")
+    in_training = _ranges(trials.train)
+    if all(_is_constant(*ends) for ends in in_training):
+        _refuse_constant(excitations, in_training, "drives", "the training trials")
     say_direction(proposal, found, trials.every)
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
@@ -184,12 +186,16 @@ def _ranges(trials: Dataset) -> list[tuple[float, float]]:
     return list(zip(u.min(axis=0).tolist(), u.max(axis=0).tolist(), strict=True))
 
 
+def _is_constant(low: float, high: float) -> bool:
+    return high - low <= ROUNDED * max(abs(low), abs(high))
+
+
 def _refuse_constant(
     texts: Sequence[str], ranges: Sequence[tuple[float, float]], does: str, where: str
 ) -> None:
     """Raise Unfit for the first signal that does not vary by more than rounding."""
     for text, (low, high) in zip(texts, ranges, strict=True):
-        if high - low <= ROUNDED * max(abs(low), abs(high)):
+        if _is_constant(low, high):
             raise Unfit(
                 f"{text} is what {does}, and it is always {low:g} in {where}: a model is "
                 "identified from how a response follows a command that varies"
