@@ -183,7 +183,7 @@ def wide(found: Catching, share: float, error: float, shares: tuple[float, ...])
 def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert wide(found, 0.5, 0.1, (0.4,)).warnings() == []
     poor = wide(found, 0.5625, 0.375, (0.44, 0.05, 0.04)).warnings()
-    assert "is 0.563 of its range, 1 m/s; more than 0.5 says little" in poor[0]
+    assert "is 0.5625 of its range, 1 m/s; more than 0.5 says little" in poor[0]
     assert "trial 0 sets the level: it uses 8.8 times as much" in poor[1]
     assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor[1]
     assert "off by up to 0.375 m/s" in poor[2]

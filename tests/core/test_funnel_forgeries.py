@@ -127,7 +127,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (shapes_swapped, "not positive"),
     (nominal_shifted, "not positive"),
     (other_inertia, "not positive"),
-    (degree_raised, "distinct, in increasing order"),
+    (degree_raised, "exponents should be 0 or more, 7 together at most"),
     (shape_asymmetric, "P at knot 7 is not symmetric"),
     (column_shifted, "not positive"),
 ]

@@ -68,7 +68,6 @@ def test_the_banded_simulation_is_the_models_own() -> None:
 def test_the_truth_is_found_and_proved(fit: MomentFit) -> None:
     assert percent(fit.model) < 2.0
     assert 0.0 < fit.proof.rate < 1.0
-    assert "proved stable" in str(fit)
 
 
 def test_the_proof_holds_on_pairs_of_solutions(fit: MomentFit) -> None:

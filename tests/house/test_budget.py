@@ -8,7 +8,7 @@ import ast
 
 import pytest
 
-from tests.house.sources import ROOT, Source, sources
+from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 23_300,
