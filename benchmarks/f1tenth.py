@@ -74,7 +74,8 @@ def first_iterate(train: Dataset, lags: int) -> Model:
     """The model that minimises the first bound of the robust simulation error."""
     problem = build_state_affine_rows(train, Polynomial(lags))
     first = next(robust_simulation_error(problem.rows))
-    return problem.model(first.theta, first.p)
+    model: Model = problem.model(first.theta, first.p)
+    return model
 
 
 def bias_removed(train: Dataset, test: Dataset, lags: int) -> dict[str, float | int | bool]:

@@ -42,7 +42,8 @@ def stacked() -> StateAffineRows:
 @pytest.fixture(scope="module")
 def model(stacked: StateAffineRows) -> StateAffineModel:
     *_, last = certified_simulation_error(stacked, iterations=4)
-    return stacked.model(last.point.theta, last.point.p)
+    made: StateAffineModel = stacked.model(last.point.theta, last.point.p)
+    return made
 
 
 @pytest.fixture(scope="module")
