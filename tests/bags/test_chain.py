@@ -119,9 +119,9 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     made = CliRunner().invoke(app, ["funnel", str(again), "--config", str(CONFIG)])
     said = " ".join(made.output.replace("│", " ").split())
     tube = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.tubes[0]
-    level, measured = re.search(
-        r"E <= (\S+) .*? largest of 16 distinct trials (\S+), safety", said
-    ).groups()  # type: ignore[union-attr]
+    found = re.search(r"E <= (\S+) .*? largest of 16 distinct trials (\S+), safety", said)
+    assert found
+    level, measured = found.groups()
     assert 0.999 * tube.level < float(level) <= tube.level
     assert tube.measured <= float(measured) < 1.001 * tube.measured
     assert "probability at most 1/17" in said

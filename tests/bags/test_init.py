@@ -816,7 +816,7 @@ def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path)
     config = tmp_path / "robot.yaml"
     said = nlsid("init", config.parent, *f1tenth()[:6], "--yes", "-u", CMD, "-y", SPEED)
     [reason] = re.findall(r"identification will refuse \((.*?)\); a response", said)
-    assert "rank 1" in reason
+    assert "has rank 2" in reason
     refused = nlsid("identify", tmp_path, *f1tenth()[:6], "--config", config, status=None)
     assert reason in refused
 

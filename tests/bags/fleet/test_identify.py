@@ -201,7 +201,7 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
     found = run(folder / "*" / "*.mcap", config, tmp_path / "out")
     assert set(found.left_out) == {"robot_0/cut", "robot_0/text", "robot_1/copy"}
     assert "truncated or unfinished" in found.left_out["robot_0/cut"]
-    assert "is not an MCAP file" in found.left_out["robot_0/text"]
+    assert "is no MCAP, SQLite or ROS 1 file" in found.left_out["robot_0/text"]
     assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
     assert (set(found.unread), set(found.unusable), set(found.copies)) == (
         {"robot_0/cut", "robot_0/text"}, set(), {"robot_1/copy"},

@@ -160,7 +160,7 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     assert "robot_2/cut: " in done.output
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
     assert f"nlsid view {design.parent} {worst}" in done.output
-    assert "is not an MCAP file" in done.output
+    assert "is no MCAP, SQLite or ROS 1 file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
     assert set(rows) == {"robot_1/other", "robot_2/cut"}
@@ -240,7 +240,7 @@ def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
     rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
     assert [row.bag for row in rows] == list(bags)
     assert rows[-1].verdict == "not read"
-    assert "is not an MCAP file" in rows[-1].trouble
+    assert "is no MCAP, SQLite or ROS 1 file" in rows[-1].trouble
     assert all(row.findings and row.start.startswith("2022-01-01T00:") for row in rows[:3])
     parquet = pytest.importorskip("pyarrow.parquet")
     write_parquet(rows, tmp_path / "t.parquet")
@@ -423,7 +423,7 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
     )
     assert lines[1:3] == [
         "left out, not read: 1 bag",
-        "  cut: is not an MCAP file: it starts with 6e 6f 20 62 61 67",
+        "  cut: is damaged or not a bag: it is no MCAP, SQLite or ROS 1 file: it starts with 6e 6f 20 62 61 67",
     ]
 
 
