@@ -105,13 +105,14 @@ def test_what_is_not_proved_has_no_tolerances(design: OutputTubeDesign, tmp_path
 @pytest.mark.parametrize(
     ("signals", "joints"),
     [
-        ((("a", "rad", "/j:position[name=elbow]"), ("b", "rad", "/j:position[name=wrist]")),
-         {"elbow", "wrist"}),
-        ((("a b", "rad", "/j:position[0]"), ("c: d #", "m", "/j:position[1]")),
-         {"a_b", "c:_d_#"}),
+        (
+            (("a", "rad", "/j:position[name=elbow]"), ("b", "rad", "/j:position[name=wrist]")),
+            {"elbow", "wrist"},
+        ),
+        ((("a b", "rad", "/j:position[0]"), ("c: d #", "m", "/j:position[1]")), {"a_b", "c:_d_#"}),
         ((("a", "rad", "/j:position[name=x]"), ("b", "rad", "/k:position[name=x]")), {"a", "b"}),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("size", [2.0, 1e-5, 1e7, 0.12345678901])
 def test_joints_are_called_as_in_the_messages_and_numbers_are_floats(
     arm: Path, signals: tuple[tuple[str, str, str], ...], joints: set[str], size: float

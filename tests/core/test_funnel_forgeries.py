@@ -135,9 +135,16 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
 
 # A refusal after the polynomials of all pieces: as long as a proof. One of them is always tried.
 LONG = {
-    "gain_lower", "multiplier_sign", "factor_entry", "margin_doubled", "goal_shrunk",
-    "shapes_swapped", "nominal_shifted", "other_inertia", "column_shifted",
-}  # fmt: skip
+    "gain_lower",
+    "multiplier_sign",
+    "factor_entry",
+    "margin_doubled",
+    "goal_shrunk",
+    "shapes_swapped",
+    "nominal_shifted",
+    "other_inertia",
+    "column_shifted",
+}
 
 
 @pytest.mark.parametrize(
