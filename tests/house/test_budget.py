@@ -1,7 +1,7 @@
 """The budget: how many statements each room has, and the caps on functions and classes.
 
-A number here is only lowered (docs/decisions/0043-a-budget-in-statements.md). Whoever raises one
-names the user in a decision of their own, and what left for it.
+A number here is only lowered (docs/decisions/0043-a-budget-in-statements.md, which says what is
+wanted). Whoever raises one names the user in a decision of their own, and what left for it.
 """
 
 import ast
@@ -11,15 +11,14 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 23_300,
-    ("bags",): 13_195,
-    ("nlsid_ros",): 2_849,
-    ("tests",): 28_750,
-    ("benchmarks", "examples"): 6_241,
+    ("nlsid_core",): 20_500,
+    ("bags",): 13_950,
+    ("nlsid_ros",): 3_170,
+    ("tests",): 26_500,
+    ("benchmarks", "examples"): 3_850,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 89, 51  # functions and classes above the caps
-FILES = 15  # of Python in a folder
+MORE_ARGUMENTS, MORE_FIELDS = 68, 39  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
