@@ -46,7 +46,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.designs import Design
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.identification import Polynomial, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
@@ -73,7 +73,7 @@ def updates() -> dict[str, float]:
     """Microseconds per update on F1TENTH trials, n = 6, for one funnel and for ten."""
     speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
     data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
-    model = identify(data, LinearClass(LAGS)).model
+    model = identify(data, Polynomial(LAGS)).model
     designs = [
         design_output_tube(
             OutputTube(model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5 + 0.1 * i)

@@ -17,7 +17,7 @@ from bags.designs.documents import MODEL, MODEL_PROOF
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
-from nlsid_core.identification import Fit, LinearClass, identify
+from nlsid_core.identification import Fit, Polynomial, identify
 from nlsid_core.models import DifferenceEquation
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
@@ -98,7 +98,7 @@ def train() -> Dataset:
 @pytest.fixture(scope="session")
 def fit(train: Dataset) -> Fit[DifferenceEquation]:
     """A model with two lags of the synthetic robot."""
-    return identify(train, LinearClass(2))
+    return identify(train, Polynomial(2))
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ grid: {period: 0.025, max_gap: 0.1}
 split: {test: ["*0"], validation: ["*5"]}
 identification: IDENTIFICATION
 """
-LAGS = "{lags: 1, method: rse_first}\nselect: {lags: [1, 2, 100]}"
+LAGS = "{lags: 1, iterations: 1}\nselect: {lags: [1, 2, 100]}"
 SEEDS = """{model: block_cascade, orders: [1, 0], phases: [1], intervals: [3], starts: 1}
 select: {seed: [0, 1]}"""
 
