@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import parser, tell
-from nlsid_core.design import design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.lstep import LSteps, section_at
 from nlsid_core.design.continuous.tvlqr import tvlqr
@@ -59,7 +59,9 @@ def row(n: int) -> dict[str, Any]:
     l_step = time.perf_counter() - started
     started = time.perf_counter()
     try:
-        design = design_funnel(field, nominal, goal=goal, Q=np.eye(n), R=np.eye(half))
+        design = design_funnel(
+            ContinuousTracking(field, nominal, goal=goal, Q=np.eye(n), R=np.eye(half))
+        )
         proved, pieces = True, len(design.found.proved.pieces)
     except NlsidError:
         proved, pieces = False, 0

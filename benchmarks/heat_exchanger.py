@@ -11,14 +11,14 @@ from pathlib import Path
 
 from benchmarks.machine import parser, spending, tell
 from benchmarks.recorded import heat_exchanger, percent, proved, single
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import Degrees, Polynomial, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.certified import (
     certified_simulation_error,
     descend_certified,
 )
 from nlsid_core.identification.polynomial.rie import robust_identification_error
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 TRAINING = 1500
@@ -36,7 +36,7 @@ def measure(data: Path, n: int) -> dict[str, float | bool]:
     """Errors in % at n lags, and whether the exact checker proves the certified model."""
     flow, temperature = heat_exchanger(data)
     train = single("exchanger", flow[:TRAINING], temperature[:TRAINING], 1.0)
-    model_class = StateAffineClass(n, leading_degree=2, right_degree=3, input_range=(FLOW_RANGE,))
+    model_class = Polynomial(n, degrees=Degrees(inputs=3, leading=2), input_range=(FLOW_RANGE,))
     problem = build_state_affine_rows(train, model_class)
 
     def score(model: StateAffineModel) -> float:

@@ -44,9 +44,9 @@ from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python, resident_mb
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.designs import Design
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.identification import Polynomial, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
@@ -73,10 +73,10 @@ def updates() -> dict[str, float]:
     """Microseconds per update on F1TENTH trials, n = 6, for one funnel and for ten."""
     speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
     data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
-    model = identify(data, LinearClass(LAGS)).model
+    model = identify(data, Polynomial(LAGS)).model
     designs = [
         design_output_tube(
-            model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5 + 0.1 * i
+            OutputTube(model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5 + 0.1 * i)
         )
         for i in range(FUNNELS)
     ]
@@ -113,7 +113,7 @@ def timing_funnel(rate: int) -> OutputTubeDesign:
         y = blank.simulate(u, [0.0, 0.0]) + 1e-3 * rng.standard_normal(samples)
         t = np.arange(samples) * period
         trials.append(Trajectory(t=t, y=y, u=u, name=f"run_{index}", digest=f"sha256:{index:064x}"))
-    design = design_output_tube(blank, Dataset(tuple(trials)))
+    design = design_output_tube(OutputTube(blank, Dataset(tuple(trials))))
     (tube,) = design.funnel.tubes
     widths = np.sqrt(2.0 / tube.tau) * (1.0 + 1e-12)  # rounded up
     funnel = replace(design.funnel, tubes=(replace(tube, level=2.0, half_widths=widths),))

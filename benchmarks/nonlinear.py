@@ -39,23 +39,21 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import (
-    BlockCascadeClass,
-    CellClass,
-    CertifiedSem,
-    FeedbackClass,
+    CellRow,
+    Degrees,
+    Feedback,
+    FilterMapFilter,
     Fit,
-    ImplicitClass,
     LeastSquares,
-    LinearClass,
     Method,
-    MonotoneClass,
+    Network,
+    Polynomial,
     Rse,
     Sem,
-    StateAffineClass,
     describe,
     identify,
 )
-from nlsid_core.identification.network.cells import Limit
+from nlsid_core.identification.network.options import Limit
 from nlsid_core.identification.prediction import simulate_trials
 
 SAMPLES = 10_000
@@ -217,29 +215,35 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
     """Classes with the methods whose models are proved, for signals like these."""
     first = data.trajectories[0]
     one = first.y.shape[1] == first.u.shape[1] == 1
+    certified = Sem(STEPS, certified=True)
     for lags in ORDERS:
         if one:
-            yield LinearClass(lags), CertifiedSem(STEPS)
-        yield StateAffineClass(lags, right_degree=2), Rse(STEPS)
-        yield StateAffineClass(lags, leading_degree=1, right_degree=2), CertifiedSem(STEPS)
+            yield Polynomial(lags), certified
+        yield Polynomial(lags, degrees=Degrees(inputs=2)), Rse(STEPS)
+        yield Polynomial(lags, degrees=Degrees(inputs=2, leading=1)), certified
         if first.y.shape[1] == 1:
-            yield MonotoneClass(lags), CertifiedSem(STEPS)
-        yield ImplicitClass(lags, input_degree=3), CertifiedSem(STEPS)
+            yield Polynomial(lags, degrees=Degrees(left=3)), certified
+        curved = Degrees(left=3, inputs=3)
+        yield Polynomial(lags, degrees=curved), certified
         # Where commands change rarely only one delay is excited.
-        yield StateAffineClass(lags, (1,), leading_degree=1, right_degree=3), CertifiedSem(STEPS)
-        yield ImplicitClass(lags, (1,), input_degree=3), CertifiedSem(STEPS)
+        yield Polynomial(lags, (1,), Degrees(inputs=3, leading=1)), certified
+        yield Polynomial(lags, (1,), curved), certified
         if one:
-            yield StateAffineClass(lags, leading_degree=2, right_degree=3), CertifiedSem(STEPS)
+            yield Polynomial(lags, degrees=Degrees(inputs=3, leading=2)), certified
             half = (lags + 1) // 2
-            yield BlockCascadeClass((half, lags - half), phases=(1,), intervals=(8, 16)), Sem()
+            filters = FilterMapFilter((half, lags - half), phases=(1,), intervals=(8, 16))
+            yield Network(filters), certified
     if first.y.shape[1] == 1:
         limits: tuple[Limit, ...] = ("top", "friction", "none")
         for cells, limit in product((1, 2), limits):
-            yield CellClass(cells, intervals=4, limit=limit), CertifiedSem(STEPS)
+            yield Network(CellRow(cells, intervals=4, limit=limit)), certified
         for lags in ORDERS:
-            yield FeedbackClass(lags), CertifiedSem(STEPS)
+            yield Network(Feedback(lags)), certified
     if one:
-        yield BlockCascadeClass((3, 3), phases=(1, 2, 3), intervals=(12, 24, 48)), Sem()
+        yield (
+            Network(FilterMapFilter((3, 3), phases=(1, 2, 3), intervals=(12, 24, 48))),
+            certified,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,8 +403,7 @@ def measure(case: PublicSet, folder: Path, limit: float) -> dict[str, Any]:
     """The promised keys of one set."""
     started = time.process_time()
     data = case.load(folder / case.folder)
-    one = all(part.shape[1] == 1 for t in data[0] for part in (t.y, t.u))
-    linear = [(LinearClass(n) if one else StateAffineClass(n), LeastSquares()) for n in ORDERS]
+    linear = [(Polynomial(n), LeastSquares()) for n in ORDERS]
     budget = Budget(limit, started, [])
     naive = best_of(case, linear, data, budget, proved=False)
     ours = best_of(case, list(ladder(data[0])), data, budget, proved=True)

@@ -22,13 +22,9 @@ from benchmarks.machine import parser, tell
 from benchmarks.recorded import proved as is_proved
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.polynomial.moments import (
-    MonotoneClass,
-    Offsets,
-    plain_moments,
-    repeated_moments,
-)
+from nlsid_core.identification.polynomial.moments import Offsets, plain_moments, repeated_moments
 from nlsid_core.identification.polynomial.monotone import (
     least_squares_equation,
     minimise_monotone_simulation_error,
@@ -94,7 +90,7 @@ def repeats(w: FloatArray, rng: np.random.Generator, noise: float) -> list[Traje
 def identify(runs: list[Trajectory], n: int) -> tuple[MomentFit, float]:
     """The proposed method and the processor time [s] of moments, program and exact proof."""
     started = time.process_time()
-    model_class = MonotoneClass(n, (0,))
+    model_class = Polynomial(n, (0,), Degrees(left=3), set="3.8")
     moments = repeated_moments([runs], model_class, OFFSETS)
     fit = minimise_moment_rie(moments, model_class, runs[0], OFFSETS)
     return fit, time.process_time() - started
@@ -104,7 +100,7 @@ def models(
     runs: list[Trajectory], clean: list[Trajectory], n: int, proposed: MonotoneEquation
 ) -> dict[str, MonotoneEquation]:
     """What the comparators find; SEM may start from the proposed model too."""
-    model_class = MonotoneClass(n, (0,))
+    model_class = Polynomial(n, (0,), Degrees(left=3), set="3.8")
     plain = plain_moments(runs, model_class, OFFSETS)
     exact = plain_moments(clean, model_class, OFFSETS)
     squares = least_squares_equation(plain, model_class, runs[0], OFFSETS)

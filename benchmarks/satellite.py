@@ -26,7 +26,7 @@ from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.soundness import simulate_boundary, smallest_escape
 from examples import satellite
 from examples.satellite_funnel import goal_matrix, problem
-from nlsid_core.design import FunnelDesign, design_funnel
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.proofs import check
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     field, nominal, weights = problem()
     goal = goal_matrix(lqr_order=arguments.lqr_order)
     with spending() as spent:
-        design = design_funnel(field, nominal, goal=goal, **weights)
+        design = design_funnel(ContinuousTracking(field, nominal, goal=goal, **weights))
     *_, proof = design.save(folder)
     result: dict[str, Any] = {
         "rho_seconds": spent.seconds,
@@ -95,7 +95,7 @@ def _attacks(design: FunnelDesign, goal: Any, starts: int) -> dict[str, Any]:
 
 def _shape(field: Any, nominal: Any, goal: Any, weights: Any, starts: int) -> dict[str, Any]:
     with spending() as spent:
-        design = design_funnel(field, nominal, goal=goal, shape="P", **weights)
+        design = design_funnel(ContinuousTracking(field, nominal, goal=goal, shape="P", **weights))
     rng = np.random.default_rng(8)
     run = simulate_boundary(design.model, design.policy, design.funnel, starts=starts, rng=rng)
     return {

@@ -34,18 +34,12 @@ from benchmarks.recorded import block_means
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import OutputTube
 from nlsid_core.design.levels import followed
 from nlsid_core.design.tube import design_output_tube, energy, innovations, scaled_to
 from nlsid_core.errors import NlsidError
 from nlsid_core.funnels.tube import Tube
-from nlsid_core.identification import (
-    BlockCascadeClass,
-    CertifiedRse,
-    ImplicitClass,
-    LinearClass,
-    StateAffineClass,
-    identify,
-)
+from nlsid_core.identification import Degrees, FilterMapFilter, Network, Polynomial, Rse, identify
 from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -114,7 +108,7 @@ def f1tenth_two_case(data: Path) -> Case:
                 t=0.025 * np.arange(len(y)), y=y, u=u[4:], name=f"{k}", y_names=("yaw", "speed")
             )
         )
-    return thirds(trials, StateAffineClass(6, delays=(1, 2, 3, 4, 5, 6)), 100)
+    return thirds(trials, Polynomial(6, (1, 2, 3, 4, 5, 6)), 100)
 
 
 def in_parts(
@@ -134,11 +128,9 @@ def exchanger_case(data: Path) -> Case:
     """Flow to temperature, state-affine with a quadratic G_0."""
     u, y = recorded.heat_exchanger(data / "exchanger")
     trials = in_parts(u, y, 1.0, 250, "exchanger")
-    model_class = StateAffineClass(
-        4, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),), delays=(0, 1, 2)
-    )
+    model_class = Polynomial(4, (0, 1, 2), Degrees(inputs=3, leading=2), input_range=((0.1, 0.7),))
     train, calibration, judged = map(named, (trials[:6], trials[6:11], trials[11:]))
-    return Case(model_class, train, calibration, judged, 240, {"method": CertifiedRse()})
+    return Case(model_class, train, calibration, judged, 240, {"method": Rse(certified=True)})
 
 
 def wh2009_case(data: Path) -> Case:
@@ -149,7 +141,7 @@ def wh2009_case(data: Path) -> Case:
     validation = named(in_parts(u[80000:90000], y[80000:90000], 1 / 51200, 10000, "val"))
     train, calibration, judged = map(named, (whole, later[:10], later[10:]))
     options = {"validation": validation}
-    model_class = BlockCascadeClass(phases=(2,), intervals=(24,), starts=6, begin="rest")
+    model_class = Network(FilterMapFilter(phases=(2,), intervals=(24,), starts=6, begin="rest"))
     return Case(model_class, train, calibration, judged, 1700, options)
 
 
@@ -157,14 +149,14 @@ def schunk_case(data: Path) -> Case:
     """Six torques to six velocities at 50 Hz."""
     measured = recorded.schunk(data / "schunk_arm", range(1, 101, 2))
     trials = [block_means(u, y, 0.004, 5, str(k)) for k, (u, y) in measured.items()]
-    return thirds(trials, StateAffineClass(2), 155)
+    return thirds(trials, Polynomial(2), 155)
 
 
 def emps_case(data: Path) -> Case:
     """Reference to measured position of a servo with dry friction, 100 Hz."""
     table = recorded.emps(data / "emps")
     whole = block_means(table["qg"], table["qm"], 1e-3, 10, "emps")
-    return thirds(in_parts(whole.u, whole.y, 0.01, 270, "emps"), LinearClass(5), 240)
+    return thirds(in_parts(whole.u, whole.y, 0.01, 270, "emps"), Polynomial(5), 240)
 
 
 def kuka_case(data: Path, joint: int) -> Case:
@@ -174,12 +166,12 @@ def kuka_case(data: Path, joint: int) -> Case:
     for letter, (u, y) in recorded.kuka(data / "kuka_kr300", signals).items():
         whole = block_means(u[joint - 1], y[joint - 1], 4e-3, 2, letter)
         trials += in_parts(whole.u, whole.y, 8e-3, 200, letter)
-    return thirds(trials, LinearClass(4), 125)
+    return thirds(trials, Polynomial(4), 125)
 
 
 SHIPPED: dict[str, Callable[[], Case]] = {
-    "f1tenth_linear": partial(f1tenth_case, LinearClass(4)),
-    "f1tenth_implicit": partial(f1tenth_case, ImplicitClass(4)),
+    "f1tenth_linear": partial(f1tenth_case, Polynomial(4)),
+    "f1tenth_implicit": partial(f1tenth_case, Polynomial(4, degrees=Degrees(left=3), set="2.11")),
 }
 RECORDED: dict[str, Callable[[Path], Case]] = {
     "f1tenth_two": f1tenth_two_case,
@@ -237,10 +229,10 @@ def measure(case: Case) -> dict[str, float | int]:
     model = identify(case.train, case.model_class, **(case.options or {})).model
     keys: dict[str, float | int] = {"identify_s": time.process_time() - started}
     started = time.process_time()
+    horizon = case.horizon * model.period
     made = design_output_tube(
-        model, case.train, case.calibration,
-        safety_factor=FACTOR, horizon=case.horizon * model.period,
-    )  # fmt: skip
+        OutputTube(model, case.train, case.calibration, safety_factor=FACTOR, horizon=horizon)
+    )
     keys["design_s"] = time.process_time() - started
     seconds = []
     for _ in range(CHECKS):
@@ -296,9 +288,9 @@ def lasting(samples: int) -> dict[str, float]:
     """One monitor over so many samples: µs of a sample in the first and the last tenth (the least
     over trials), and by how much the process grew between them.
     """
-    case = f1tenth_case(LinearClass(4))
+    case = f1tenth_case(Polynomial(4))
     model = identify(case.train, case.model_class).model
-    made = design_output_tube(model, case.train, case.calibration)
+    made = design_output_tube(OutputTube(model, case.train, case.calibration))
     monitor, k = Monitor(model, None, made.funnel), 0
     tenths: list[list[float]] = [[] for _ in range(10)]
     grown = [0.0] * 10

@@ -20,12 +20,15 @@ from benchmarks.machine import parser, spending, tell
 from benchmarks.recorded import percent, proved, single, wiener_hammerstein
 from nlsid_core.arrays import FloatArray
 from nlsid_core.identification import (
-    BlockCascadeClass,
-    identify_block_cascade,
+    Degrees,
+    FilterMapFilter,
+    Network,
+    Polynomial,
     prove_stability,
 )
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.network.cascade import identify_block_cascade
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 PERIOD = 1.0 / 51200.0  # s
@@ -42,7 +45,7 @@ PUBLISHED = {
     "n7.final": 5.0, "n5.rmse_v": 0.0119, "cascade_mv": 0.241,
 }  # fmt: skip
 CASCADE_TRAIN, CASCADE_TEST = slice(5000, 80_000), slice(105_200, 184_000)
-CASCADE = BlockCascadeClass(phases=(2, 3), intervals=(24, 48), seed=1, begin="rest")
+CASCADE = Network(FilterMapFilter(phases=(2, 3), intervals=(24, 48), begin="rest"), seed=1)
 SKIPPED = 50
 
 Keys = dict[str, float | bool]
@@ -58,7 +61,9 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
     """First and chosen iterate at n lags: errors in % and V on the thesis's test samples."""
     problem = build_state_affine_rows(
         single("estimation", u[train], y[train], PERIOD),
-        StateAffineClass(n, right_degree=3, input_range=((float(np.min(u)), float(np.max(u))),)),
+        Polynomial(
+            n, degrees=Degrees(inputs=3), input_range=((float(np.min(u)), float(np.max(u))),)
+        ),
     )
     started = time.perf_counter()
     iterates: list[tuple[float, StateAffineModel]] = []
@@ -85,20 +90,20 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
 def cascade(u: FloatArray, y: FloatArray) -> Keys:
     """The certified block cascade on the official test samples."""
     with spending() as spent:
-        fit = identify_block_cascade(
+        model, proof, _ = identify_block_cascade(
             single("train", u[CASCADE_TRAIN], y[CASCADE_TRAIN], PERIOD),
             single("validation", u[THESIS_VALIDATION], y[THESIS_VALIDATION], PERIOD),
             CASCADE,
             transient=200,
             progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
         )
-    error = (fit.model.simulate(u[CASCADE_TEST]) - y[CASCADE_TEST])[SKIPPED:]
+    error = (model.simulate(u[CASCADE_TEST]) - y[CASCADE_TEST])[SKIPPED:]
     return {
         "cascade_mv": 1e3 * float(np.sqrt(np.mean(error**2))),
-        "cascade_proved": proved(fit.model, fit.proof),
+        "cascade_proved": proved(model, proof),
         "cascade_seconds": spent.seconds,
         "cascade_cpu_seconds": spent.processor,
-        "cascade_rate": fit.proof.rate,
+        "cascade_rate": proof.rate,
     }
 
 

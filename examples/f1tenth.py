@@ -1,7 +1,7 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
 from bags.samples import f1tenth
-from nlsid import LinearClass, Monitor, OutputTube, Status, design, identify, read_bags
+from nlsid import Monitor, OutputTube, Polynomial, Status, design, identify, read_bags
 from nlsid_core.identification import simulation_percent
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
@@ -13,7 +13,7 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
     dataset = read_bags(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
     train, test = dataset.without(TEST), dataset.select(TEST)
 
-    fit = identify(train, LinearClass(4))
+    fit = identify(train, Polynomial(4))
     tube = design(OutputTube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)]))
 
     inside = 0

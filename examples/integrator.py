@@ -15,7 +15,7 @@ import numpy as np
 
 from bags.designs.displacement import displacement_half_width
 from bags.signals.expressions import washout
-from nlsid import Dataset, LinearClass, OutputTube, Trajectory, design, identify
+from nlsid import Dataset, OutputTube, Polynomial, Trajectory, design, identify
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.identification.prediction import simulate_trial
@@ -64,7 +64,7 @@ def designed(drives: list[Drive], *, velocity: bool = False) -> OutputTubeDesign
     """The proved tube: half of the drives make the model and the observer, the others its level."""
     trials = [one.velocity() if velocity else one.washed_out() for one in drives]
     train, calibration = Dataset(tuple(trials[::2])), Dataset(tuple(trials[1::2]))
-    model = identify(train, LinearClass(LAGS), comparators=()).model
+    model = identify(train, Polynomial(LAGS), comparators=()).model
     return design(OutputTube(model, train, calibration, level="constant"))
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_are
 
 from nlsid import Nominal, VectorField, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import FunnelDesign, design_funnel
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 
 MASS, GRAVITY = 0.5, 9.81  # kg, m/s²
 INERTIA = np.array([0.0032, 0.0032, 0.0055])  # kg m²
@@ -96,7 +96,9 @@ def inputs(t: float) -> FloatArray:
 def designed(knots: int = KNOTS, level: float = LEVEL) -> FunnelDesign:
     """The funnel into {LQR cost in hover ≤ level}; Q and R scaled alike keep the LQR's gains."""
     field, nominal, S = problem(knots)
-    return design_funnel(field, nominal, goal=S / level, Q=Q / level, R=R / level)
+    return design_funnel(
+        ContinuousTracking(field, nominal, goal=S / level, Q=Q / level, R=R / level)
+    )
 
 
 def problem(knots: int) -> tuple[VectorField, Nominal, FloatArray]:

@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from nlsid_core.dynamics.taylor import taylor_field
     from nlsid_core.errors import NlsidError
     from nlsid_core.identification import (
-        BlockCascadeClass,
-        CellClass,
-        FeedbackClass,
+        CellRow,
+        Degrees,
+        Feedback,
+        FilterMapFilter,
         Fit,
-        ImplicitClass,
         LeastSquares,
-        LinearClass,
+        Network,
+        Polynomial,
         Rie,
         Rse,
         Sem,
-        StateAffineClass,
         identify,
     )
     from nlsid_core.models import Signal
@@ -48,28 +48,28 @@ if TYPE_CHECKING:
     from nlsid_core.running.reading import Reading, Status
 
 __all__ = [
-    "BlockCascadeClass",
-    "CellClass",
+    "CellRow",
     "ContinuousTracking",
     "Dataset",
+    "Degrees",
     "Design",
-    "FeedbackClass",
+    "Feedback",
+    "FilterMapFilter",
     "Fit",
     "Goal",
-    "ImplicitClass",
     "LeastSquares",
-    "LinearClass",
     "Monitor",
+    "Network",
     "NlsidError",
     "Nominal",
     "OutputTube",
+    "Polynomial",
     "Reading",
     "Rie",
     "Rse",
     "SampledTracking",
     "Sem",
     "Signal",
-    "StateAffineClass",
     "Status",
     "Trajectory",
     "VectorField",
@@ -86,9 +86,8 @@ __all__ = [
     "taylor_field",
 ]
 
-_CLASSES: Final = (
-    "LinearClass", "StateAffineClass", "ImplicitClass", "BlockCascadeClass", "CellClass",
-    "FeedbackClass",
+_FAMILIES: Final = (
+    "Polynomial", "Degrees", "Network", "FilterMapFilter", "CellRow", "Feedback",
 )  # fmt: skip
 _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
@@ -98,7 +97,7 @@ _HOMES: Final = {
     "bags.signals.grid": ("read_bags",),
     "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
     "nlsid_core.models": ("Signal",),
-    "nlsid_core.identification": ("identify", "Fit", *_CLASSES, *_METHODS),
+    "nlsid_core.identification": ("identify", "Fit", *_FAMILIES, *_METHODS),
     "nlsid_core.design": ("design", *_PROBLEMS, *_MOTIONS, "compose_funnels"),
     "nlsid_core.designs": ("Design", "load"),
     "nlsid_core.dynamics": ("Nominal", "VectorField"),

@@ -53,11 +53,17 @@ def rivals(node: Node, publisher: Publisher) -> str:
     A subscriber cannot hear if it asks for a quality of service that `publisher` does not offer.
     """
     topic = publisher.topic_name
-    said = [several(topic, node.get_publishers_info_by_topic(topic))]
+    publishers = node.get_publishers_info_by_topic(topic)
+    said = [several(topic, publishers)]
+    # As the graph has it, like the others': `publisher` itself has 0 for a lease without end.
+    own = (node.get_name(), node.get_namespace())
+    offered = next(
+        (p.qos_profile for p in publishers if (p.node_name, p.node_namespace) == own), None
+    )
     deaf = [
         (endpoint, why)
         for endpoint in node.get_subscriptions_info_by_topic(topic)
-        if (why := mismatch(publisher.qos_profile, endpoint.qos_profile))
+        if offered is not None and (why := mismatch(offered, endpoint.qos_profile))
     ]
     said += [f"{topic}: {names([endpoint])} cannot hear it: {why}" for endpoint, why in deaf]
     return "; ".join(filter(None, said))

@@ -16,8 +16,8 @@ from typer.main import get_command
 from bags.designs.documents import MODEL, MODEL_PROOF
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTubeDesign, design_output_tube
-from nlsid_core.identification import Fit, LinearClass, identify
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid_core.identification import Fit, Polynomial, identify
 from nlsid_core.models import DifferenceEquation
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
@@ -98,7 +98,7 @@ def train() -> Dataset:
 @pytest.fixture(scope="session")
 def fit(train: Dataset) -> Fit[DifferenceEquation]:
     """A model with two lags of the synthetic robot."""
-    return identify(train, LinearClass(2))
+    return identify(train, Polynomial(2))
 
 
 @pytest.fixture(scope="session")
@@ -106,11 +106,13 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> OutputTubeDesign:
     """Two tubes for it, one for ever and one for 7 s, and around a plan with a policy."""
     model = replace(fit.model, training="sha256:0")
     return design_output_tube(
-        model,
-        train,
-        profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.5), (7.0, 0.5)],
-        horizon=7.0,
-        inlet=0.02,
+        OutputTube(
+            model,
+            train,
+            profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.5), (7.0, 0.5)],
+            horizon=7.0,
+            inlet=0.02,
+        )
     )
 
 

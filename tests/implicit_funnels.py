@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import plan_motion, track, tvlqr
 from nlsid_core.models import Signal
@@ -21,7 +22,9 @@ def designed(form: str = "response", goal: float = 0.1) -> TrackingDesign:
     x, u = plan_motion(model, [0.0, 0.0], [goal, 0.0], steps=STEPS)
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
-    return design_state_funnel(model, policy, feedback, assumption=assumption(form, BOUND))
+    return design_state_funnel(
+        SampledTracking(model, policy, feedback, assumption=assumption(form, BOUND))
+    )
 
 
 @cache
@@ -45,4 +48,6 @@ def two_joints(form: str = "response") -> TrackingDesign:
     x, u = np.zeros((3, 4)), np.zeros((2, 2))
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
-    return design_state_funnel(model, policy, feedback, assumption=assumption(form, BOUND))
+    return design_state_funnel(
+        SampledTracking(model, policy, feedback, assumption=assumption(form, BOUND))
+    )

@@ -6,15 +6,14 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification.polynomial.moments import (
-    MonotoneClass,
-    Offsets,
-)
+from nlsid_core.identification import Degrees
+from nlsid_core.identification import Polynomial as Equation
+from nlsid_core.identification.polynomial.moments import Offsets
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.polynomial import Polynomial, constant
 
 NOISE = 0.05
-CLASS = MonotoneClass(2, (0,))
+CLASS = Equation(2, (0,), Degrees(left=3), set="3.8")
 OFFSETS = Offsets(0.0, np.zeros(1))
 
 

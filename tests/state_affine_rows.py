@@ -3,19 +3,16 @@
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.banded import Rows
-from nlsid_core.identification.polynomial.rows import (
-    StateAffineClass,
-    StateAffineRows,
-    build_state_affine_rows,
-)
+from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 
 EXACT = 1e-10  # agreement of two floating-point routes to the same number
 
 
 def problem(
     *, outputs: int = 1, trials: int = 2, samples: int = 24, noise: float = 0.05,
-    model_class: StateAffineClass | None = None, seed: int = 3,
+    model_class: Polynomial | None = None, seed: int = 3,
 ) -> StateAffineRows:  # fmt: skip
     """Rows of a small nonlinear system with `outputs` coupled outputs."""
     rng = np.random.default_rng(seed)
@@ -28,7 +25,7 @@ def problem(
             y[t] = A @ y[t - 1] / (1.0 + 0.3 * u[t] ** 2) + u[t] - 0.3 * u[t - 1] ** 3
         y += noise * rng.standard_normal(y.shape)
         trajectories.append(Trajectory(t=np.arange(float(samples)), y=y, u=u, name=f"run {index}"))
-    default = StateAffineClass(2, leading_degree=1, lagged_degree=1, right_degree=1)
+    default = Polynomial(2, degrees=Degrees(leading=1, lagged=1))
     return build_state_affine_rows(Dataset(tuple(trajectories)), model_class or default)
 
 

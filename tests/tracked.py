@@ -9,6 +9,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.funnels.sampled import DisturbanceAssumption
@@ -80,7 +81,9 @@ def assumption(form: str = "response", bound: float = BOUND) -> DisturbanceAssum
 def designed(form: str = "response", goal: float = 0.4) -> TrackingDesign:
     """The funnel around that motion."""
     base = tracked(goal)
-    return design_state_funnel(base.model, base.policy, base.feedback, assumption=assumption(form))
+    return design_state_funnel(
+        SampledTracking(base.model, base.policy, base.feedback, assumption=assumption(form))
+    )
 
 
 def write(design: TrackingDesign, folder: Path) -> Path:

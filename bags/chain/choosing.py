@@ -23,7 +23,7 @@ from nlsid_core.progress import Progress, part
 class Selected:
     """What was tried and chosen, and the files written of it."""
 
-    selection: Selection[Model]
+    selection: Selection
     identified: Identified
 
 

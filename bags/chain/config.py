@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from bags.chain.identification_config import CLASSES, Identification
+from bags.chain.identification_config import Identification
 from bags.chain.sections import (
     Corner,
     Key,
@@ -21,10 +21,9 @@ from bags.chain.sections import (
 from bags.signals.expressions import parse_factors
 from bags.signals.sampling import Sampler, sampled_path
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import BlockCascadeClass, CellClass, FeedbackClass, LinearClass
 from nlsid_core.running.comparison import Centre
 
-ONE_BY_ONE = (LinearClass, BlockCascadeClass)  # classes of one response and one excitation
+ONE_BY_ONE = ("linear", "block_cascade")  # models of one response and one excitation
 
 
 def _listed(value: object) -> object:
@@ -366,14 +365,13 @@ def _time_refusals(config: Config) -> Iterator[str]:
 def _model_refusals(config: Config) -> Iterator[str]:
     counts = len(config.signals.response), len(config.signals.excitation)
     said = f"{counts[0]} responses and {counts[1]} excitations"
-    kind = type(config.identification.model_class)
-    model = next(name for name, one in CLASSES.items() if one is kind)
-    if kind in ONE_BY_ONE and counts != (1, 1):
+    model = config.identification.model
+    if model in ONE_BY_ONE and counts != (1, 1):
         yield (
             f"identification.model: {model} has one response and one excitation, not {said}; take "
             "state_affine or implicit, or leave out signals"
         )
-    elif kind in (CellClass, FeedbackClass) and counts[0] != 1:
+    elif model in ("cells", "feedback") and counts[0] != 1:
         yield (
             f"identification.model: {model} has one response, not {said}; take state_affine or "
             "implicit, or leave out signals"
@@ -381,7 +379,7 @@ def _model_refusals(config: Config) -> Iterator[str]:
     elif (
         config.funnel is not None
         and config.funnel.profile is not None
-        and (kind is not LinearClass or counts != (1, 1))
+        and (model != "linear" or counts != (1, 1))
     ):
         yield (
             "funnel.profile: a plan is tracked by `model: linear` with one response and one "
@@ -396,12 +394,12 @@ def _model_refusals(config: Config) -> Iterator[str]:
                     f"responses they answer, not with `{key}: {value}`; leave out `profile` for a "
                     "tube around the model's simulation"
                 )
-    for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):
+    for key, needed in (("input_range", counts[1]), ("output_range", counts[0])):
         given = getattr(config.identification.model_class, key, None)
-        if given is not None and len(given) not in options:
+        if given is not None and len(given) != needed:
             yield (
                 f"identification.{key}: {len(given)} pairs [low, high] for {said}; it needs "
-                f"{options[0]}"
+                f"{needed}"
             )
     try:
         config.identification.each(config.select or {})

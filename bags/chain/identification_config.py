@@ -2,15 +2,18 @@
 
     model: state_affine        # which class; its options stand beside it
     lags: 2
-    method: rse_certified      # which method of the class; its options stand beside it, too
+    method: rse                # which method of the class; its options stand beside it, too
+    certified: true
     iterations: 5
 
-Names, types, defaults and limits are those of the dataclasses in `nlsid_core.identification`.
+Types, defaults and limits are those of the dataclasses in `nlsid_core.identification`; what a name
+of `model` opens of them is in `templates`.
 """
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import product
 from typing import Annotated, Any, get_type_hints
 
@@ -18,40 +21,27 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from bags.chain.sections import UNKNOWN_KEY, problems
+from bags.chain.templates import TEMPLATES
 from bags.recordings.names import did_you_mean
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
-    BlockCascadeClass,
-    CellClass,
-    FeedbackClass,
     Fit,
-    ImplicitClass,
-    LinearClass,
-    LinearStateClass,
     Method,
     Model,
     ModelClass,
-    MonotoneClass,
-    StateAffineClass,
+    alike,
     identify,
     methods_of,
 )
-from nlsid_core.identification.methods.options import alike
 from nlsid_core.progress import Progress, silent
 
-CLASSES: dict[str, type] = {
-    "linear": LinearClass,
-    "state_affine": StateAffineClass,
-    "block_cascade": BlockCascadeClass,
-    "cells": CellClass,
-    "feedback": FeedbackClass,
-    "monotone": MonotoneClass,
-    "implicit": ImplicitClass,
-    "linear_states": LinearStateClass,
-}
-RANGES = ("input_range", "box")  # options of which one [low, high] is the range of one signal
+DEFAULT = "linear"  # the model of a section that names none
+RANGES = (
+    "input_range",
+    "output_range",
+)  # options of which one [low, high] is the range of one signal
 OWN = {  # of every section
     "transient": Annotated[int, Field(ge=0)],
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
@@ -69,7 +59,7 @@ class IdentificationConfig:
     given: the section itself, as a mapping.
     """
 
-    model_class: ModelClass[Model]
+    model_class: ModelClass
     method: Method
     given: Mapping[str, object]
     transient: int = 0
@@ -97,21 +87,26 @@ class IdentificationConfig:
             progress=progress,
         )
 
+    @property
+    def model(self) -> str:
+        """What the section calls the class."""
+        return str(self.given.get("model", DEFAULT))
+
     def every_method(self) -> tuple[Method, ...]:
         """This method, then every other one of the class, with the options that they share."""
-        others = [k for k in methods_of(self.model_class) if not isinstance(self.method, k)]
-        return (self.method, *(alike(kind, self.method) for kind in others))
+        others = [one for one in methods_of(self.model_class) if one.name != self.method.name]
+        return (self.method, *(alike(one, self.method) for one in others))
 
     def each(self, options: Mapping[str, Sequence[object]]) -> "list[IdentificationConfig]":
         """This section with every combination of the options' values; DataError names a wrong one.
 
         The last option varies fastest.
         """
-        own = [option.name for option in fields(type(self.model_class))]  # type: ignore[arg-type]
+        own = list(TEMPLATES[self.model].keys)
         for key in options:
             if key not in own:
                 raise DataError(
-                    f"select.{key}: no option of `model: {self.given.get('model', 'linear')}`, "
+                    f"select.{key}: no option of `model: {self.model}`, "
                     f"whose options this section tries; remove select.{key}, or try: "
                     f"{', '.join(own)}"
                 )
@@ -132,29 +127,39 @@ def _read(section: object) -> IdentificationConfig:
     if not isinstance(section, dict):
         raise _error(_wrong((), section, "should be keys and values, such as `lags: 4`"))
     left = dict(section)
-    name = left.pop("model", "linear")
-    kind = CLASSES.get(name) if isinstance(name, str) else None
-    if kind is None:
-        near = did_you_mean(str(name), CLASSES)
-        what = f"there is no such model; there are: {', '.join(CLASSES)}{near}"
+    name = left.pop("model", DEFAULT)
+    template = TEMPLATES.get(name) if isinstance(name, str) else None
+    if template is None:
+        near = did_you_mean(str(name), TEMPLATES)
+        what = f"there is no such model; there are: {', '.join(TEMPLATES)}{near}"
         raise _error(_wrong((), section, what))
     wrong: list[InitErrorDetails] = []
     own = _values(OWN, {key: left.pop(key) for key in OWN if key in left}, wrong)
-    method_name = left.pop("method", None)
-    model_class = _made(kind, {k: left.pop(k) for k in _names(kind) if k in left}, wrong)
-    known = {
-        m.name: m for m in (METHODS.values() if model_class is None else methods_of(model_class))
-    }
-    chosen = next(iter(known)) if method_name is None else method_name
+    word = left.pop("method", None)
+    options = {key: left.pop(key) for key in template.keys if key in left}
+    wrong.extend(
+        _wrong((k,), options, "Field required") for k in template.needed if k not in options
+    )
+    model_class = _made(template.make, template.hints(), options, template.keys, wrong)
+    methods = () if model_class is None else methods_of(model_class)
+    known = list(dict.fromkeys(one.word for one in methods)) or list(METHODS)
+    chosen = known[0] if word is None else word
     if not isinstance(chosen, str) or chosen not in known:
         what = "is not for this model class:" if chosen in [*METHODS] else "should be"
         wrong.append(_wrong(("method",), chosen, f"{what} {_listed(known)}"))
         raise _error(*wrong)
-    method_kind = known[chosen]
-    method = _made(method_kind, {k: left.pop(k) for k in _names(method_kind) if k in left}, wrong)
-    if model_class is None and method_name is None:  # then the method, and its keys, are not known
+    usual = next((one for one in methods if one.word == chosen), METHODS[chosen]())
+    names = _names(usual)
+    method = _made(
+        partial(_changed, usual), get_type_hints(type(usual)),
+        {key: left.pop(key) for key in names if key in left}, {}, wrong,
+    )  # fmt: skip
+    if method is not None and methods and method.name not in [one.name for one in methods]:
+        what = f"should be {str(not method.certified).lower()} for this model class"
+        wrong.append(_wrong(("certified",), method.certified, what))
+    if model_class is None and word is None:  # then the method, and its keys, are not known
         left = {k: v for k, v in left.items() if not any(k in _names(m) for m in METHODS.values())}
-    keys = ", ".join(["model", *_names(kind), "method", *_names(method_kind), *OWN])
+    keys = ", ".join(["model", *template.keys, "method", *names, *OWN])
     for key in left:
         details = {"key": str(key), "known": keys}
         wrong.append(_wrong((), section, "there is no such key", UNKNOWN_KEY, details))
@@ -163,22 +168,34 @@ def _read(section: object) -> IdentificationConfig:
     return IdentificationConfig(model_class, method, section, **own)
 
 
+def _changed(method: Method, values: Mapping[str, Any]) -> Method:
+    return replace(method, **values)
+
+
 Identification = Annotated[IdentificationConfig, PlainValidator(_read)]
 
 
-def _made(kind: Any, given: dict[str, object], wrong: list[InitErrorDetails]) -> Any:
-    """An instance with these options, each of the type that its field declares; None if wrong."""
+def _made(
+    make: Callable[[Mapping[str, Any]], Any],
+    hints: Mapping[str, Any],
+    given: dict[str, object],
+    names: Mapping[str, str],
+    wrong: list[InitErrorDetails],
+) -> Any:
+    """What is made of these options, each of the type that its field declares; None if wrong.
+
+    names: what an option is called inside, by its key.
+    """
     before = len(wrong)
-    hints = {key: hint for key, hint in get_type_hints(kind).items() if key in given}
-    missing = [f.name for f in fields(kind) if f.default is MISSING and f.name not in given]
-    wrong.extend(_wrong((key,), given, "Field required") for key in missing)
     values = _values(hints, given, wrong)
     if len(wrong) > before:
         return None
     try:
-        return kind(**values)
+        return make(values)
     except OptionError as error:
-        wrong.append(_wrong((error.key,), given.get(error.key), f"should be {error.allowed}"))
+        keys = {option: key for key, option in names.items()}
+        key = keys.get(error.key, error.key)
+        wrong.append(_wrong((key,), given.get(key), f"should be {error.allowed}"))
     except DataError as error:
         wrong.append(_wrong((), given, str(error)))
     return None
@@ -210,7 +227,7 @@ def _names(kind: Any) -> list[str]:
     return [option.name for option in fields(kind)]
 
 
-def _listed(known: Mapping[str, object]) -> str:
+def _listed(known: Sequence[str]) -> str:
     return " or ".join(", ".join(f"'{name}'" for name in known).rsplit(", ", 1))
 
 

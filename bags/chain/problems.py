@@ -25,7 +25,7 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
-MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field",
+MEMBERS = ("format", "version", "shape", "gain", "vector_field",
            "nominal", "goal", "Q", "R", "limits", "hold", "error", "push")  # fmt: skip
 
 
@@ -45,7 +45,6 @@ class FunnelProblem:
     goal: Goal | None = None
     shape: str = "rho"
     gain: str = "constant"
-    objective: str = "volume"
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
@@ -59,7 +58,6 @@ class FunnelProblem:
             "version": files.VERSION,
             "shape": self.shape,
             "gain": self.gain,
-            "objective": self.objective,
             "vector_field": self.field.document(),
             "nominal": {
                 "t": self.nominal.t.tolist(),
@@ -100,7 +98,7 @@ class FunnelProblem:
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
         usual = {
-            "shape": "rho", "gain": "constant", "objective": "volume",
+            "shape": "rho", "gain": "constant",
         }  # fmt: skip
         words = usual | document
         return cls(
@@ -111,7 +109,6 @@ class FunnelProblem:
             _goal(document, field.n, source),
             files.member(words, "shape", str, source=source),
             files.member(words, "gain", str, source=source),
-            files.member(words, "objective", str, source=source),
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
@@ -127,7 +124,6 @@ class FunnelProblem:
             self.nominal,
             goal=self.goal,
             shape=self.shape,  # type: ignore[arg-type]  # checked by the problem
-            objective=self.objective,  # type: ignore[arg-type]
             Q=self.Q,
             R=self.R,
             gain=self.gain,

@@ -13,8 +13,9 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic.fields import FieldInfo
 
 from bags.chain.config import Config
-from bags.chain.identification_config import CLASSES, IdentificationConfig
+from bags.chain.identification_config import IdentificationConfig
 from bags.chain.sections import Key, Section, sections_in
+from bags.chain.templates import TEMPLATES, Template
 from bags.chain.tracking_config import TrackingConfig
 from nlsid_core.identification import METHODS, methods_of
 
@@ -43,7 +44,6 @@ IDENTIFICATION = """
 | `max_rate` | slowest rate a sample that counts, in (0, 1) | exp(-1/samples of the longest trial) |
 | `allow_unproved` | write a model without a proof of stability too | `false` |
 """
-REQUIRED = {"lags": 1}  # options without a default, so that a class can be made and asked
 
 
 def page() -> str:
@@ -103,7 +103,7 @@ def _default(field: FieldInfo) -> str:
 def _written(value: Any) -> str:
     if isinstance(value, Section):
         return "all defaults"
-    return f"`{json.dumps(value)}`"
+    return f"`{json.dumps(value, default=str)}`"
 
 
 def _range(field: FieldInfo) -> str:
@@ -152,27 +152,37 @@ def _words(annotation: Any) -> list[str]:
 
 
 def _identification() -> Iterator[str]:
-    for name, kind in CLASSES.items():
-        needed = {f.name: REQUIRED[f.name] for f in fields(kind) if f.default is MISSING}
-        methods = ", ".join(f"`{method.name}`" for method in methods_of(kind(**needed)))
+    for name, template in TEMPLATES.items():
+        made = methods_of(template.make({}))
+        words = ", ".join(f"`{word}`" for word in dict.fromkeys(method.word for method in made))
+        certified = ", `certified`" if any(getattr(m, "certified", False) for m in made) else ""
         yield f"#### model: {name}\n"
-        yield f"{_first_sentence(kind)} Methods: {methods}.\n"
-        yield from _options(kind)
+        yield f"{template.says}. Methods: {words}{certified}.\n"
+        rows = template_rows(template)
+        if rows:
+            yield "| key | what | type | default |"
+            yield "|---|---|---|---|"
+            yield from (
+                f"| `{key}` | {text} | {what} | {value} |" for key, text, what, value in rows
+            )
+            yield ""
     yield "#### Options of methods\n"
     yield "| method | key | what | type | default |"
     yield "|---|---|---|---|---|"
     for method in METHODS.values():
         for key, text, kind_, default in option_rows(method):
-            yield f"| `{method.name}` | `{key}` | {text} | {kind_} | {default} |"
+            yield f"| `{method.word}` | `{key}` | {text} | {kind_} | {default} |"
 
 
-def _options(kind: Any) -> Iterator[str]:
-    rows = option_rows(kind)
-    if rows:
-        yield "| key | what | type | default |"
-        yield "|---|---|---|---|"
-        yield from (f"| `{key}` | {text} | {what} | {value} |" for key, text, what, value in rows)
-        yield ""
+def template_rows(template: Template) -> list[tuple[str, str, str, str]]:
+    """(key, what its option's docstring says, type, default) of each key of a template."""
+    known = {row[0]: row for kind in (template.family, template.part) for row in option_rows(kind)}
+    found = []
+    for key, option in template.keys.items():
+        _, text, kind, _ = known[option]
+        default = "required" if key in template.needed else _written(template.default(key))
+        found.append((key, text, kind, default))
+    return found
 
 
 def option_rows(kind: Any) -> list[tuple[str, str, str, str]]:

@@ -107,7 +107,7 @@ def notes(result: Identified) -> list[str]:
     return lines
 
 
-def selection_table(selection: Selection[Model]) -> Table:
+def selection_table(selection: Selection) -> Table:
     """Validation, training and test error of every class, the chosen one bold."""
     table = Table(title="chosen by the validation error", title_justify="left")
     table.add_column("model class")

@@ -20,7 +20,7 @@ from bags.recordings.message_types import decode
 from bags.recordings.remote import place
 from bags.signals.columns import read_columns
 from bags.signals.reader import bag_digest
-from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -385,23 +385,6 @@ def _replayed(
     if not stamped:
         raise BagError(f"{bag}: no sample with all of {watch.pairing}")
     return stamped, watch.forecasts
-
-
-def samples_of(
-    design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
-) -> list[Sample]:
-    """The samples that a monitor of the design makes of a bag's messages, in order.
-
-    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
-    """
-    sampler, place_of, found = design.sampler(), place(bag), []
-    with Bag(place_of, definitions=definitions) as source:
-        _check(sampler, source, place_of)
-        for message in source.messages(sampler.topics):
-            stamp_ns = sampler.stamp(message.data, message.log_time_ns)
-            decoded = decode(message.data, *source.types_on(message.topic))
-            found += sampler.message(message.topic, stamp_ns, decoded)
-    return found + sampler.flush()
 
 
 def announced_runs(

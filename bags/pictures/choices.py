@@ -21,7 +21,7 @@ class Scored:
     scores: Validation
 
 
-def draw_selection(selection: Selection[Model], options: Mapping[str, Sequence[object]]) -> bytes:
+def draw_selection(selection: Selection, options: Mapping[str, Sequence[object]]) -> bytes:
     """Training and validation error over the option with most values, a line for each other one."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -12,7 +12,7 @@ from bags.setup.proposal import FITTED, Proposal
 from bags.signals.delays import RELATED
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
-from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
+from nlsid_core.identification import Degrees, LeastSquares, Polynomial, Rse, identify
 
 LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
 FEW_LAGS: Final = (1, 2, 3)  # tried with several signals, the inputs at all delays or at one,
@@ -34,7 +34,7 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     for lags in LAGS:
         try:
             fit = identify(
-                fitted, LinearClass(lags), method=Rse(iterations=TRIED_ITERATIONS),
+                fitted, Polynomial(lags), method=Rse(iterations=TRIED_ITERATIONS),
                 comparators=(), test=train.select(held_back),
             )  # fmt: skip
         except NlsidError:  # too few samples for so many, or no proof
@@ -48,7 +48,7 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     refused: dict[int, str] = {}
     for lags in (good, *others) if known else (section["lags"],):
         try:
-            fit = identify(train, LinearClass(lags), comparators=())
+            fit = identify(train, Polynomial(lags), comparators=())
         except NlsidError as error:  # more data and iterations may end without a proof: the next
             refused[lags] = str(error)
         else:
@@ -83,10 +83,10 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
     held_back = list(names[1::3]) or list(names[:1])
     alone = len(held_back) == len(names)
     fitted = train if alone else train.without(held_back)
-    known: dict[StateAffineClass, float] = {}
+    known: dict[Polynomial, float] = {}
     for lags, degree in product(FEW_LAGS, DEGREES):
         for delays in (None, *((k,) for k in range(1, lags + 1))):
-            tried = StateAffineClass(lags, delays, right_degree=degree, input_range=ranges)
+            tried = Polynomial(lags, delays, Degrees(inputs=degree), input_range=ranges)
             if _terms(tried) > MOST_TERMS:
                 continue
             with suppress(NlsidError):
@@ -103,14 +103,14 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
     proposal.varies = _varies(train.select(held_back))
     good = min((c for c, error in known.items() if error * LAGS_BETTER <= best),
                key=lambda c: c.lags + _terms(c))  # fmt: skip
-    section |= {"lags": good.lags, "right_degree": good.right_degree}
+    section |= {"lags": good.lags, "right_degree": good.degrees.inputs}
     if good.delays is not None:
         section["delays"] = list(good.delays)
         proposal.why["delays"] = "as the lags"
     ranked = sorted(known, key=known.__getitem__)
     shown = [(c, known[c]) for c in dict.fromkeys([*ranked[:SHOWN], good])]
     said = ", ".join(
-        f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.right_degree}: {error:.3g} %"
+        f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.degrees.inputs}: {error:.3g} %"
         for c, error in shown
     )
     if alone:
@@ -150,7 +150,7 @@ def _varies(trials: Dataset) -> str:
     return f", in which {of}, rms; of calmer test trials it is more"
 
 
-def _terms(tried: StateAffineClass) -> int:
+def _terms(tried: Polynomial) -> int:
     """Of the polynomial in the inputs."""
     window = len(tried.window(len(tried.input_range or ())))
-    return math.comb(window + tried.right_degree, tried.right_degree)
+    return math.comb(window + tried.degrees.inputs, tried.degrees.inputs)

@@ -135,7 +135,7 @@ def propose(
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
     if len(responses) > 1:
-        section["method"] = "sem_certified"
+        section |= {"method": "sem", "certified": True}
         proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)

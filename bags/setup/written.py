@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from bags.chain.config import Config
-from bags.chain.identification_config import CLASSES
-from bags.chain.reference import keys_of, option_rows
+from bags.chain.reference import keys_of, template_rows
 from bags.chain.sections import Key, Section, sections_in
+from bags.chain.templates import TEMPLATES
 from bags.setup.proposal import Proposal
 
 WIDTH: Final = 110
@@ -51,7 +51,7 @@ def _section(
 
 def _options(content: Mapping[str, Any]) -> dict[str, Key]:
     """The keys of the section `identification`."""
-    rows = option_rows(CLASSES[content["model"]])
+    rows = template_rows(TEMPLATES[content["model"]])
     return {"model": Key("the class of models")} | {key: Key(text) for key, text, _, _ in rows}
 
 

@@ -17,15 +17,16 @@ from benchmarks.thesis.relaxation import Sampled
 from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.continuous.design import FunnelDesign, decided, proved_for
+from nlsid_core.design.continuous.design import ContinuousSearch, FunnelDesign, decided
 from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.continuous.problem import ContinuousTracking
+from nlsid_core.design.continuous.search import Swept, proved_for
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
 from nlsid_core.design.continuous.vstep import DEGREE
-from nlsid_core.design.problems import ContinuousTracking
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -42,10 +43,7 @@ def design_by_alternation(
     Raises DataError and Infeasible as `design` does.
     """
     started = time.perf_counter()
-    setting = prepare(
-        problem.dynamics, problem.nominal, goal=problem.goal, policy=problem.policy, Q=problem.Q,
-        R=problem.R, gain=problem.gain, limits=problem.limits,
-    )  # fmt: skip
+    setting = prepare(problem)
     steps, policy = setting.steps, setting.policy
     if len(steps.field.valid):
         raise DataError("the alternation does not know where dynamics are valid: take the sweep")
@@ -58,14 +56,15 @@ def design_by_alternation(
         start = ContinuousFunnel(policy.x, setting.P, first, policy.vector_field, "")
         refuse_start(start, solve_ends(steps, policy, start, executor=executor))
 
-    def search(margin: float) -> tuple[Setting, FloatArray, None]:
+    def search(margin: float) -> Swept:
         found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
-        return setting, found.funnel.rho, None
+        return Swept(setting, found.funnel.rho, None)
 
     _, funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
     seconds = {"rho": time.perf_counter() - started}
-    history = [("rho", funnel.volume_integral())]
-    return decided(setting, funnel, proved, history=history, seconds=seconds)
+    history = (("rho", funnel.volume_integral()),)
+    searched = ContinuousSearch(setting.goal, proved, setting.first_guess(), history, seconds)
+    return decided(setting, funnel, searched)
 
 
 def exponential_start(

@@ -10,8 +10,10 @@ from typing import Any
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike
+from nlsid_core.design import ContinuousTracking
 from nlsid_core.design.continuous.lstep import sections
-from nlsid_core.design.continuous.setting import Goal, prepare
+from nlsid_core.design.continuous.problem import Goal
+from nlsid_core.design.continuous.setting import prepare
 from nlsid_core.design.continuous.sweep import sweep_rho
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError
@@ -53,7 +55,9 @@ def sample_funnel(
     """
     if samples < 2:
         raise DataError(f"{samples} samples an interval: its two ends are the least")
-    setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
+    setting = prepare(
+        ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
+    )
     steps, policy = setting.steps, setting.policy
     instants = sections(steps, policy, setting.P, count=samples)
     margin = setting.margin(setting.rho_final)

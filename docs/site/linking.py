@@ -9,7 +9,14 @@ import re
 from functools import cache
 
 CODE = re.compile(r"(?<!`)`([A-Za-z_]\w*(?:\.\w+)*)(?:\([^`]*\))?`(?!`)")
-ROOMS = ("", "identification.", "models.", "design.", "dynamics.", "identification.moment_rie.")
+ROOMS = (
+    "",
+    "identification.",
+    "models.",
+    "design.",
+    "dynamics.",
+    "identification.polynomial.moment_rie.",
+)
 
 
 def derives(page: str) -> bool:

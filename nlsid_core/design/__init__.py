@@ -3,7 +3,7 @@
 from nlsid_core.design.compose import compose_funnels
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.motion import plan_motion
-from nlsid_core.design.continuous.setting import Goal
+from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
 from nlsid_core.design.continuous.tvlqr import (
     Tracking,
     integrate_nominal,
@@ -12,7 +12,7 @@ from nlsid_core.design.continuous.tvlqr import (
     tvlqr,
 )
 from nlsid_core.design.design import design
-from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
+from nlsid_core.design.problems import OutputTube, SampledTracking
 from nlsid_core.design.riccati import Feedback, discrete_tvlqr
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 

@@ -7,7 +7,8 @@ from concurrent.futures import Executor
 from typing import get_args, overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
-from nlsid_core.design.problems import ContinuousTracking, OutputTube, Problem, SampledTracking
+from nlsid_core.design.continuous.problem import ContinuousTracking
+from nlsid_core.design.problems import OutputTube, Problem, SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
@@ -44,8 +45,8 @@ def design(
         raise DataError(f"the problem should be one of {kinds}, is {problem!r}")
     match problem:
         case OutputTube():
-            return design_output_tube(**vars(problem))
+            return design_output_tube(problem)
         case SampledTracking():
-            return design_state_funnel(**vars(problem), progress=progress)
+            return design_state_funnel(problem, progress=progress)
         case ContinuousTracking():
-            return design_funnel(**vars(problem), executor=executor, progress=progress)
+            return design_funnel(problem, executor=executor, progress=progress)

@@ -1,26 +1,19 @@
 """What `design` solves: a frozen dataclass for each kind of funnel, checked when it is made."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import get_args
 
-from nlsid_core.arrays import ArrayLike
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design.continuous.setting import Goal
-from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.continuous.problem import ContinuousTracking
 from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
-from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.options import require_at_least, require_one_of, require_positive, require_ranges
-from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
-
-Shape = Literal["rho", "P"]
-Objective = Literal["volume", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,54 +87,6 @@ class SampledTracking:
         for key in ("goal", "start"):
             if getattr(self, key) is not None:
                 require_positive(self, key)
-
-
-@dataclass(frozen=True, eq=False)
-class ContinuousTracking:
-    """The largest funnel around a nominal motion that ends in a goal, proved for every t.
-
-    dynamics: a VectorField, or a function of some of t, x, u, w, named so; one that is no
-    polynomial is expanded on every interval around what the funnel needs there, see
-    `dynamics.taylor`. uncertain: rows (low, high) of the w of such a function. goal: half-widths
-    (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal` (None: the largest set
-    that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
-    R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
-    given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
-    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one
-    pair (low, high) for each input, at which inputs saturate; the proof then covers every mode.
-
-    hold: s, how old the input that is applied may be: the time between samples, and any delay
-    ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
-    assumed to act continuously). K is then linear between knots. error: (n,)
-    bounds of how much each state is measured wrong (None: not at all).
-
-
-    shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
-    there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
-    """
-
-    dynamics: VectorField | Callable[..., Any]
-    nominal: Nominal
-    goal: Goal | ArrayLike | None = None
-    policy: ContinuousPolicy | None = None
-    shape: Shape = "rho"
-    objective: Objective = "volume"
-    Q: ArrayLike | None = None
-    R: ArrayLike | None = None
-    gain: str = "constant"
-    limits: ArrayLike | None = None
-    uncertain: ArrayLike | None = None
-    hold: float | Literal["largest"] | None = None
-    error: ArrayLike | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.nominal, Nominal):
-            raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
-        if not isinstance(self.policy, ContinuousPolicy | None):
-            raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
-        require_one_of(self, "shape", get_args(Shape))
-        require_one_of(self, "objective", get_args(Objective))
-        require_one_of(self, "gain", GAINS)
 
 
 Problem = OutputTube | SampledTracking | ContinuousTracking

@@ -23,8 +23,9 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design.increment_form import Form, read_form
-from nlsid_core.design.levels import LevelKind, followed
+from nlsid_core.design.levels import followed
 from nlsid_core.design.plan import lqr_gain, track_profile
+from nlsid_core.design.problems import OutputTube
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.design.tube_program import Found, gramian, solved
 from nlsid_core.designs import Design
@@ -51,35 +52,26 @@ BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
 
 
-def design_output_tube(
-    model: StableModel,
-    train: Dataset,
-    calibration: Dataset | None = None,
-    *,
-    reaction_time: float | None = None,
-    safety_factor: float = 1.5,
-    horizon: float | None = None,
-    box: Sequence[tuple[float, float]] | None = None,
-    level: LevelKind = "auto",
-    profile: Sequence[tuple[float, float]] | None = None,
-    inlet: float = 0.0,
-    lqr_weights: tuple[float, float] | None = (1.0, 1.0),
-) -> OutputTubeDesign:
-    """The funnel that `OutputTube` describes; its options are these.
+def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
+    """The funnel that the problem describes.
 
     Raises DataError on options or trials that do not fit, Infeasible if no tube is found or proved.
     """
+    model, train, horizon, level = problem.model, problem.train, problem.horizon, problem.level
+    profile, inlet, safety_factor = problem.profile, problem.inlet, problem.safety_factor
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    trials = calibration_trials(train, calibration, least=least_window(model, train, horizon))
+    least = least_window(model, train, horizon)
+    trials = calibration_trials(train, problem.calibration, least=least)
     train = trials.design
-    y_box, u_box = _box(model, stepper, train, box)
+    y_box, u_box = _box(model, stepper, train, problem.box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
     K: FloatArray | None = None
     if profile is not None:
-        K, level = _gain(model, lqr_weights), "constant"
+        K, level = _gain(model, problem.lqr_weights), "constant"
     form = Form.of(model, bounds, K)
-    samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
+    ahead = problem.reaction_time
+    samples = REACTION if ahead is None else max(1, round(ahead / model.period))
     amplitudes = np.maximum(
         np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
     )

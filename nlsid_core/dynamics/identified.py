@@ -25,7 +25,7 @@ def identified_field(
 
     E dx/dt = g(x) + r(u) is stepped as e(x⁺) = f(x, u), e = Ex - hg/2 and f = Ex + hg/2 + hr, so E
     is the linear part of (e + f)/2 and hg = f - e. Every linear model of measured states
-    (`LinearStateClass`) is one, as is every model of an `ImplicitClass(..., continuous=True)`.
+    (set 2.19) is one, as is every model of a `Polynomial(..., continuous=True)`.
     A step of h differs from the solution by O(h³). What is proved of the model is about its steps.
 
     box: (low, high) of every state, then every input, where the field is to be used (None: of a

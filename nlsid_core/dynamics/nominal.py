@@ -62,6 +62,6 @@ class Nominal:
         """(S,) times and (S, n) |f(t, x₀, u₀) - ẋ₀| there."""
         share = np.arange(SAMPLES) / SAMPLES
         when = np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * share).ravel(), self.t[-1])
-        rate = self.x.derivative()
-        gaps = [field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t) for t in when.tolist()]
-        return when, np.abs(gaps)
+        X, U = self.x(when)[:, None], self.u(when)[:, None]
+        rates = [field(t, x, u)[0] for t, x, u in zip(when.tolist(), X, U, strict=True)]
+        return when, np.abs(rates - self.x.derivative()(when))

@@ -59,6 +59,10 @@ class PiecewisePolynomial:
         Times outside the knots take the nearest piece's polynomial.
         """
         t = np.asarray(t, dtype=np.float64)
+        if t.ndim == 0:
+            place = int(self.piece(t))
+            s = float((t - self.t[place]) / (self.t[place + 1] - self.t[place]))
+            return bernstein(self.control[place], s)
         flat = np.atleast_1d(t).ravel()
         k = self.piece(flat)
         s = (flat - self.t[k]) / (self.t[k + 1] - self.t[k])
@@ -70,7 +74,7 @@ class PiecewisePolynomial:
     def piece(self, t: ArrayLike) -> FloatArray:
         """The index of the piece each time lies in; a knot belongs to the piece after it."""
         found = np.searchsorted(self.t, np.asarray(t), side="right") - 1
-        return np.clip(found, 0, len(self.t) - 2)
+        return np.minimum(np.maximum(found, 0), len(self.t) - 2)
 
     def derivative(self) -> "PiecewisePolynomial":
         """The time derivative, exact within each piece but for rounding."""

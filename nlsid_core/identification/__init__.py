@@ -1,71 +1,47 @@
 """Identification: a dataset in, a stable model with its proof out (thesis Part I)."""
 
+from nlsid_core.identification.choosing import Selection, Tried, select
+from nlsid_core.identification.families import ModelClass, describe, methods_of
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
-from nlsid_core.identification.identify import Selection, Tried, identify, select
+from nlsid_core.identification.identify import identify
 from nlsid_core.identification.methods.options import (
     METHODS,
-    CertifiedRse,
-    CertifiedSem,
-    FirstRse,
     LeastSquares,
     Method,
-    ModelClass,
-    MomentRie,
     Rie,
     Rse,
     Sem,
-    describe,
+    alike,
 )
-from nlsid_core.identification.network.cascade import (
-    BlockCascadeClass,
-    CascadeFit,
-    identify_block_cascade,
-)
-from nlsid_core.identification.network.cells import CellClass
-from nlsid_core.identification.network.feedback import FeedbackClass
-from nlsid_core.identification.polynomial.implicit_rows import ImplicitClass
-from nlsid_core.identification.polynomial.linear import LinearClass
-from nlsid_core.identification.polynomial.linear_states import LinearStateClass
-from nlsid_core.identification.polynomial.moment_rie import MomentFit
-from nlsid_core.identification.polynomial.moments import MonotoneClass
-from nlsid_core.identification.polynomial.monotone import identify_from_repeats
-from nlsid_core.identification.polynomial.rows import StateAffineClass
+from nlsid_core.identification.network.options import CellRow, Feedback, FilterMapFilter, Network
+from nlsid_core.identification.polynomial.options import Degrees, Polynomial
 from nlsid_core.identification.prediction import Model, predict, simulate_trial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.identification.repeats import RepeatTest, compare_repeats
-from nlsid_core.identification.searches import methods_of
 from nlsid_core.identification.validation import (
     Residual,
     Validation,
     simulation_percent,
     validate,
-    without_missing,
 )
 
 __all__ = [
     "METHODS",
-    "BlockCascadeClass",
     "Candidate",
-    "CascadeFit",
-    "CellClass",
-    "CertifiedRse",
-    "CertifiedSem",
-    "FeedbackClass",
-    "FirstRse",
+    "CellRow",
+    "Degrees",
+    "Feedback",
+    "FilterMapFilter",
     "Fit",
     "History",
-    "ImplicitClass",
     "ImplicitProof",
     "LeastSquares",
-    "LinearClass",
-    "LinearStateClass",
     "Method",
     "Model",
     "ModelClass",
-    "MomentFit",
-    "MomentRie",
-    "MonotoneClass",
+    "Network",
+    "Polynomial",
     "Proof",
     "RepeatTest",
     "Residual",
@@ -74,15 +50,13 @@ __all__ = [
     "Selection",
     "Sem",
     "StabilityProof",
-    "StateAffineClass",
     "Step",
     "Tried",
     "Validation",
+    "alike",
     "compare_repeats",
     "describe",
     "identify",
-    "identify_block_cascade",
-    "identify_from_repeats",
     "methods_of",
     "predict",
     "prove_implicit",
@@ -92,5 +66,4 @@ __all__ = [
     "simulation_percent",
     "stated_rate",
     "validate",
-    "without_missing",
 ]

@@ -3,14 +3,16 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.methods.options import M, Method
+from nlsid_core.identification.methods.options import Method
+from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
 
+M = TypeVar("M", bound=Model, covariant=True)
 AT_BOUND = 1.15  # of 1 - max_rate: a search keeps 1.1 (`rates.ROOM`), and a proof loses a little
 
 

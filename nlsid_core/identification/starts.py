@@ -20,12 +20,12 @@ from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows
-from nlsid_core.identification.polynomial.linear import SLOWEST_POLE
-from nlsid_core.identification.polynomial.moments import MonotoneClass
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.options import Polynomial
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.regressors import lagged, signal_scale
 from nlsid_core.models import MonotoneEquation, StateAffineModel
 
+SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
 LINEAR_ITERATES = 10  # of the robust simulation error, for the linear model of other classes
 LONGER = 4  # times the lags, of the model that is reduced
 BEND = 1e-3  # the cubic part, at one spread, of the equation that a linear model begins as
@@ -101,6 +101,12 @@ def reflected(theta: FloatArray, radius: float = SLOWEST_POLE, outputs: int = 1)
     return np.concatenate([np.eye(outputs)[None], -a]).ravel()
 
 
+def poles_of(theta: FloatArray, outputs: int) -> FloatArray:
+    """Poles of the linear model with left parameters θ ((n+1) n_y²,)."""
+    G = theta.reshape(-1, outputs, outputs)
+    return np.asarray(np.linalg.eigvals(companion(-np.linalg.solve(G[0], G[1:]))))
+
+
 def companion(a: FloatArray) -> FloatArray:
     """A of x⁺ = A x, y the first n_y states, for a (n, n_y, n_y): outputs always tell x."""
     n, n_y, _ = a.shape
@@ -159,7 +165,7 @@ def linear_start(
     Of the iterates from the identity and from the stable starts those that simulate best.
     """
     try:
-        problem = build_state_affine_rows(train, StateAffineClass(lags, delays))
+        problem = build_state_affine_rows(train, Polynomial(lags, delays or tuple(range(lags + 1))))
     except DataError:  # delays or excitation that linear models have not
         return None
     error, found = SimulationError(problem.rows), []
@@ -175,10 +181,11 @@ def linear_start(
         return None
     _, last = min(found, key=lambda one: one[0])
     model = problem.model(last.theta, last.p)
+    assert isinstance(model, StateAffineModel), "delays are given"
     return model if np.linalg.cond(model.G[0].coefficients[0]) < WELL_CONDITIONED else None
 
 
-def as_monotone(model: StateAffineModel, model_class: MonotoneClass) -> MonotoneEquation:
+def as_monotone(model: StateAffineModel, model_class: Polynomial) -> MonotoneEquation:
     """The linear model of one output as an equation of the class."""
     first = float(model.G[0].coefficients.ravel()[0])
     p = _by_monomial(model)
@@ -186,7 +193,7 @@ def as_monotone(model: StateAffineModel, model_class: MonotoneClass) -> Monotone
     units = np.eye(degree, dtype=np.int64)
     b = [-p.get(tuple(unit), np.zeros(1))[0] / first * scale for unit in units.tolist()]
     return MonotoneEquation(
-        e=np.array([1.0, 0.0, BEND / scale**2 if model_class.degree == 3 else 0.0]),
+        e=np.array([1.0, 0.0, BEND / scale**2 if model_class.degrees.left == 3 else 0.0]),
         a=np.array([-float(g.coefficients.ravel()[0]) / first for g in model.G[1:]]),
         b=np.array(b) / model.u_scale[[i for i, _ in model.window]],
         c=float(-p.get((0,) * degree, np.zeros(1))[0] / first * scale),

@@ -2,17 +2,17 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import NlsidError, SolverError
+from nlsid_core.errors import DataError, Infeasible, NlsidError, SolverError
 from nlsid_core.identification.fit import (
     Candidate,
     History,
@@ -22,15 +22,17 @@ from nlsid_core.identification.fit import (
     stated_rate,
 )
 from nlsid_core.identification.methods.banded import Rows
-from nlsid_core.identification.methods.options import FirstRse, Method, Rse
+from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.methods.rse import Iterate, affordable_steps, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rates import is_too_slow, searched_rate
+from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.progress import Progress, silent
 
 T = TypeVar("T", bound=Model)
-W = TypeVar("W", bound=Method)
+S = TypeVar("S")
+R = TypeVar("R")
 log = logging.getLogger(__name__)
 STEPS_A_BOUND = 10  # of Newton's method, to its minimum, as a rule
 FEW_STEPS = 2  # towards it in a large problem: a new bound brings more than the end of the last
@@ -56,12 +58,10 @@ class Task:
         """The slowest rate that a search keeps, so that its proof is fast enough."""
         return searched_rate(self.max_rate)
 
-    def wanted(self, kind: type[W]) -> W | None:
-        """The method of this kind that was asked for, with its options; None if none was."""
-        for method in (self.method, *self.comparators):
-            if isinstance(method, kind):
-                return method
-        return None
+    def wanted(self, name: str) -> Any:
+        """The method of this name that was asked for, with its options; None if none was."""
+        asked = (self.method, *self.comparators)
+        return next((method for method in asked if method.name == name), None)
 
 
 class Trail(Generic[T]):
@@ -72,18 +72,18 @@ class Trail(Generic[T]):
         self.candidates: list[Candidate[T]] = []
         self.history = History(value)
 
-    def add(self, kind: type[W], make: Callable[[W], T]) -> None:
-        """Make the candidate of this kind of method, if it is asked for."""
+    def add(self, name: str, make: Callable[[Any], T]) -> None:
+        """Make the candidate of the method of this name, if it is asked for."""
 
-        def proved(method: W) -> tuple[T, Proof | None]:
+        def proved(method: Method) -> tuple[T, Proof | None]:
             model = make(method)
             return model, self.prove(model)
 
-        self.add_proved(kind, proved)
+        self.add_proved(name, proved)
 
-    def add_proved(self, kind: type[W], make: Callable[[W], tuple[T, Proof | None]]) -> None:
+    def add_proved(self, name: str, make: Callable[[Any], tuple[T, Proof | None]]) -> None:
         """The same where the proof comes with the model."""
-        method = self.task.wanted(kind)
+        method = self.task.wanted(name)
         if method is None:
             return
         self.task.progress(method.title, 0.1 * len(self.candidates))
@@ -104,22 +104,20 @@ class Trail(Generic[T]):
         starts: Iterable[tuple[str, FloatArray]] = (),
         within: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
-        """The iterates of the robust simulation error; the first and the best are candidates.
+        """The iterates of the robust simulation error; the best is a candidate.
 
         starts: left parameters with their names, at which a first bound is made exact; from each
         it is iterated too, and the iterate of the least simulation error is kept. In a large
-        problem, by `affordable_steps`, no bound but the first is taken to its minimum.
+        problem, by `affordable_steps`, no bound is taken to its minimum.
         within: the nearest left parameters that are allowed, at which an iterate that is not is
         taken.
         """
-        first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
-        if first is None and final is None:
+        method = self.task.wanted("rse")
+        if method is None:
             return
-        begun = (("", None), *(() if final is None else starts))
-        iterations = 1 if final is None else final.iterations
+        begun, iterations, steps = (("", None), *starts), method.iterations, None
         affordable = affordable_steps(rows) // len(begun)
-        steps = None
-        if final is not None and iterations * STEPS_A_BOUND > affordable:
+        if iterations * STEPS_A_BOUND > affordable:
             steps = FEW_STEPS
             iterations = min(iterations, max(FEWEST_BOUNDS, affordable // steps))
             log.info("a large problem: %d bounds from each start, %d Newton steps towards the "
@@ -128,15 +126,11 @@ class Trail(Generic[T]):
         started, best, failure = time.process_time(), None, SolverError("no iterate")
         for start, theta in begun:
             path: list[Step] = []
-            exact_first = theta is None and first is not None
             try:
                 for last in robust_simulation_error(
-                    rows, start=theta, iterations=iterations, steps=steps, exact_first=exact_first
+                    rows, start=theta, iterations=iterations, steps=steps
                 ):
                     path.append(Step(f"iterate {len(path) + 1} {start}".rstrip(), last.J))
-                    if first is not None and exact_first and len(path) == 1:
-                        seconds, found = time.process_time() - started, model(last)
-                        self._keep(first, found, self.prove(found), seconds)
                     done = 0.2 + 0.4 * len(path) / iterations
                     self.task.progress(f"robust simulation error, iterate {len(path)}", done)
                 allowed = last.theta if within is None else within(last.theta)
@@ -152,9 +146,8 @@ class Trail(Generic[T]):
         if best is None:
             raise failure
         self.history = History(self.history.value, best[2])
-        if final is not None:
-            seconds, found = time.process_time() - started, model(best[1])
-            self._keep(final, found, self.prove(found), seconds)
+        seconds, found = time.process_time() - started, model(best[1])
+        self._keep(method, found, self.prove(found), seconds)
 
     def solved(self, method: Method, bound: float) -> None:
         """The history of a fit that one program made, if it is the method asked for."""
@@ -173,3 +166,19 @@ class Trail(Generic[T]):
         self.candidates.append(
             Candidate(method, model, proof, seconds, self.task.transient, remark)
         )
+
+
+def tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | None:
+    """What a search makes of a start; None if there is no start, or it leads to nothing."""
+    try:
+        return minimised(start())
+    except (DataError, SolverError, LinAlgError) as reason:
+        log.info("no model from this start: %s", reason)
+        return None
+
+
+def least_error(models: Sequence[T], train: Dataset) -> T:
+    """The model that simulates the training data best; Infeasible if there is none."""
+    if not models:
+        raise Infeasible("no start of the search leads to a model that can be used")
+    return min(models, key=lambda model: simulation_percent(model, train))

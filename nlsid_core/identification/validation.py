@@ -15,7 +15,7 @@ from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import (
     Model,
@@ -216,15 +216,11 @@ def residual_tests(
     )
 
 
-def simulation_percent(
-    model: Model, dataset: Dataset, *, transient: int = 0, weights: FloatArray | None = None
-) -> float:
+def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
     of their spread; ŷ is simulated from the model's history, n is that or `transient` if longer.
-
-    weights: (n_y,) of the squares of each output (None: all equal).
     """
-    return _percent(_simulated(model, dataset, max(history(model), transient)), weights)
+    return _percent(_simulated(model, dataset, max(history(model), transient)))
 
 
 def prediction_percent(
@@ -256,29 +252,6 @@ def hold_out(train: Dataset) -> tuple[Dataset, Dataset]:
     )
 
 
-def without_missing(trial: Trajectory, missing: FloatArray, *, shortest: int) -> tuple[
-    tuple[Trajectory, ...], int
-]:  # fmt: skip
-    """The stretches of `trial` where `missing` (N,) is false, and how many samples were skipped.
-
-    Stretches of fewer than `shortest` samples are skipped too. Raises DataError if none is left.
-    """
-    flags = np.asarray(missing, dtype=bool)
-    if flags.shape != trial.t.shape:
-        raise DataError(f"{trial.name}: {flags.shape} flags for {len(trial)} samples")
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], flags, [True]])))
-    stretches = [
-        (begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)
-        if end - begin >= shortest
-    ]  # fmt: skip
-    if not stretches:
-        raise DataError(f"{trial.name}: no stretch of {shortest} samples without gaps")
-    kept = tuple(
-        trial.rows(slice(*ends), f"{trial.name} part {i}") for i, ends in enumerate(stretches, 1)
-    )
-    return kept, len(trial) - sum(map(len, kept))
-
-
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
@@ -301,14 +274,10 @@ def _clipped_percent(model: Model, dataset: Dataset) -> float:
     return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
-def _percent(
-    pairs: list[tuple[FloatArray, FloatArray]], weights: FloatArray | None = None
-) -> float:
+def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
     spread = np.maximum(centred.std(axis=0), np.finfo(float).tiny)
-    if weights is not None:
-        spread = spread / np.sqrt(weights)
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.linalg.norm((measured - simulated) / spread) / np.linalg.norm(centred / spread)
     return float(100.0 * ratio) if np.isfinite(ratio) else np.inf

@@ -23,7 +23,7 @@ from scipy.linalg import LinAlgError, cholesky
 
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
-from nlsid_core.polynomial.documents import write_whole
+from nlsid_core.polynomial.documents import WHOLE, write_whole
 
 ROOM = 0.7  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
 ROUNDING = 0.3  # of that room: what rounding may take of a diagonal entry
@@ -73,9 +73,10 @@ class Scale:
 
     def lost(self, change: FloatArray) -> FloatArray:
         """(J+1, k) what the diagonal of r loses by a change (J+1, k, k), scaled as written."""
-        at = np.zeros_like(change)
-        for total, part in zip(at, change * self.weights, strict=True):
-            np.add.at(total, self.places, part)
+        k = change.shape[1]
+        flat = (self.places[0] * k + self.places[1]).ravel()
+        moved = (change * self.weights).reshape(len(change), -1)
+        at = np.array([np.bincount(flat, row, k * k) for row in moved]).reshape(-1, k, k)
         return np.asarray(np.abs(at).sum(axis=1) + np.abs(at).sum(axis=2)) / 2
 
 
@@ -112,8 +113,13 @@ def witness(
     allowed = ROUNDING * room[:, None] * scale.small**2
     enough = ceil(log2(len(monomials) ** 1.5 / allowed.min()))  # |E|₁ ≤ k^1.5 2^-unit
     enough = max(0, enough + SPARE_BITS)
-    kept = (u for u in range(enough) if (scale.lost(_rounding(roots, u)) <= allowed).all())
-    unit = next(kept, enough)
+    few, unit = -1, enough  # of bits: too few, and enough
+    while unit - few > 1:
+        middle = (few + unit) // 2
+        if (scale.lost(_rounding(roots, middle)) <= allowed).all():
+            unit = middle
+        else:
+            few = middle
     return _written(monomials, scale.columns, unit, list(roots))
 
 
@@ -234,7 +240,11 @@ def _written(
 ) -> Json:
     factors = []
     for root in roots:
-        rows = [[round(entry) for entry in row] for row in np.ldexp(root, unit).tolist()]
+        whole = np.rint(np.ldexp(root, unit))
+        if np.abs(whole).max(initial=0.0) <= WHOLE:
+            rows = whole.astype(np.int64).tolist()
+        else:
+            rows = [[write_whole(round(entry)) for entry in row] for row in whole.tolist()]
         factors.append([_row(row) for row in rows if any(row)])
     return {
         "basis": monomials.tolist(),
@@ -243,7 +253,7 @@ def _written(
     }
 
 
-def _row(row: Sequence[int]) -> list[int | str]:
+def _row(row: Sequence[int | str]) -> list[int | str]:
     """Without leading zeros: the last entry belongs to the last monomial."""
     first = next((k for k, entry in enumerate(row) if entry), len(row) - 1)
-    return [write_whole(entry) for entry in row[first:]]
+    return list(row[first:])

@@ -28,7 +28,7 @@ from bags.tools.fitness import Level, check_fitness
 from bags.tools.importing import import_tables, read_tables
 from bags.tools.info import bag_info
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.identification import Polynomial, identify
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -456,7 +456,7 @@ def test_a_command_that_changes_only_where_no_response_is_is_named(tmp_path: Pat
     assert said == [f"{COMMAND} is 0.5 wherever every response was recorded"]
     dataset = read_dataset([tmp_path / "late"], responses=[SPEED], excitations=[COMMAND])
     with pytest.raises(DataError, match=r"/cmd_vel.* is constant \(0\.5\) in all trials"):
-        identify(dataset, LinearClass(lags=1))
+        identify(dataset, Polynomial(1))
 
 
 def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:

@@ -75,7 +75,6 @@ def test_errors_without_the_calibration_trials_are_as_documented(
     result = identify_bags(f1tenth(), config, tmp_path, progress=silent)
     errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     assert errors["least_squares"] == pytest.approx(11.52, abs=0.05)
-    assert errors["rse_first"] == pytest.approx(12.60, abs=0.05)
     assert errors["rse"] == pytest.approx(8.00, abs=0.05)
     assert errors["sem"] == pytest.approx(8.00, abs=0.05)
     assert len(result.train) == 17

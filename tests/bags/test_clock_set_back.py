@@ -14,7 +14,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.grid import read_dataset
 from bags.signals.reader import LOG_TIME, read_signals
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import design_output_tube
+from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
@@ -68,7 +68,7 @@ def test_the_monitor_says_it_and_does_not_blame_the_robot(
         y=Signal("speed", "m/s", f"{SPEED}|clock(log)"),
         u=Signal("command", "m/s", f"{COMMAND}|clock(log)"),
     )
-    design = design_output_tube(model, train)
+    design = design_output_tube(OutputTube(model, train))
     wired: WiredTube = WiredDesign(design.model, None, design.funnel)
     said = replay_messages(wired, bag, centre=Centre.COMMAND)
     readings = [entry.reading for entry in said]

@@ -9,10 +9,10 @@ from pydantic import TypeAdapter
 from typer.testing import CliRunner
 
 from bags.chain.config import Config
-from bags.chain.identification_config import CLASSES
-from bags.chain.reference import keys_of, option_rows, page
+from bags.chain.reference import keys_of, option_rows, page, template_rows
 from bags.chain.sections import Section, sections_in
 from bags.chain.shipped import config_file
+from bags.chain.templates import TEMPLATES
 from bags.chain.tracking_config import TrackingConfig
 from bags.commands.cli import app
 from bags.samples import f1tenth
@@ -116,7 +116,10 @@ def test_every_key_says_what_it_is_and_its_example_is_accepted(kind: type[Sectio
 
 def test_every_option_of_a_class_and_a_method_is_on_the_page() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    for kind in (*CLASSES.values(), *METHODS.values()):
-        for key, what, _, _ in option_rows(kind):
-            assert what, f"{kind.__name__}.{key}"
-            assert f"`{key}` | {what}" in text
+    rows = [row for template in TEMPLATES.values() for row in template_rows(template)]
+    for key, what, _, _ in [
+        *rows,
+        *(row for kind in METHODS.values() for row in option_rows(kind)),
+    ]:
+        assert what, key
+        assert f"`{key}` | {what}" in text

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from bags.pictures.funnel_plots import funnel_picture, state_pairs, write_funnel_picture
 from examples import one_dimensional
 from examples.satellite_funnel import goal_matrix, problem
-from nlsid_core.design import FunnelDesign, design_funnel
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
 
 pytestmark = pytest.mark.pictures
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.pictures
 @pytest.fixture(scope="module")
 def satellite() -> FunnelDesign:
     field, nominal, weights = problem(13)
-    return design_funnel(field, nominal, goal=goal_matrix(), **weights)
+    return design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
 
 
 @pytest.mark.parametrize(

@@ -11,24 +11,16 @@ from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification import (
-    METHODS,
-    BlockCascadeClass,
-    CertifiedRse,
-    CertifiedSem,
+    Degrees,
+    FilterMapFilter,
     Fit,
-    ImplicitClass,
     LeastSquares,
-    LinearClass,
-    LinearStateClass,
-    MomentRie,
-    MonotoneClass,
+    Network,
+    Polynomial,
     Rie,
     Rse,
     Sem,
-    StateAffineClass,
-    describe,
     identify,
-    methods_of,
     predict,
     select,
     validate,
@@ -43,7 +35,7 @@ from tests.conftest import synthetic_dataset
 from tests.identified_bags import saturating
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
-CASCADE = BlockCascadeClass((2, 1), phases=(1,), intervals=(8,), starts=4)
+CASCADE = Network(FilterMapFilter((2, 1), phases=(1,), intervals=(8,), starts=4))
 
 
 def saturated(samples: int, seed: int, noise: float = 0.01) -> Trajectory:
@@ -72,66 +64,34 @@ def monotone() -> Fit[MonotoneEquation]:
 
 @pytest.fixture(scope="module")
 def affine(train: Dataset) -> Fit[StateAffineModel]:
-    declared = StateAffineClass(2, input_range=((-0.5, 1.5),), on_out_of_range="refuse")
-    return identify(train, declared, method=CertifiedRse(iterations=3))
-
-
-def test_every_class_has_its_methods_and_together_they_are_all() -> None:
-    classes = (LinearClass(2), StateAffineClass(2), CASCADE, MonotoneClass(2))
-    assert methods_of(ImplicitClass())[0] is Rie
-    assert methods_of(LinearStateClass()) == (LeastSquares, CertifiedSem)
-    assert {m for c in classes for m in methods_of(c)} == set(METHODS.values())
-    assert methods_of(StateAffineClass(2, lagged_degree=1))[0] is Rse
-    for degrees in ((0, 1), (1, 1), (2, 0)):
-        assert CertifiedRse in methods_of(StateAffineClass(2, None, *degrees))
-    for degrees in ((3, 0), (2, 1), (0, 2)):
-        assert CertifiedRse not in methods_of(StateAffineClass(2, None, *degrees))
-    with pytest.raises(DataError, match="is no model class; there are: LinearClass"):
-        methods_of("linear")
+    declared = Polynomial(2, input_range=((-0.5, 1.5),), on_out_of_range="refuse")
+    return identify(train, declared, method=Rse(iterations=3, certified=True))
 
 
 def test_a_cascade_fit_is_a_fit_with_the_choices_as_its_history(cascade: Fit[BlockCascade]) -> None:
-    assert cascade.methods == ("sem",)
+    assert cascade.methods == ("sem_certified",)
     assert "8 intervals" in cascade.history.steps[0].what
     assert cascade.history.value == "validation error, rms []"
     assert cascade.chosen.transient == 60
-    assert cascade.errors["test"]["sem"] < 2.0
+    assert cascade.errors["test"]["sem_certified"] < 2.0
     assert cascade.proof.rate < 1.0
     text = str(cascade)
     assert "block cascade: filters of orders 2 and 1" in text
     assert "train  validation        test" in text
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_cascade(cascade: Fit[BlockCascade]) -> None:
-    data, validation = (
-        Dataset((saturated(500, 0), saturated(700, 1))),
-        Dataset((saturated(500, 2),)),
-    )
-    again = identify(data, CASCADE, validation=validation, transient=60)
-    assert again.model.document() == cascade.model.document()
-    other = identify(data, replace(CASCADE, seed=5), validation=validation, transient=60)
-    assert other.model.document() != cascade.model.document()
-
-
 def test_moments_stand_beside_the_biased_rie_and_least_squares(
     monotone: Fit[MonotoneEquation],
 ) -> None:
-    assert monotone.methods == ("least_squares", "rie", "moment_rie")
-    assert repeated.percent(monotone.model) < 0.4 * repeated.percent(monotone["rie"].model)
+    pairs = [*repeated.pair(2000, 1), *repeated.pair(1500, 2)]
+    alone = Dataset(tuple(replace(trial, group="") for trial in pairs))
+    biased = identify(alone, repeated.CLASS, comparators=())
+    assert "which noise biases" in str(biased)
+    assert monotone.methods == ("least_squares", "rie")
+    assert repeated.percent(monotone.model) < 0.4 * repeated.percent(biased.model)
     assert monotone["least_squares"].proof is not None, "every candidate is offered to the prover"
     assert len(monotone.history.steps) == 1
     assert "mean squared simulation error by the moments" in str(monotone)
-
-
-def test_only_what_is_asked_for_runs(train: Dataset) -> None:
-    alone = identify(train, LinearClass(2), method=LeastSquares(), comparators=())
-    assert alone.methods == ("least_squares",)
-    assert str(alone.history) == "solved directly"
-    two = identify(train, LinearClass(2), method=Sem(), comparators=[LeastSquares()])
-    assert two.methods == ("least_squares", "sem")
-    with pytest.raises(DataError, match=r"Rie\(\) is not for this model class \(LinearClass\)"):
-        identify(train, LinearClass(2), comparators=[Rie()])
 
 
 def test_a_comparator_that_fails_is_left_out_and_logged(
@@ -139,20 +99,20 @@ def test_a_comparator_that_fails_is_left_out_and_logged(
 ) -> None:
     renamed = [replace(t, group="same") for t in train]
     fit = identify(
-        Dataset(tuple(renamed)), MonotoneClass(2, degree=1), method=LeastSquares(),
+        Dataset(tuple(renamed)), Polynomial(2, set="3.8"), method=LeastSquares(),
         allow_unproved=True,
     )  # fmt: skip
-    assert fit.methods == ("least_squares", "rie")
+    assert fit.methods == ("least_squares",)
     assert "are not repeats" in caplog.text
 
 
 def test_other_signals_or_another_period_are_refused(train: Dataset) -> None:
     renamed = Dataset(tuple(replace(t, u_names=("torque",)) for t in train))
     with pytest.raises(DataError, match=r"the test data hold .*torque"):
-        identify(train, LinearClass(2), test=renamed)
+        identify(train, Polynomial(2), test=renamed)
     slow = Dataset(tuple(replace(t, t=2.0 * t.t) for t in train))
     with pytest.raises(DataError, match=r"the validation data are sampled every 0\.2 s"):
-        identify(train, LinearClass(2), validation=slow)
+        identify(train, Polynomial(2), validation=slow)
 
 
 # -- bad input ---------------------------------------------------------------------------------
@@ -161,29 +121,17 @@ def test_other_signals_or_another_period_are_refused(train: Dataset) -> None:
 def test_too_little_data_says_how_much_there_is_and_what_for() -> None:
     short = Dataset((saturated(70, 0),))
     for model_class, reason in (
-        (LinearClass(30), "40 rows for 62 parameters"),
-        (StateAffineClass(6, right_degree=3), "64 equations for 127 parameters; give more data"),
-        (StateAffineClass(80), "70 samples, 80 lags need more"),
-        (BlockCascadeClass((20, 20)), "fewer than 99 scored samples"),
-        (MonotoneClass(80), "70 common samples; 81 needed"),
+        (Polynomial(30), "40 equations for 62 parameters"),
+        (
+            Polynomial(6, degrees=Degrees(inputs=3)),
+            "64 equations for 126 parameters; give at least 126",
+        ),
+        (Polynomial(80), "70 samples, 80 lags need more"),
+        (Network(FilterMapFilter((20, 20))), "fewer than 99 scored samples"),
+        (Polynomial(80, degrees=Degrees(left=3), set="3.8"), "70 common samples; 81 needed"),
     ):
         with pytest.raises(DataError, match=reason):
             identify(short, model_class, validation=short)
-
-
-def test_an_input_that_excites_nothing_is_named() -> None:
-    t, rng = 0.01 * np.arange(400), np.random.default_rng(0)
-    still = Dataset((Trajectory(t=t, y=rng.standard_normal(400), u=np.full(400, 0.4)),))
-    for model_class in (LinearClass(2), StateAffineClass(2), CASCADE):
-        with pytest.raises(DataError, match="constant"):
-            identify(still, model_class, validation=still)
-    with pytest.raises(DataError, match=r"the excitation u0 is constant \(0.4\)"):
-        identify(still, MonotoneClass(2), method=Rie())
-    square = Dataset((Trajectory(t=t, y=rng.standard_normal(400), u=np.tile([0.0, 1.0], 200)),))
-    with pytest.raises(DataError, match="window of 3 inputs: with a constant it has rank 2, not 4"):
-        identify(square, MonotoneClass(2), method=Rie())
-    with pytest.raises(DataError, match="does not excite 2 lags"):
-        identify(square, LinearClass(2))
 
 
 def test_a_basis_that_repeats_itself_says_its_rank() -> None:
@@ -191,7 +139,7 @@ def test_a_basis_that_repeats_itself_says_its_rank() -> None:
     u = np.sign(rng.standard_normal(500))  # u² is constant
     data = Dataset((Trajectory(t=np.arange(500.0), y=rng.standard_normal(500), u=u),))
     with pytest.raises(DataError, match="polynomial basis of 10 has rank 7"):
-        identify(data, StateAffineClass(2, right_degree=2))
+        identify(data, Polynomial(2, degrees=Degrees(inputs=2)))
 
 
 def test_what_is_no_repeat_is_refused_and_said_to_be_untested_if_asked() -> None:
@@ -200,11 +148,11 @@ def test_what_is_no_repeat_is_refused_and_said_to_be_untested_if_asked() -> None
     data = Dataset((first, late))
     with pytest.raises(DataError, match=r"are not repeats: .*correlates with the excitation"):
         identify(data, repeated.CLASS)
-    accepted = identify(data, repeated.CLASS, method=MomentRie(accept_untested_repeats=True))
+    accepted = identify(data, repeated.CLASS, method=Rie(accept_untested_repeats=True))
     assert accepted.proof.rate < 1.0
     alone = Dataset((replace(first, group=""), replace(second, group="")))
     with pytest.raises(DataError, match="share a `group`"):
-        identify(alone, repeated.CLASS)
+        identify(alone, repeated.CLASS, method=Rie(accept_untested_repeats=True))
 
 
 # -- inputs beyond the range that was proved ---------------------------------------------------
@@ -247,7 +195,7 @@ def test_the_certificate_states_what_is_declared(
 
 
 def test_a_range_that_refuses_its_own_training_data_is_refused(train: Dataset) -> None:
-    narrow = StateAffineClass(2, input_range=((0.2, 0.5),), on_out_of_range="refuse")
+    narrow = Polynomial(2, input_range=((0.2, 0.5),), on_out_of_range="refuse")
     with pytest.raises(DataError, match=r"which the model refuses; declare a wider range"):
         identify(train, narrow)
     clipped = identify(train, replace(narrow, on_out_of_range="clip"), comparators=())
@@ -281,23 +229,6 @@ def test_predictions_of_a_monotone_equation_are_simulations_restarted_at_every_s
         assert predicted[row, 0] == pytest.approx(restarted[-1], abs=1e-12)
 
 
-def test_a_cascade_predicts_what_it_simulates_which_is_said_and_its_residual_is_the_noise(
-    cascade: Fit[BlockCascade],
-) -> None:
-    test = Dataset((saturated(900, 8),))
-    scores = cascade.chosen.validate(test)
-    assert scores.prediction_percent == {}, "it is no number of its own"
-    assert "prediction error: -, as this class of models predicts what it" in str(scores)
-    assert "one-step residual" not in str(scores)
-    np.testing.assert_array_equal(
-        predict(cascade.model, test.trajectories[0], 20),
-        simulate_trial(cascade.model, test.trajectories[0])[history(cascade.model) + 19 :],
-    )
-    assert scores.white
-    assert scores.independent
-    assert scores.samples == 840
-
-
 def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[MonotoneEquation]) -> None:
     test = Dataset((repeated.run(np.random.default_rng(7).uniform(-2, 2, 3000), 0.05, 7),))
     scores = validate(monotone.model, test)
@@ -310,7 +241,10 @@ def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[Monoton
 def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None:
     train = Dataset((saturated(400, 0), saturated(500, 1)))
     validation = Dataset((saturated(400, 2),))
-    orders = [replace(CASCADE, orders=orders) for orders in ((1, 0), (2, 1))]
+    orders = [
+        replace(CASCADE, structure=replace(CASCADE.structure, orders=orders))
+        for orders in ((1, 0), (2, 1))
+    ]
     chosen = select(train, validation, orders, transient=60)
     assert chosen.best == orders[1]
     assert not chosen.refitted, "validation trials choose its knots"
@@ -320,7 +254,7 @@ def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None
 @pytest.mark.slow
 def test_no_class_chooses_by_the_trials_that_it_is_judged_by() -> None:
     train, validation = Dataset((saturated(400, 0), saturated(500, 1))), saturated(400, 2)
-    knots = replace(CASCADE, intervals=(1, 2, 8, 16))
+    knots = replace(CASCADE, structure=replace(CASCADE.structure, intervals=(1, 2, 8, 16)))
     alone = identify(train, knots, transient=60)
     assert alone.model.bags == train.bags, "the trial its knots were chosen by is named too"
     for sign in (1.0, -1.0):  # with other outputs the same model is judged
@@ -344,11 +278,10 @@ def test_the_second_of_two_trials_and_the_last_third_of_one_are_held_out() -> No
 
 def test_a_selection_without_a_model_says_why() -> None:
     train, validation = Dataset((saturated(400, 0),)), Dataset((saturated(400, 2),))
-    with pytest.raises(Infeasible, match="share a `group`"):
-        select(train, validation, [MonotoneClass(1), MonotoneClass(2)])
+    with pytest.raises(Infeasible, match="equations for"):
+        select(train, validation, [Polynomial(98), Polynomial(99)])
     with pytest.raises(DataError, match="no model class to select from"):
         select(train, validation, [])
-    assert describe(StateAffineClass(2, right_degree=3)) == "state affine, lags 2, right degree 3"
 
 
 # -- documents ---------------------------------------------------------------------------------
@@ -383,15 +316,15 @@ def test_documents_of_each_class_validate_against_the_published_schemas(
 @pytest.mark.parametrize(
     "model_class",
     [
-        LinearClass(2),
-        pytest.param(StateAffineClass(2, leading_degree=1), marks=pytest.mark.slow),
+        Polynomial(2),
+        pytest.param(Polynomial(2, degrees=Degrees(leading=1)), marks=pytest.mark.slow),
     ],
 )
 def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
-    train: Dataset, model_class: LinearClass | StateAffineClass
+    train: Dataset, model_class: Polynomial
 ) -> None:
-    before = Rse(4) if isinstance(model_class, LinearClass) else CertifiedRse(4)
-    fit = identify(train, model_class, method=CertifiedSem(4), comparators=[before])
+    before = Rse(4, certified=not model_class.is_linear)
+    fit = identify(train, model_class, method=Sem(4, certified=True), comparators=[before])
     errors = fit.errors["train"]
     assert fit.proof.rate < 1.0
     assert errors["sem_certified"] <= errors[before.name] * (1 + 1e-9)
@@ -402,12 +335,12 @@ def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_u
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, 2))
     data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
-    assert identify(data, StateAffineClass(1), method=CertifiedRse()).proof.rate < 1.0
-    quadratic = StateAffineClass(1, (0,), leading_degree=2)
+    assert identify(data, Polynomial(1), method=Rse(certified=True)).proof.rate < 1.0
+    quadratic = Polynomial(1, (0,), Degrees(leading=2))
     with pytest.raises(ShapeError, match="degree 1 at most; minimise the robust simulation error"):
-        identify(data, quadratic, method=CertifiedRse(), comparators=())
+        identify(data, quadratic, method=Rse(certified=True), comparators=())
     beside = identify(
-        data, quadratic, method=Rse(2), comparators=[CertifiedRse(2)], allow_unproved=True
+        data, quadratic, method=Rse(2), comparators=[Rse(2, certified=True)], allow_unproved=True
     )
     assert beside.methods == ("rse",)
 
@@ -420,7 +353,7 @@ def test_products_of_lags_and_five_inputs_are_certified() -> None:
         y[t] = (0.6 + 0.05 * u[t - 1, 0]) * y[t - 1] + u[t - 1] @ [1.0, -0.5, 0.3, 0.2, 0.1]
     measured = y + 0.05 * np.std(y) * rng.standard_normal(400)
     data = Dataset((Trajectory(t=0.1 * np.arange(400), y=measured, u=u),))
-    model_class = StateAffineClass(1, lagged_degree=1)
-    fit = identify(data, model_class, method=CertifiedRse(3), comparators=())
+    model_class = Polynomial(1, degrees=Degrees(lagged=1))
+    fit = identify(data, model_class, method=Rse(3, certified=True), comparators=())
     assert fit.proof.rate < 1.0
     assert fit.errors["train"]["rse_certified"] < 7.0

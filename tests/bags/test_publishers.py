@@ -15,7 +15,7 @@ from bags.signals.grid import read_dataset
 from bags.signals.publishers import two_curves
 from bags.tools.fitness import Level, check_fitness
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import design_output_tube
+from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
@@ -92,7 +92,7 @@ def resampled(fit: Fit[DifferenceEquation], train: Dataset) -> WiredTube:
         y=Signal("speed", "m/s", f"{SPEED}|linear(0.3 s)"),
         u=Signal("command", "m/s", COMMAND),
     )
-    design = design_output_tube(model, train)
+    design = design_output_tube(OutputTube(model, train))
     return WiredDesign(design.model, None, design.funnel)
 
 

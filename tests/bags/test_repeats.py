@@ -8,11 +8,8 @@ from scipy.signal import lfilter
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.polynomial.moments import (
-    MonotoneClass,
-    offsets_of,
-    repeated_moments,
-)
+from nlsid_core.identification import Degrees, Polynomial
+from nlsid_core.identification.polynomial.moments import offsets_of, repeated_moments
 from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
 from tests.repeated import CLASS, OFFSETS, pair
@@ -65,5 +62,5 @@ def test_unusable_repeats_say_what_is_wrong() -> None:
         repeated_moments([short], CLASS, OFFSETS)
     with pytest.raises(ShapeError, match="one output"):
         offsets_of([replace(first, y=np.zeros((400, 2)), y_names=(), y_units=(), y_paths=())])
-    with pytest.raises(DataError, match="degree is 2"):
-        MonotoneClass(1, (0,), 2)
+    with pytest.raises(DataError, match="left is 2"):
+        Polynomial(1, (0,), Degrees(left=2), set="3.8")

@@ -21,9 +21,9 @@ from bags.signals.grid import filled_samples, read_dataset
 from bags.signals.reader import read_signals
 from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
-from nlsid_core.design import design_output_tube
+from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.errors import BagError
-from nlsid_core.identification import LinearClass, identify
+from nlsid_core.identification import Polynomial, identify
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from tests.bag_messages import (
@@ -437,9 +437,9 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
         hold=0.15,
         clock="log",
     )
-    fit = identify(data, LinearClass(4))
+    fit = identify(data, Polynomial(4))
     model = replace(fit.model, training="sha256:0")
-    made = design_output_tube(model, data, profile=[(0.0, 0.0), (9.7, 0.5)], inlet=0.1)
+    made = design_output_tube(OutputTube(model, data, profile=[(0.0, 0.0), (9.7, 0.5)], inlet=0.1))
     design = WiredDesign(made.model, made.policy, made.funnel)
     said = replay_messages(design, bags[0], centre=Centre.COMMAND)
     trial = data.trajectories[0]
@@ -469,8 +469,8 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
         for bag in (whole, lossy)
     )
     assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
-    model = replace(identify(data, LinearClass(1)).model, training="sha256:0")
-    made = design_output_tube(model, data)
+    model = replace(identify(data, Polynomial(1)).model, training="sha256:0")
+    made = design_output_tube(OutputTube(model, data))
     design = WiredDesign(made.model, made.policy, made.funnel)
     before, after = (replay_messages(design, bag) for bag in (whole, lossy))
     assert len(before) == len(after) == len(u)

@@ -15,7 +15,7 @@ from bags.commands.cli import app
 from bags.monitoring.replay import Replay
 from bags.tools.fitness import LEAST_OVERLAP
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import CertifiedSem, LinearClass, MonotoneClass, Rse, identify
+from nlsid_core.identification import Degrees, Polynomial, Rse, Sem, identify
 from nlsid_core.running.reading import Reading, Status
 from tests.bag_messages import COMMAND, SPEED, speed_bag
 
@@ -66,7 +66,11 @@ def test_what_is_used_is_the_most_that_a_sample_used(last: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "method"), [(MonotoneClass(1, delays=(1,)), CertifiedSem()), (LinearClass(2), Rse())]
+    ("kind", "method"),
+    [
+        (Polynomial(1, (1,), Degrees(left=3), set="3.8"), Sem(certified=True)),
+        (Polynomial(2), Rse()),
+    ],
 )
 def test_the_rate_of_a_method_with_a_long_name_is_not_cut(kind: Any, method: Any) -> None:
     rng, trials = np.random.default_rng(1), []

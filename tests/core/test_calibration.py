@@ -11,7 +11,7 @@ from bags.designs.provenance import of_funnel
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials, windows
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import DataError
@@ -101,7 +101,14 @@ def test_the_calibration_trials_do_not_choose_the_observer(
         tuple(replace(t, y=t.y + 0.5 * noise.standard_normal(t.y.shape)) for t in split.calibration)
     )
     other = design_output_tube(
-        design.model, split.design, profile=PROFILE, horizon=7.0, inlet=0.02, calibration=loud
+        OutputTube(
+            design.model,
+            split.design,
+            profile=PROFILE,
+            horizon=7.0,
+            inlet=0.02,
+            calibration=loud,
+        )
     )
     np.testing.assert_array_equal(other.policy.L, design.policy.L)
     for louder, tube in zip(other.funnel.tubes, design.funnel.tubes, strict=True):
@@ -123,15 +130,15 @@ def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
     split = calibration_trials(train, least=72)
     apart = replace(fit.model, bags=split.designed_on, training="sha256:0")
     made = design_output_tube(
-        apart, split.design, profile=PROFILE, horizon=7.0, calibration=split.calibration
+        OutputTube(apart, split.design, profile=PROFILE, horizon=7.0, calibration=split.calibration)
     )
     assert "with probability at most 1/4" in worth(made)
-    seen = design_output_tube(replace(fit.model, bags=split.measured_on[:2], training="sha256:0"),
-                       train, profile=PROFILE, horizon=7.0)  # fmt: skip
+    known = replace(fit.model, bags=split.measured_on[:2], training="sha256:0")
+    seen = design_output_tube(OutputTube(known, train, profile=PROFILE, horizon=7.0))
     assert "as the model was fitted to 2 of them" in worth(seen)
     long = Dataset(synthetic_dataset(0.01, trials=1, samples=400).trajectories)
-    cut = design_output_tube(replace(fit.model, training="sha256:0"), long,
-                      profile=PROFILE, horizon=7.0)  # fmt: skip
+    own = replace(fit.model, training="sha256:0")
+    cut = design_output_tube(OutputTube(own, long, profile=PROFILE, horizon=7.0))
     said = worth(cut)
     assert "largest of 2 distinct windows" in said
     assert "windows of one recording are hardly exchangeable" in said

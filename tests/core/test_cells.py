@@ -12,24 +12,26 @@ from nlsid_core import documents, files, proofs
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.identification import (
-    CellClass,
-    CertifiedSem,
+    CellRow,
+    Degrees,
     Fit,
-    LinearClass,
+    Network,
+    Polynomial,
     Selection,
-    StateAffineClass,
+    Sem,
     identify,
     prove_stability,
     select,
 )
-from nlsid_core.identification.network.cells import Cascade, Limit, Trial
+from nlsid_core.identification.network.cells import Cascade, Trial
+from nlsid_core.identification.network.options import Limit
 from nlsid_core.identification.prediction import predict, simulate_trial
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from tests.core.kernel.stability_claims import network
 from tests.two_tanks import NOISE, tanks
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
-SMALL = CellClass()
+SMALL = Network(CellRow())
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def test_two_tanks_that_flow_over_are_found_to_the_noise_and_proved(fit: Fit[Cel
 
 @pytest.mark.slow
 def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
-    straight = identify(tanks(1), replace(SMALL, limit="none"))
+    straight = identify(tanks(1), Network(CellRow(limit="none")))
     assert len(straight.model.maps) == 3
     assert rms(straight, tanks(1)) > 3.0 * rms(fit, tanks(1))
 
@@ -61,11 +63,11 @@ def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
 @pytest.mark.slow
 def test_select_takes_the_cells_where_the_data_are_of_cells() -> None:
     classes: list[Any] = [
-        LinearClass(2),
-        StateAffineClass(2, leading_degree=1, right_degree=2),
+        Polynomial(2),
+        Polynomial(2, degrees=Degrees(inputs=2, leading=1)),
         SMALL,
     ]
-    chosen: Selection[Any] = select(tanks(1), tanks(2, h=(6.0, 3.0)), classes, method=None)
+    chosen: Selection = select(tanks(1), tanks(2, h=(6.0, 3.0)), classes, method=None)
     assert chosen.best is SMALL
     assert chosen.errors[2] < 0.3 * min(chosen.errors[:2])
 
@@ -189,7 +191,7 @@ def test_data_that_cannot_be_used_are_refused() -> None:
         (tanks(1, 60).trajectories[0], DataError, "more than three times"),
     ):
         with pytest.raises(error, match=said):
-            identify(Dataset((bad,)), CellClass(cells=1), method=CertifiedSem())
+            identify(Dataset((bad,)), Network(CellRow(1)), method=Sem(certified=True))
 
 
 def sliding(seed: int, samples: int = 1200) -> Dataset:
@@ -213,7 +215,7 @@ def test_a_slide_that_comes_to_rest_in_dry_friction_is_found_and_proved() -> Non
     errors = {}
     limits: tuple[Limit, ...] = ("friction", "none")
     for limit in limits:
-        made = identify(sliding(1), CellClass(1, intervals=2, limit=limit))
+        made = identify(sliding(1), Network(CellRow(1, intervals=2, limit=limit)))
         errors[limit] = rms(made, sliding(2))
         assert made.proof.rate < 0.97
     assert errors["friction"] < 1.3 * 0.002

@@ -7,16 +7,7 @@ import pytest
 
 from nlsid_core import proofs
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import (
-    CertifiedSem,
-    ImplicitClass,
-    LeastSquares,
-    LinearStateClass,
-    MonotoneClass,
-    Rie,
-    Sem,
-    identify,
-)
+from nlsid_core.identification import Degrees, LeastSquares, Polynomial, Rie, Sem, identify
 from nlsid_core.identification.polynomial.implicit_descent import ImplicitSet
 from nlsid_core.identification.polynomial.implicit_rie import least_squares_coefficients
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
@@ -52,7 +43,7 @@ def coupled(samples: int, seed: int) -> Dataset:
 
 
 def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
-    fit = identify(noisy(1500, 1), CLASS, method=CertifiedSem(), comparators=(Sem(), Rie()))
+    fit = identify(noisy(1500, 1), CLASS, method=Sem(certified=True), comparators=(Sem(), Rie()))
     free, proved = (fit.errors["train"][name] for name in ("sem", "sem_certified"))
     assert proved == pytest.approx(free, rel=1e-4)
     assert proved < 0.95 * fit.errors["train"]["rie"]
@@ -62,8 +53,8 @@ def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
 @pytest.mark.slow
 def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> None:
     data = resonant(1500, 0)
-    model_class = MonotoneClass(2, (0,))
-    fit = identify(data, model_class, method=CertifiedSem(), comparators=(Sem(), Rie()))
+    model_class = Polynomial(2, (0,), Degrees(left=3), set="3.8")
+    fit = identify(data, model_class, method=Sem(certified=True), comparators=(Sem(), Rie()))
     errors = fit.errors["train"]
     assert errors["sem"] < errors["sem_certified"] < 0.98 * errors["rie"]
     assert fit["sem"].proof is None, "the truth is outside the set"
@@ -76,9 +67,9 @@ def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> No
 
 @pytest.mark.slow
 def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
-    fast = identify(noisy(800, 1), CLASS, method=CertifiedSem(), comparators=(), max_rate=0.4)
+    fast = identify(noisy(800, 1), CLASS, method=Sem(certified=True), comparators=(), max_rate=0.4)
     assert fast.proof.rate <= 0.4
-    free = identify(noisy(800, 1), CLASS, method=CertifiedSem(), comparators=())
+    free = identify(noisy(800, 1), CLASS, method=Sem(certified=True), comparators=())
     assert free.proof.rate > 0.4
     assert free.errors["train"]["sem_certified"] < fast.errors["train"]["sem_certified"]
 
@@ -86,26 +77,33 @@ def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
 @pytest.mark.parametrize(
     "model_class",
     [
-        ImplicitClass(1, (0,), "2.13"),
-        ImplicitClass(1, (0,), "2.19", 1),
+        Polynomial(1, (0,), Degrees(left=3), set="2.13"),
+        Polynomial(1, (0,), set="2.19"),
         *(
             pytest.param(longer, marks=pytest.mark.slow)
             for longer in (
-                ImplicitClass(2, (0,)),
-                ImplicitClass(2, (0,), "2.10"),
-                ImplicitClass(1, (0,), "2.12"),
-                ImplicitClass(1, (0,), "2.13", 5, 3),
-                ImplicitClass(1, (0,), "2.11", 3, 2, box=((-4.0, 4.0), (-2.1, 2.1))),
+                Polynomial(2, (0,), Degrees(left=3), set="2.11"),
+                Polynomial(2, (0,), Degrees(left=3), set="2.10"),
+                Polynomial(1, (0,), Degrees(left=3), set="2.12"),
+                Polynomial(1, (0,), Degrees(left=5, past=3), set="2.13"),
+                Polynomial(
+                    1,
+                    (0,),
+                    Degrees(left=3, past=2),
+                    output_range=((-4.0, 4.0),),
+                    input_range=((-2.1, 2.1),),
+                    set="2.11",
+                ),
             )
         ),
     ],
     ids=str,
 )
 def test_every_set_of_implicit_models_has_a_proved_minimum_below_its_bounds(
-    model_class: ImplicitClass,
+    model_class: Polynomial,
 ) -> None:
     fit = identify(
-        noisy(500, 1), model_class, method=CertifiedSem(), comparators=(LeastSquares(), Rie())
+        noisy(500, 1), model_class, method=Sem(certified=True), comparators=(LeastSquares(), Rie())
     )
     errors = fit.errors["train"]
     assert errors["sem_certified"] < min(errors["rie"], errors["least_squares"]) * (1 + 1e-9)
@@ -118,7 +116,11 @@ def test_every_set_of_implicit_models_has_a_proved_minimum_below_its_bounds(
 def test_linear_models_of_several_measured_states_are_found_and_proved() -> None:
     data, test = coupled(400, 0), coupled(400, 1)
     fit = identify(
-        data, LinearStateClass(), method=CertifiedSem(), comparators=(LeastSquares(),), test=test
+        data,
+        Polynomial(1, (1,), set="2.19"),
+        method=Sem(certified=True),
+        comparators=(LeastSquares(),),
+        test=test,
     )
     for name in ("train", "test"):
         errors = fit.errors[name]
@@ -131,7 +133,15 @@ def test_linear_models_of_several_measured_states_are_found_and_proved() -> None
 def test_the_sensitivities_are_those_of_the_simulation() -> None:
     data = noisy(60, 1)
     rows = build_implicit_rows(
-        data, ImplicitClass(2, (0, 1), right_degree=2, box=((-9, 9), (-3, 3)))
+        data,
+        Polynomial(
+            2,
+            (0, 1),
+            Degrees(left=3, past=2),
+            output_range=((-9, 9),),
+            input_range=((-3, 3),),
+            set="2.11",
+        ),
     )
     implicit = ImplicitSet(rows, 1.0)
     at = np.concatenate(least_squares_coefficients(rows)).ravel()
@@ -159,9 +169,9 @@ def test_a_linear_model_begins_as_itself_in_the_other_classes() -> None:
     assert start is not None
     trial = data.trajectories[0]
     expected = start.simulate(trial.u, trial.y[:2])[:, 0]
-    straight = as_monotone(start, MonotoneClass(2, (0, 1), degree=1))
+    straight = as_monotone(start, Polynomial(2, (0, 1), set="3.8"))
     np.testing.assert_allclose(straight.simulate(trial.u, trial.y[:2, 0]), expected, atol=1e-9)
-    rows = build_implicit_rows(data, ImplicitClass(2, (0, 1)))
+    rows = build_implicit_rows(data, Polynomial(2, (0, 1), Degrees(left=3), set="2.11"))
     found = ImplicitSet(rows, 1.0).outputs(np.concatenate(as_implicit(start, rows)).ravel())
     assert found is not None
     error = (expected - trial.y[:, 0])[2:] / rows.y_scale[1][0]
@@ -173,5 +183,10 @@ def test_of_a_random_walk_there_is_a_stable_model_too() -> None:
     u = np.random.default_rng(1).uniform(-1.0, 1.0, 300)
     y = np.cumsum(np.random.default_rng(0).standard_normal(300))
     data = Dataset((Trajectory(t=np.arange(300.0), y=y, u=u),))
-    fit = identify(data, MonotoneClass(1, (0,)), method=CertifiedSem(), comparators=())
+    fit = identify(
+        data,
+        Polynomial(1, (0,), Degrees(left=3), set="3.8"),
+        method=Sem(certified=True),
+        comparators=(),
+    )
     assert fit.proof.rate <= fit.max_rate

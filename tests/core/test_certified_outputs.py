@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import Degrees, Polynomial, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.polynomial import certified
@@ -16,7 +16,7 @@ from nlsid_core.identification.polynomial.certified import (
     descend_certified,
 )
 from nlsid_core.identification.polynomial.matrix_set import MatrixSet, slowest_rate
-from nlsid_core.identification.polynomial.rows import StateAffineClass, StateAffineRows
+from nlsid_core.identification.polynomial.rows import StateAffineRows
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check
 from tests.state_affine_rows import problem
@@ -29,8 +29,8 @@ MARKED = [CASES[0], *(pytest.param(case, marks=pytest.mark.slow) for case in CAS
 def rows(outputs: int, leading: int, lagged: int, most: float) -> StateAffineRows:
     return problem(
         outputs=outputs, trials=1, samples=200, noise=0.2,
-        model_class=StateAffineClass(
-            2, (0, 1), leading_degree=leading, lagged_degree=lagged, input_range=((-most, most),)
+        model_class=Polynomial(
+            2, (0, 1), Degrees(leading=leading, lagged=lagged), ((-most, most),)
         ),
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.funnel_scaling import chain
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, design_funnel, integrate_nominal
 from nlsid_core.design.continuous import cliques
 from nlsid_core.design.continuous.cliques import CliqueSteps, cliques_of, share_of_work
 from nlsid_core.design.continuous.diagnosis import NoFunnel
@@ -117,7 +117,9 @@ def test_a_sweep_that_fails_says_where() -> None:
 
 def designed() -> Any:
     field, nominal = pendulums()
-    return design_funnel(field, nominal, goal=8.0 * np.eye(8), Q=np.eye(8), R=np.eye(4))
+    return design_funnel(
+        ContinuousTracking(field, nominal, goal=8.0 * np.eye(8), Q=np.eye(8), R=np.eye(4))
+    )
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
@@ -22,7 +22,9 @@ WIDE = Limits(lowest=-10.0, highest=10.0, stop_rate=1.0)
 def moving(design: OutputTubeDesign, train: Dataset) -> OutputTubeDesign:
     """A tube that starts at a speed, so that the policy may also take input away."""
     profile = [(0.0, 0.3), (2.0, 0.3), (5.0, 0.5), (7.0, 0.5)]
-    return design_output_tube(design.model, train, profile=profile, horizon=7.0, inlet=0.02)
+    return design_output_tube(
+        OutputTube(design.model, train, profile=profile, horizon=7.0, inlet=0.02)
+    )
 
 
 def closed_loop(

@@ -8,11 +8,12 @@ import pytest
 from nlsid_core import proofs
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design
-from nlsid_core.errors import DataError, OptionError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import (
-    FeedbackClass,
+    Feedback,
     Fit,
-    LinearClass,
+    Network,
+    Polynomial,
     Sem,
     identify,
     prove_stability,
@@ -31,7 +32,12 @@ from nlsid_core.models import CellNetwork
 from tests.duffing import NOISE, trials
 
 AMPLITUDES = [0.1, 0.2, 0.25, 0.15]
-SMALL = FeedbackClass(stages=2, imitated=20)
+SMALL = Network(Feedback(stages=2, imitated=20))
+
+
+def with_structure(**options: int) -> Network[Feedback]:
+    """The same with other options."""
+    return replace(SMALL, structure=replace(SMALL.structure, **options))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +56,7 @@ def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None
     assert proved.proof is not None
     assert proved.error_percent(fresh) < 5.0
     assert proved.error_percent(louder) < 12.0
-    straight = identify(trials(AMPLITUDES), LinearClass(3), method=Sem(), comparators=())
+    straight = identify(trials(AMPLITUDES), Polynomial(3), method=Sem(), comparators=())
     assert straight.chosen.error_percent(fresh) > 20.0
     proofs.decide(fit.proof.document(fit.model, "m.json"), {"m.json": fit.model.document()})
     assert CellNetwork.from_document(fit.model.document()).document() == fit.model.document()
@@ -74,7 +80,7 @@ def test_a_slower_proof_than_the_kernel_can_decide_is_refused(fit: Fit[CellNetwo
 
 def test_a_well_damped_loop_is_proved_as_it_is() -> None:
     """x'' + 2x' + x + x³ = u contracts over all of its range: nothing is unrolled."""
-    found = identify(trials([0.2, 0.4, 0.6], damping=2.0), replace(SMALL, lags=2), comparators=())
+    found = identify(trials([0.2, 0.4, 0.6], damping=2.0), with_structure(lags=2), comparators=())
     assert len(found.model.maps) == 1
     assert len(found.model.start) == 2
     assert found.chosen.error_percent(trials([0.5], damping=2.0, seed=1)) < 200 * NOISE
@@ -151,7 +157,7 @@ def test_the_network_simulates_what_was_fitted() -> None:
 @pytest.mark.slow
 def test_several_layers_are_proved_by_their_weights(fit: Fit[CellNetwork]) -> None:
     """P couples no stage with another, so that no program has to be solved."""
-    n, proof = SMALL.lags, prove_stability(fit.model)
+    n, proof = SMALL.structure.lags, prove_stability(fit.model)
     assert proof is not None
     for i in range(len(fit.model.start) // n):
         rows = proof.P[i * n : (i + 1) * n]
@@ -163,22 +169,10 @@ def test_several_layers_are_proved_by_their_weights(fit: Fit[CellNetwork]) -> No
 def test_a_tube_of_many_maps_is_proved() -> None:
     """Five maps, 32 corners: one matrix stands for them in the search, the kernel decides all."""
     train = trials(AMPLITUDES)
-    found = identify(train, replace(SMALL, stages=5), comparators=())
+    found = identify(train, with_structure(stages=5), comparators=())
     assert len(found.model.maps) >= 3
     tube = design(OutputTube(found.model, train, trials(AMPLITUDES, seed=3)))
     assert "for ever" in str(tube.verdict)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("lags", 0), ("lags", 9), ("stages", 0), ("stages", 9), ("intervals", 0),
-        ("imitated", -1), ("start_samples", 2), ("seed", -1),
-    ],
-)  # fmt: skip
-def test_options_that_make_no_sense_are_refused(key: str, value: int) -> None:
-    with pytest.raises(OptionError, match=key):
-        FeedbackClass(**{key: value})
 
 
 def test_data_that_cannot_be_used_are_refused() -> None:

@@ -30,7 +30,7 @@ def at_rest(knots: int) -> Nominal:
 
 def prepared(nominal: Nominal) -> Setting:
     """What the search starts from."""
-    return prepare(servo, nominal, goal=GOAL, policy=None, Q=None, R=None, gain="constant")
+    return prepare(ContinuousTracking(servo, nominal, goal=GOAL))
 
 
 def test_a_fast_servo_gets_knots_near_the_goal_and_is_proved_there() -> None:
@@ -57,7 +57,7 @@ def test_what_linear_shapes_lose_is_found_where_they_turn_fast() -> None:
 def refused(t: float, *, left: float) -> NoFunnel:
     """At t, with V falling by `left`."""
     taken = dict.fromkeys(TERMS, 0.0) | {"remainder": 1.0}
-    return NoFunnel(Diagnosis(t, 1.0 + left, taken, (0.1, 0.1, 0.1)))
+    return NoFunnel(t, lambda: Diagnosis(t, 1.0 + left, taken, (0.1, 0.1, 0.1)), left)
 
 
 def test_knots_are_added_near_a_refusal_between_them_and_everywhere_for_a_remainder() -> None:
@@ -95,5 +95,5 @@ def test_a_shape_that_is_wider_before_the_end_than_equations_reach_is_no_refusal
 
     still = integrate_nominal(valve, lambda _: [0.0], t=np.linspace(0, 0.5, 41), start=np.zeros(4))
     goal = [0.05, 0.3, 0.3, 0.1]
-    setting = prepare(valve, still, goal=goal, policy=None, Q=None, R=None, gain="constant")
+    setting = prepare(ContinuousTracking(valve, still, goal=goal))
     assert setting.margin(setting.rho_final) > 0

@@ -16,7 +16,7 @@ from bags.chain.problems import FunnelProblem
 from bags.commands import cli
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.design import Goal, design_funnel, integrate_nominal, tvlqr
+from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
 from tests.marks import slow_among
@@ -206,7 +206,7 @@ def test_a_nominal_that_disobeys_is_told_by_how_much_where_and_in_which_state() 
     bent[3, 1, 0] += 0.1  # the slope at 0.75 s is then 3·0.1/0.25 more
     bad = Nominal(PiecewisePolynomial(nominal.t, bent), nominal.u)
     with pytest.raises(DataError, match=r"dx0/dt is off by 1\.2 at t = 0\.75 s"):
-        design_funnel(field, bad, goal=20 * np.eye(2))
+        design_funnel(ContinuousTracking(field, bad, goal=20 * np.eye(2)))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_dynamics_that_are_not_polynomial_name_the_operation_and_offer_taylor(
 def test_a_nominal_of_other_sizes_is_told() -> None:
     field = VectorField.from_function(lambda x, u: np.array([-x[0] + u[0]]), 1, 1)
     with pytest.raises(DataError, match="the nominal has 2 states and 1 inputs, the dynamics 1"):
-        design_funnel(field, hanging()[1], goal=np.eye(1))
+        design_funnel(ContinuousTracking(field, hanging()[1], goal=np.eye(1)))
 
 
 def test_a_policy_of_other_dynamics_or_around_another_nominal_is_told() -> None:
@@ -237,11 +237,11 @@ def test_a_policy_of_other_dynamics_or_around_another_nominal_is_told() -> None:
     policy = tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).policy
     second = VectorField.from_function(lambda x, u: np.array([x[1], -x[0] - x[1] / 5 + u[0]]), 2, 1)
     with pytest.raises(DataError, match="made for other dynamics"):
-        design_funnel(second, nominal, goal=20 * np.eye(2), policy=policy)
+        design_funnel(ContinuousTracking(second, nominal, goal=20 * np.eye(2), policy=policy))
     t = np.linspace(0, 2, KNOTS)
     away = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.array([0.01, 0]))
     with pytest.raises(DataError, match="around another nominal"):
-        design_funnel(field, away, goal=20 * np.eye(2), policy=policy)
+        design_funnel(ContinuousTracking(field, away, goal=20 * np.eye(2), policy=policy))
 
 
 def test_an_uncontrollable_linearisation_may_still_have_a_goal_and_a_riccati_solution() -> None:
@@ -249,7 +249,7 @@ def test_an_uncontrollable_linearisation_may_still_have_a_goal_and_a_riccati_sol
     t = np.linspace(0, 1, 5)
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=[0.0, 0.0])
     with pytest.raises(Infeasible, match="uncontrollable"):
-        design_funnel(field, nominal)
+        design_funnel(ContinuousTracking(field, nominal))
     assert tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).S.shape == (5, 2, 2)
 
 
@@ -257,4 +257,4 @@ def test_dynamics_valid_only_where_the_nominal_is_not_are_told() -> None:
     field, nominal = hanging()
     short = VectorField(field.pieces, 2, 1, valid=np.array([[0, 0.1, 0.3]]))
     with pytest.raises(DataError, match=r"entry 0 of \(x, u\) is 0 at 0 s, not well within"):
-        design_funnel(short, nominal, goal=20 * np.eye(2))
+        design_funnel(ContinuousTracking(short, nominal, goal=20 * np.eye(2)))

@@ -11,7 +11,13 @@ from typer.testing import CliRunner
 
 from bags.commands.cli import app
 from nlsid_core import files as documents
-from nlsid_core.design import Goal, compose_funnels, design_funnel, integrate_nominal
+from nlsid_core.design import (
+    ContinuousTracking,
+    Goal,
+    compose_funnels,
+    design_funnel,
+    integrate_nominal,
+)
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.proofs import check
@@ -37,7 +43,9 @@ def proofs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     goal: Any = 20 * np.eye(2)
     paths = []
     for start, damping in ((2.0, 0.4), (1.0, 0.2), (0.0, 0.2)):
-        design = design_funnel(*motion(start, start + 1, damping=damping), goal=goal)
+        design = design_funnel(
+            ContinuousTracking(*motion(start, start + 1, damping=damping), goal=goal)
+        )
         paths.append(design.save(tmp_path_factory.mktemp("stage"))[-1])
         goal = Goal.start_of(design.funnel)
     return paths[::-1]
@@ -102,7 +110,9 @@ def test_a_stage_that_ends_wider_than_the_next_starts_is_told_by_how_much(
 ) -> None:
     after = documents.load_document(proofs[1].with_name("funnel.json"))
     goal = np.array(after["P"][0]) / after["rho"][0] / 1.3
-    wide = design_funnel(*motion(0.0, 1.0), goal=goal).save(tmp_path / "wide")[-1]
+    wide = design_funnel(ContinuousTracking(*motion(0.0, 1.0), goal=goal)).save(tmp_path / "wide")[
+        -1
+    ]
     with pytest.raises(Infeasible, match=r"reaches 1\.28"):  # 1.3 less the room the LQR leaves
         compose_funnels([wide, proofs[1]], tmp_path / "out")
 

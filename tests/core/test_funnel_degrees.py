@@ -39,7 +39,9 @@ def moving(field: VectorField, knots: int = 9) -> Nominal:
 def test_dynamics_of_degree_five_are_proved_and_no_start_leaves(n: int, tmp_path: Path) -> None:
     field = quintic(n)
     assert field.degree == 5
-    design = design_funnel(field, moving(field), goal=8 * np.eye(n), Q=np.eye(n), R=np.eye(field.m))
+    design = design_funnel(
+        ContinuousTracking(field, moving(field), goal=8 * np.eye(n), Q=np.eye(n), R=np.eye(field.m))
+    )
     assert check(design.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(2)
     parts = (field, design.policy, design.funnel)
@@ -55,14 +57,21 @@ def test_degree_four_takes_the_same_squares_as_degree_five() -> None:
     program = sphere_program(field)
     assert isinstance(program, SphereProgram)
     assert program.half == 3
-    assert np.min(design_funnel(field, moving(field), goal=8 * np.eye(2)).found.proved.margins) > 0
+    assert (
+        np.min(
+            design_funnel(
+                ContinuousTracking(field, moving(field), goal=8 * np.eye(2))
+            ).found.proved.margins
+        )
+        > 0
+    )
 
 
 def test_beyond_degree_five_the_taylor_way_is_named() -> None:
     field = VectorField.from_function(lambda x: np.array([-(x[0] ** 7)]), 1, 0)
     nominal = integrate_nominal(field, lambda _: [], t=[0.0, 0.5, 1.0], start=[0.0])
     with pytest.raises(DataError, match=r"degree 7; L-steps are solved up to 5: take a Taylor"):
-        design_funnel(field, nominal, goal=np.eye(1), Q=np.zeros((1, 1)))
+        design_funnel(ContinuousTracking(field, nominal, goal=np.eye(1), Q=np.zeros((1, 1))))
 
 
 @pytest.mark.parametrize("alternate", [False, True])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from examples.satellite_funnel import goal_matrix, problem
-from nlsid_core.design import design_funnel
+from nlsid_core.design import ContinuousTracking, design_funnel
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
@@ -23,7 +23,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """The satellite's four documents, with half the knots of the example."""
     field, nominal, weights = problem(25)
     folder = tmp_path_factory.mktemp("satellite")
-    *_, proof = design_funnel(field, nominal, goal=goal_matrix(), **weights).save(folder)
+    *_, proof = design_funnel(
+        ContinuousTracking(field, nominal, goal=goal_matrix(), **weights)
+    ).save(folder)
     verdict = check(proof)
     assert verdict.margin > 0
     return {path.name: json.loads(path.read_text()) for path in folder.iterdir()}
@@ -177,7 +179,7 @@ def test_a_file_with_other_white_space_is_another_file(files: Files, tmp_path: P
 @pytest.mark.slow
 def test_no_proof_is_found_for_a_funnel_that_is_one_percent_too_wide() -> None:
     field, nominal, weights = problem(25)
-    design = design_funnel(field, nominal, goal=goal_matrix(), **weights)
+    design = design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
     knots = len(design.funnel.t)
     wide = replace(design.funnel, rho=design.funnel.rho * np.linspace(1.01, 1, knots))
     assert prove_pieces(LSteps(field), design.policy, wide).unproved

@@ -62,7 +62,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     assert str(found).startswith("NOT PROVED")
     assert not hasattr(found, "certificate")
     assert not hasattr(found, "save")
-    setting = prepare(field, nominal, policy=None, R=None, gain="constant", **options)
+    setting = prepare(ContinuousTracking(field, nominal, **options))
     parts = (field, setting.policy, found.funnel)
     run = simulate_boundary(*parts, starts=100, rng=np.random.default_rng(1), substeps=50)
     assert run.violations == 100
@@ -84,7 +84,7 @@ def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> 
     with pytest.raises(Infeasible, match=r"no funnel at t = 1\.5 s"):
         sample_funnel(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1)), samples=3)
     sampled = sample_funnel(*hanging(), goal=GOAL)
-    proved = design_funnel(*hanging(), goal=GOAL)
+    proved = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
     assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
 
 
@@ -97,7 +97,7 @@ def test_a_sample_at_one_end_only_is_refused() -> None:
 
 
 def test_the_alternation_is_proved_and_ends_within_one_percent_of_the_sweep() -> None:
-    sweep = design_funnel(*hanging(), goal=GOAL)
+    sweep = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
     found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL))
     assert np.min(found.found.proved.margins) > 0
     ratio = found.funnel.volume_integral() / sweep.funnel.volume_integral()
@@ -105,7 +105,7 @@ def test_the_alternation_is_proved_and_ends_within_one_percent_of_the_sweep() ->
 
 
 def test_the_alternation_may_start_from_a_given_rho() -> None:
-    sweep = design_funnel(*hanging(), goal=GOAL)
+    sweep = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
     first = 0.9 * sweep.funnel.rho * np.linspace(0.7, 1, 9)
     found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL), rho=first)
     assert found.funnel.rho[-1] == 0.9
@@ -129,7 +129,7 @@ def test_a_first_rho_that_cannot_start_is_refused(
         design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL, **WEIGHTS), rho=rho)
 
 
-@pytest.mark.parametrize("option", ["shape", "objective", "gain"])
+@pytest.mark.parametrize("option", ["shape", "gain"])
 def test_an_unknown_option_is_named_with_the_known_ones(option: str) -> None:
     chosen: Any = {option: "magic"}
     with pytest.raises(OptionError, match=f"{option} is 'magic'; it should be one of "):
@@ -138,7 +138,7 @@ def test_an_unknown_option_is_named_with_the_known_ones(option: str) -> None:
 
 @pytest.mark.slow
 def test_every_iterate_of_the_alternation_is_larger_than_the_last() -> None:
-    setting = prepare(*hanging(), goal=GOAL, **DEFAULTS)
+    setting = prepare(ContinuousTracking(*hanging(), goal=GOAL, **DEFAULTS))
     start = exponential_start(setting.steps, setting.policy, setting.P)
     found = alternate_rho(setting.steps, setting.policy, start, stop=1e-3)
     assert (np.diff(found.volumes) > 0).all()
@@ -151,38 +151,21 @@ def test_every_iterate_of_the_alternation_is_larger_than_the_last() -> None:
 
 @pytest.fixture(scope="module")
 def setting() -> Setting:
-    return prepare(*hanging(), goal=GOAL, **DEFAULTS)
+    return prepare(ContinuousTracking(*hanging(), goal=GOAL, **DEFAULTS))
 
 
 @pytest.mark.slow
-def test_both_objectives_grow_the_funnel_and_are_proved() -> None:
-    rho = design_funnel(*hanging(), goal=GOAL)
-    found = {
-        name: design_funnel(*hanging(), goal=GOAL, shape="P", objective=name)
-        for name in ("volume", "reference")
-    }
-    for design in found.values():
-        assert design.funnel.volume_integral() > 1.05 * rho.funnel.volume_integral()
-        assert np.min(design.found.proved.margins) > 0
-        volumes = [volume for _, volume in design.found.history[1:]]
-        assert (np.diff(volumes) > 0).all()
-    # Each is best at what it asks for: the volume, or the least blown-up copy of the first shape.
-    assert volume_of(found["volume"]) >= volume_of(found["reference"])
-    first = rho.funnel
-    assert least_copies(found["reference"], first) >= 0.999 * least_copies(found["volume"], first)
+def test_v_steps_grow_the_funnel_and_it_is_proved() -> None:
+    rho = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
+    found = design_funnel(ContinuousTracking(*hanging(), goal=GOAL, shape="P"))
+    assert found.funnel.volume_integral() > 1.05 * rho.funnel.volume_integral()
+    assert np.min(found.found.proved.margins) > 0
+    volumes = [volume for _, volume in found.found.history[1:]]
+    assert (np.diff(volumes) > 0).all()
 
 
 def volume_of(design: FunnelDesign) -> float:
     return design.funnel.volume_integral()
-
-
-def least_copies(design: FunnelDesign, first: ContinuousFunnel) -> float:
-    """Σ over knots of the largest r with r·(first ellipsoid) inside the funnel's, by radius²."""
-    total = 0.0
-    for t in first.t[:-1].tolist():
-        L = np.linalg.inv(np.linalg.cholesky(first.shape(t)))
-        total += 1 / np.linalg.eigvalsh(L @ design.funnel.shape(t) @ L.T)[-1]
-    return total
 
 
 def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_further(
@@ -216,7 +199,9 @@ def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     )  # fmt: skip
     t = np.linspace(0, 2, 9)
     nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
-    rho, design = (design_funnel(field, nominal, goal=GOAL, shape=s) for s in ("rho", "P"))
+    rho, design = (
+        design_funnel(ContinuousTracking(field, nominal, goal=GOAL, shape=s)) for s in ("rho", "P")
+    )
     assert design.model.is_pushed
     assert volume_of(design) > 1.25 * volume_of(rho)
     stays_inside(design, pushed=0.01)
@@ -225,7 +210,8 @@ def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
 @pytest.mark.slow
 def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
     rho, design = (
-        design_funnel(*hanging(5), goal=GOAL, limits=[[-0.4, 0.4]], shape=s) for s in ("rho", "P")
+        design_funnel(ContinuousTracking(*hanging(5), goal=GOAL, limits=[[-0.4, 0.4]], shape=s))
+        for s in ("rho", "P")
     )
     assert volume_of(design) > 1.1 * volume_of(rho)
     assert stays_inside(design) > 100
@@ -238,7 +224,9 @@ def test_p_stays_where_a_taylor_polynomial_is_valid() -> None:
 
     t = np.linspace(0, 2, 9)
     nominal = integrate_nominal(boat, lambda _: np.zeros(1), t=t, start=np.zeros(2))
-    rho, design = (design_funnel(boat, nominal, goal=GOAL, shape=s) for s in ("rho", "P"))
+    rho, design = (
+        design_funnel(ContinuousTracking(boat, nominal, goal=GOAL, shape=s)) for s in ("rho", "P")
+    )
     assert volume_of(design) > 1.2 * volume_of(rho)
     for k, t0 in enumerate(design.funnel.t[:-1].tolist()):
         box = {entry: (low, high) for entry, low, high in design.model.validity(k)}
@@ -275,6 +263,6 @@ def stays_inside(design: FunnelDesign, pushed: float = 0.0) -> int:
 
 
 def test_a_design_knows_how_it_was_found() -> None:
-    design = design_funnel(*hanging(), goal=GOAL)
+    design = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
     assert set(design.found.seconds) == {"policy", "rho", "proof"}
     assert design.found.history[0] == ("rho", design.funnel.volume_integral())

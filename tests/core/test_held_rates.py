@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.design import FunnelDesign, design
-from nlsid_core.design.continuous import design as search
+from nlsid_core.design.continuous import search
 from nlsid_core.design.continuous.held import Changes
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.rates import curving_states

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design, plan_motion
-from nlsid_core.design.continuous import design as search
+from nlsid_core.design.continuous import search
 from nlsid_core.design.continuous.held import LONGEST, SHORTEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.errors import Infeasible

@@ -14,7 +14,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.dynamics import VectorField, identified_field
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import CertifiedSem, Fit, ImplicitClass, LinearStateClass, identify
+from nlsid_core.identification import Degrees, Fit, Polynomial, Sem, identify
 from nlsid_core.models import ImplicitModel, TrapezoidalModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import Signal
@@ -55,9 +55,17 @@ def field_rates(field: VectorField) -> Rates:
 
 @pytest.fixture(scope="module")
 def slowed() -> Fit[ImplicitModel]:
-    cubic = ImplicitClass(1, (1,), "2.13", 3, 3, box=((-2, 2), (-2, 2)), continuous=True)
+    cubic = Polynomial(
+        1,
+        (1,),
+        Degrees(left=3, past=3),
+        output_range=((-2, 2),),
+        input_range=((-2, 2),),
+        set="2.13",
+        continuous=True,
+    )
     return identify(
-        Dataset((recorded(drag, 1, 0),)), cubic, method=CertifiedSem(10), comparators=()
+        Dataset((recorded(drag, 1, 0),)), cubic, method=Sem(10, certified=True), comparators=()
     )
 
 
@@ -103,7 +111,9 @@ def test_a_step_of_the_model_is_the_trapezoidal_rule_of_the_field(
 @pytest.mark.slow
 def test_every_linear_model_of_measured_states_has_a_field() -> None:
     data = Dataset((recorded(network, 2, 1),))
-    fit = identify(data, LinearStateClass(), method=CertifiedSem(5), comparators=())
+    fit = identify(
+        data, Polynomial(1, (1,), set="2.19"), method=Sem(5, certified=True), comparators=()
+    )
     A, B = identified_field(fit.model).jacobians(0.0, np.zeros(2), np.zeros(1))
     np.testing.assert_allclose(A, [[-0.5, 0.3], [0.6, -1.2]], atol=0.06)
     np.testing.assert_allclose(B, [[1.0], [0.0]], atol=0.06)
@@ -154,8 +164,3 @@ def test_models_that_step_no_such_equation_are_refused(slowed: Fit[ImplicitModel
         identified_field(slowed.model, box=[(-1, 1)])
     with pytest.raises(ShapeError, match="half-widths"):
         identified_field(slowed.model, disturbance=[-1.0])
-    for options in ({"lags": 2}, {"delays": (0, 1)}, {"right_degree": 1}):
-        with pytest.raises(DataError, match="continuous models have"):
-            ImplicitClass(**{  # type: ignore[arg-type]
-                "delays": (1,), "right_degree": 3, "continuous": True, **options
-            })  # fmt: skip

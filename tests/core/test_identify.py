@@ -16,15 +16,12 @@ from bags.samples import f1tenth
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification import (
-    CertifiedRse,
-    FirstRse,
     LeastSquares,
-    LinearClass,
     Method,
+    Polynomial,
     Rie,
     Rse,
     Sem,
-    StateAffineClass,
     describe,
     identify,
     select,
@@ -35,7 +32,7 @@ from nlsid_core.proofs import check
 from tests.conftest import TRUE_A, synthetic_dataset
 
 STATE_AFFINE = {
-    "lags": 2, "model": "state_affine", "method": "rse_certified", "iterations": 5,
+    "lags": 2, "model": "state_affine", "method": "rse", "certified": True, "iterations": 5,
     "leading_degree": 1, "right_degree": 1, "input_range": [0.0, 0.5],
 }  # fmt: skip
 BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "03", "05", "13", "23", "35"}]
@@ -52,9 +49,9 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("method", [FirstRse(), Rse(), Sem(), LeastSquares()])
+@pytest.mark.parametrize("method", [Rse(), Sem(), LeastSquares(), Rie()])
 def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Method) -> None:
-    fit = identify(train, LinearClass(2), method=method)
+    fit = identify(train, Polynomial(2), method=method)
     assert isinstance(fit.model, DifferenceEquation)
     assert fit.chosen.method is method
     assert fit[method.name] is fit.chosen
@@ -63,17 +60,17 @@ def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Met
 
 def test_a_fit_says_what_was_found(train: Dataset) -> None:
     test = synthetic_dataset(0.01, trials=2)
-    fit = identify(train, LinearClass(2), validation=test, test=test)
+    fit = identify(train, Polynomial(2), validation=test, test=test)
     text = str(fit)
     assert "train  validation        test" in text
-    assert f"* {Rse.title}" in text
+    assert f"* {Rse().title}" in text
     assert fit.errors["test"]["rse"] == fit.chosen.error_percent(test)
 
 
 def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
-    fit = identify(train, StateAffineClass(2), method=CertifiedRse())
+    fit = identify(train, Polynomial(2, (0, 1, 2)), method=Rse(certified=True))
     assert isinstance(fit.model, StateAffineModel)
-    linear = identify(train, LinearClass(2))
+    linear = identify(train, Polynomial(2))
     assert fit["rse"].error_percent(train) == pytest.approx(
         linear["rse"].error_percent(train), rel=1e-4
     )
@@ -83,10 +80,10 @@ def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
 
 
 def test_an_unknown_method_and_one_of_another_class_are_refused(train: Dataset) -> None:
-    with pytest.raises(DataError, match="'magic' is no method; there are: LeastSquares, Rie"):
-        identify(train, LinearClass(2), method="magic")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match=r"Rie\(\) is not for this model class \(LinearClass\)"):
-        identify(train, LinearClass(2), method=Rie())
+    with pytest.raises(DataError, match="'magic' is no method; there are: least_squares, rie"):
+        identify(train, Polynomial(2), method="magic")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=r"is not for this model class; it has: rie, least_squares"):
+        identify(train, Polynomial(2, set="3.8"), method=Rse())
 
 
 def unstable_recordings() -> Dataset:
@@ -106,11 +103,11 @@ def unstable_recordings() -> Dataset:
 def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not_white() -> None:
     data = unstable_recordings()
     with pytest.raises(Infeasible, match="no proof of stability"):
-        identify(data, LinearClass(1), method=LeastSquares())
-    unproved = identify(data, LinearClass(1), method=LeastSquares(), allow_unproved=True)
+        identify(data, Polynomial(1), method=LeastSquares())
+    unproved = identify(data, Polynomial(1), method=LeastSquares(), allow_unproved=True)
     with pytest.raises(Infeasible, match="has no proof"):
         _ = unproved.proof
-    stable = identify(data, StateAffineClass(1), method=CertifiedRse())
+    stable = identify(data, Polynomial(1), method=Rse(certified=True))
     assert stable.proof.rate < 1.0
     scores = validate(stable.model, data)
     assert not scores.white
@@ -122,28 +119,28 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
 
 def test_selection_takes_the_class_with_the_least_validation_error(train: Dataset) -> None:
     validation = synthetic_dataset(0.01, trials=3)
-    classes = [LinearClass(1), LinearClass(2), LinearClass(60)]
+    classes = [Polynomial(1), Polynomial(2), Polynomial(60)]
     seen: list[str] = []
     chosen = select(train, validation, classes, progress=lambda what, _: seen.append(what))
-    assert chosen.best == LinearClass(2)
+    assert chosen.best == Polynomial(2)
     assert chosen.errors[0] > chosen.errors[1]
     assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
     assert seen == [
         *map(describe, classes), "fitting to training and validation trials", "done"
     ]  # fmt: skip
-    assert "linear, lags 2" in str(chosen)
+    assert "polynomial, lags 2" in str(chosen)
     with pytest.raises(Infeasible, match="no class has a proved model"):
-        select(train, validation, [LinearClass(60)])
+        select(train, validation, [Polynomial(60)])
 
 
 def test_the_class_that_is_selected_is_fitted_to_training_and_validation_trials(
     train: Dataset,
 ) -> None:
     validation = synthetic_dataset(0.01, trials=3)
-    chosen = select(train, validation, [LinearClass(1), LinearClass(2)])
+    chosen = select(train, validation, [Polynomial(1), Polynomial(2)])
     assert chosen.refitted
     both = Dataset((*train.trajectories, *validation.trajectories))
-    direct = identify(both, LinearClass(2), comparators=())
+    direct = identify(both, Polynomial(2), comparators=())
     np.testing.assert_array_equal(chosen.fit.model.a, direct.model.a)
     assert len(chosen.fit.model.bags) == len(train) + 3
     tried = chosen.tried[1].fit
@@ -179,7 +176,7 @@ def test_the_command_line_compares_methods_on_the_same_bags(
     given = ["identify", str(tmp_path), *BAGS, "--config", str(both), "--compare"]
     made = CliRunner().invoke(app, given)
     assert made.exit_code == 0, made.output
-    for method in (LeastSquares, Rie, Rse, CertifiedRse):
+    for method in (LeastSquares(), Rie(), Rse(), Rse(certified=True)):
         rows = re.findall(rf"^ {method.name} .*", made.output, re.MULTILINE)
         assert len(rows) == 2
         for row in rows:

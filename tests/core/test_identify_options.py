@@ -1,4 +1,4 @@
-"""Options of classes and methods: each refusal names the option, its value and what is allowed."""
+"""Options of families and methods: each refusal names the option, its value and what is allowed."""
 
 import pickle
 from dataclasses import FrozenInstanceError, fields
@@ -9,80 +9,74 @@ import pytest
 from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
-    BlockCascadeClass,
-    CellClass,
-    CertifiedRse,
-    CertifiedSem,
-    FeedbackClass,
-    ImplicitClass,
-    LinearClass,
-    LinearStateClass,
-    MomentRie,
-    MonotoneClass,
+    CellRow,
+    Degrees,
+    Feedback,
+    FilterMapFilter,
+    LeastSquares,
+    Network,
+    Polynomial,
+    Rie,
     Rse,
-    StateAffineClass,
+    Sem,
+    alike,
+    methods_of,
 )
-from nlsid_core.identification.methods.options import alike
 
-LEAST_OPTIONS: dict[type, dict[str, Any]] = {
-    LinearClass: {"lags": 1}, StateAffineClass: {"lags": 2}, MonotoneClass: {"lags": 1},
-    BlockCascadeClass: {}, CellClass: {}, FeedbackClass: {}, ImplicitClass: {},
-    LinearStateClass: {},
-}  # fmt: skip
+NEEDED: dict[type, dict[str, Any]] = {Network: {"structure": Feedback()}, Polynomial: {"lags": 2}}
 # class, option -> its smallest and largest allowed values, and the nearest that are refused
 LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
-    (LinearClass, "lags"): ((1, 100), (0, 101, 2.5, True)),
-    (StateAffineClass, "lags"): ((2, 100), (0, 101)),
-    (StateAffineClass, "delays"): (((0,), (2,), None), ((-1,), (3,), ())),
-    (StateAffineClass, "leading_degree"): ((0, 5), (-1, 6)),
-    (StateAffineClass, "lagged_degree"): ((0, 5), (-1, 6)),
-    (StateAffineClass, "right_degree"): ((0, 5), (-1, 6)),
-    (StateAffineClass, "input_range"): ((((0.0, 1.0),), None), (((1.0, 1.0),), ())),
-    (StateAffineClass, "on_out_of_range"): (("clip", "refuse"), ("warn",)),
-    (StateAffineClass, "weights"): ((None, (1.0, 2.5)), ((), (0.0, 1.0), (float("nan"),))),
-    (MonotoneClass, "lags"): ((1, 100), (0, 101)),
-    (MonotoneClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
-    (MonotoneClass, "degree"): ((1, 3), (2,)),
-    (BlockCascadeClass, "orders"): (((1, 0), (0, 100)), ((0, 0), (-1, 2), (101, 0), (1,))),
-    (BlockCascadeClass, "phases"): (((1,), (4,)), ((0,), (5,), ())),
-    (BlockCascadeClass, "intervals"): (((1,),), ((0,), ())),
-    (BlockCascadeClass, "smoothing"): (((0.0,),), ((-1e-9,), (float("nan"),), ())),
-    (BlockCascadeClass, "starts"): ((1, 1000), (0, 1001)),
-    (BlockCascadeClass, "start_samples"): ((1,), (0,)),
-    (BlockCascadeClass, "seed"): ((0,), (-1, 0.5)),
-    (BlockCascadeClass, "begin"): (("measured", "rest"), ("motion",)),
-    (CellClass, "cells"): ((1, 3), (0, 4, 1.5)),
-    (CellClass, "intervals"): ((1, 30), (0, 31)),
-    (CellClass, "start_samples"): ((1, 10_000), (0, 10_001)),
-    (CellClass, "limit"): (("top", "friction", "none"), ("saturation",)),
-    (CellClass, "smoothing"): ((0.0, 1.0), (-1e-9, float("nan"), float("inf"))),
-    (FeedbackClass, "lags"): ((1, 8), (0, 9)),
-    (FeedbackClass, "intervals"): ((1, 30), (0, 31)),
-    (FeedbackClass, "stages"): ((1, 8), (0, 9)),
-    (FeedbackClass, "imitated"): ((0, 10_000), (-1, 10_001)),
-    (FeedbackClass, "start_samples"): ((3, 10_000), (0, 2, 10_001)),
-    (FeedbackClass, "seed"): ((0,), (-1, 0.5)),
-    (ImplicitClass, "lags"): ((1, 100), (0, 101)),
-    (ImplicitClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
-    (ImplicitClass, "set"): (("2.10", "2.11", "2.12", "2.13"), ("2.9",)),
-    (ImplicitClass, "left_degree"): ((1, 9), (0, 2, 11)),
-    (ImplicitClass, "right_degree"): ((1,), (0, 6)),
-    (ImplicitClass, "input_degree"): ((1, 5), (0, 6)),
-    (ImplicitClass, "storage_degree"): ((0,), (-1, 5)),
-    (ImplicitClass, "box"): ((((0.0, 1.0),), None), (((1.0, 1.0),), ())),
+    (Polynomial, "lags"): ((1, 100), (0, 101, 2.5, True)),
+    (Polynomial, "delays"): (((0,), (2,), None), ((-1,), (3,), ())),
+    (Polynomial, "input_range"): ((((0.0, 1.0),), None), (((1.0, 1.0),), ())),
+    (Polynomial, "output_range"): ((((0.0, 1.0),), None), (((1.0, 1.0),), ())),
+    (Polynomial, "on_out_of_range"): (("clip", "refuse"), ("warn",)),
+    (Polynomial, "set"): (("3.8", None), ("2.9",)),
+    (Degrees, "left"): ((1, 9), (0, 2, 11)),
+    (Degrees, "past"): ((1, 5), (0, 6)),
+    (Degrees, "inputs"): ((0, 5), (-1, 6)),
+    (Degrees, "leading"): ((0, 5), (-1, 6)),
+    (Degrees, "lagged"): ((0, 5), (-1, 6)),
+    (FilterMapFilter, "orders"): (((1, 0), (0, 100)), ((0, 0), (-1, 2), (101, 0), (1,))),
+    (FilterMapFilter, "phases"): (((1,), (4,)), ((0,), (5,), ())),
+    (FilterMapFilter, "intervals"): (((1,),), ((0,), ())),
+    (FilterMapFilter, "starts"): ((1, 1000), (0, 1001)),
+    (FilterMapFilter, "begin"): (("measured", "rest"), ("motion",)),
+    (CellRow, "cells"): ((1, 3), (0, 4, 1.5)),
+    (CellRow, "intervals"): ((1, 30), (0, 31)),
+    (CellRow, "limit"): (("top", "friction", "none"), ("saturation",)),
+    (Feedback, "lags"): ((1, 8), (0, 9)),
+    (Feedback, "intervals"): ((1, 30), (0, 31)),
+    (Feedback, "stages"): ((1, 8), (0, 9)),
+    (Feedback, "imitated"): ((0, 10_000), (-1, 10_001)),
+    (Network, "start_samples"): ((3, 10_000), (0, 2, 10_001)),
+    (Network, "seed"): ((0,), (-1, 0.5)),
     (Rse, "iterations"): ((1, 1000), (0, 1001, 2.5)),
-    (CertifiedRse, "iterations"): ((1, 1000), (0, 1001)),
-    (CertifiedSem, "iterations"): ((1, 1000), (0, 1001)),
+    (Sem, "iterations"): ((1, 1000), (0, 1001)),
 }
-FREE = {
-    (MomentRie, "accept_untested_repeats"), (ImplicitClass, "coupled"),
-    (ImplicitClass, "continuous"),
-}  # true or false  # fmt: skip
+FREE = {  # true or false, or options of their own
+    (Rie, "accept_untested_repeats"), (Polynomial, "continuous"), (Polynomial, "degrees"),
+    (Network, "structure"), (Rse, "certified"), (Sem, "certified"),
+}  # fmt: skip
+OTHER_COMBINATIONS: tuple[tuple[Degrees, dict[str, Any], str], ...] = (
+    (Degrees(left=3, past=2), {}, "needs ranges in set 2.11"),
+    (Degrees(left=3, past=3), {"set": "2.10", "lags": 2}, "needs the degree left 5, or"),
+    (Degrees(left=1, past=2), {"set": "2.10"}, "needs the degree left 3"),
+    (Degrees(left=3, lagged=1), {}, "stable in ranges only"),
+    (Degrees(left=5), {"set": "3.8"}, "left is 5; it should be 1 or 3"),
+    (Degrees(left=3, inputs=2), {"set": "3.8"}, "affine in past outputs and inputs"),
+    (Degrees(left=3), {"set": "2.12", "lags": 2}, "set 2.12 is for 1 lag"),
+    (Degrees(left=3), {"set": "2.19"}, "set 2.19 is linear"),
+    (Degrees(left=3), {"set": "2.11", "input_range": ((0.0, 1.0),)}, "or neither"),
+    (Degrees(left=3, leading=1), {}, "no factor of y"),
+    (Degrees(left=3), {"continuous": True}, "continuous models have measured states"),
+    (Degrees(left=3), {"continuous": True, "delays": (1,)}, "left and past the same"),
+)
 
 
 @pytest.mark.parametrize(("kind", "key"), LIMITS, ids=lambda part: getattr(part, "__name__", part))
 def test_an_option_is_taken_up_to_its_limits_and_refused_beyond(kind: type, key: str) -> None:
-    least = LEAST_OPTIONS.get(kind, {})
+    least = NEEDED.get(kind, {})
     allowed, refused = LIMITS[kind, key]
     for value in allowed:
         assert getattr(kind(**least | {key: value}), key) == value
@@ -95,9 +89,17 @@ def test_an_option_is_taken_up_to_its_limits_and_refused_beyond(kind: type, key:
 
 
 def test_every_option_of_every_class_and_method_has_its_limits_tested() -> None:
-    kinds = [*LEAST_OPTIONS, *METHODS.values()]
+    kinds = [Polynomial, Degrees, Network, FilterMapFilter, CellRow, Feedback, *METHODS.values()]
     options = {(kind, option.name) for kind in kinds for option in fields(kind)}
     assert options == set(LIMITS) | FREE
+
+
+@pytest.mark.parametrize(("degrees", "options", "reason"), OTHER_COMBINATIONS)
+def test_what_no_model_can_satisfy_is_refused(
+    degrees: Degrees, options: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(DataError, match=reason):
+        Polynomial(degrees=degrees, **options)
 
 
 def test_options_cannot_be_changed_after_they_were_checked() -> None:
@@ -105,11 +107,30 @@ def test_options_cannot_be_changed_after_they_were_checked() -> None:
         Rse().iterations = 0  # type: ignore[misc]
 
 
-def test_a_name_and_a_title_belong_to_one_method() -> None:
-    assert all(METHODS[name].name == name for name in METHODS)
-    assert len({method.title for method in METHODS.values()}) == len(METHODS)
+def test_a_word_and_a_title_belong_to_one_method() -> None:
+    assert all(METHODS[word].word == word for word in METHODS)
+    assert {Rse().name, Rse(certified=True).name} == {"rse", "rse_certified"}
+    assert len({method().title for method in METHODS.values()}) == len(METHODS) == 4
 
 
 def test_what_runs_beside_a_method_takes_over_the_options_that_both_have() -> None:
-    assert alike(Rse, CertifiedSem(iterations=3)) == Rse(iterations=3)
-    assert alike(MomentRie, Rse(iterations=3)) == MomentRie()
+    assert alike(Rse(), Sem(iterations=3, certified=True)) == Rse(iterations=3)
+    assert alike(Rie(), Rse(iterations=3)) == Rie()
+
+
+def test_the_methods_of_a_class_begin_with_the_one_that_is_taken() -> None:
+    assert methods_of(Polynomial(2))[0] == Rse()
+    assert methods_of(Polynomial(2, degrees=Degrees(left=3)))[0] == Rie()
+    assert methods_of(Network(CellRow())) == (Sem(certified=True),)
+    for degrees, certified in (((2, 0), True), ((1, 1), True), ((3, 0), False), ((2, 1), False)):
+        made = Polynomial(2, degrees=Degrees(leading=degrees[0], lagged=degrees[1]))
+        assert (Rse(certified=True) in methods_of(made)) is certified
+    with pytest.raises(DataError, match="is no model class; there are: Polynomial, Network"):
+        methods_of(LeastSquares())
+
+
+def test_one_set_of_options_says_which_equations_are_searched() -> None:
+    assert Polynomial(2).form is None
+    assert Polynomial(2, degrees=Degrees(left=3)).form == "3.8"
+    assert Polynomial(2, degrees=Degrees(left=3, inputs=2)).form == "2.11"
+    assert Polynomial(1, degrees=Degrees(5, 3), set="2.10").storage_degree == 4

@@ -8,13 +8,10 @@ import pytest
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError
-from nlsid_core.identification import LinearClass, identify, prove_stability
+from nlsid_core.identification import Fit, Polynomial, identify, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.linear_states import (
-    LinearStateFit,
-    identify_linear_states,
-)
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
+from nlsid_core.models import ImplicitModel
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
 
@@ -22,6 +19,18 @@ A = np.array([[0.9, 0.2], [-0.2, 0.7]])
 B = np.array([[1.0], [0.5]])
 OFFSET = np.array([3.0, -40.0])
 SIZE = np.array([1.0, 20.0])
+
+
+def identified(data: Dataset) -> Fit[ImplicitModel]:
+    """The stable linear model of measured states."""
+    return identify(data, Polynomial(1, (1,), set="2.19"), comparators=())
+
+
+def A_of(fit: Fit[ImplicitModel]) -> np.ndarray:
+    """(n, n): ∂x⁺/∂x."""
+    n = len(fit.model)
+    zero = np.zeros((1, n + len(fit.model.inputs)))
+    return fit.model.jacobian(zero[:, :n], zero[:, :n], zero[:, n:])[0, :, :n]
 
 
 def states(A: np.ndarray, *, samples: int = 400, noise: float = 0.0, seed: int = 0) -> Dataset:
@@ -35,7 +44,7 @@ def states(A: np.ndarray, *, samples: int = 400, noise: float = 0.0, seed: int =
     return Dataset((Trajectory(t=0.1 * np.arange(samples), y=y, u=u, name="run"),))
 
 
-def stored(fit: LinearStateFit, folder: Path) -> Path:
+def stored(fit: Fit[ImplicitModel], folder: Path) -> Path:
 
     files.write_document(folder / "model.json", fit.model.document())
     path = folder / "model.proof.json"
@@ -45,8 +54,8 @@ def stored(fit: LinearStateFit, folder: Path) -> Path:
 
 def test_noise_free_states_give_the_truth_back_with_a_proof(tmp_path: Path) -> None:
     data = states(A)
-    fit = identify_linear_states(data)
-    found = fit.A * SIZE / SIZE[:, None]
+    fit = identified(data)
+    found = A_of(fit) * SIZE / SIZE[:, None]
     np.testing.assert_allclose(found, A, atol=1e-4)
     assert "(set 2.19: " in check(stored(fit, tmp_path)).statement
     trial = data.trajectories[0]
@@ -64,8 +73,8 @@ def test_data_of_an_unstable_system_give_a_stable_model_with_a_proof(
     regressors = np.hstack([trial.y[:-1], trial.u[:-1], np.ones((len(trial) - 1, 1))])
     plain = np.linalg.lstsq(regressors, trial.y[1:], rcond=None)[0][:2].T
     assert max(abs(np.linalg.eigvals(plain))) > 1.0
-    fit = identify_linear_states(data)
-    assert max(abs(np.linalg.eigvals(fit.A))) < 1.0
+    fit = identified(data)
+    assert max(abs(np.linalg.eigvals(A_of(fit)))) < 1.0
     path = stored(fit, tmp_path)
     assert check(path).margin > 0.0
     other = fit.model.document()
@@ -78,7 +87,7 @@ def test_data_of_an_unstable_system_give_a_stable_model_with_a_proof(
 
 def test_several_outputs_with_delays_get_a_stable_model_with_a_proof(tmp_path: Path) -> None:
     """Linear in outputs and inputs: degrees 0, 0, 1."""
-    stacked = build_state_affine_rows(states(A, noise=0.05), StateAffineClass(2))
+    stacked = build_state_affine_rows(states(A, noise=0.05), Polynomial(2))
     *_, last = robust_simulation_error(stacked.rows, iterations=5)
     model = stacked.model(last.theta, last.p)
     proof = prove_stability(model)
@@ -89,7 +98,7 @@ def test_several_outputs_with_delays_get_a_stable_model_with_a_proof(tmp_path: P
 
 
 def test_one_output_and_one_input_get_a_difference_equation_with_a_proof(tmp_path: Path) -> None:
-    fit = identify(synthetic_dataset(0.1), LinearClass(3))
+    fit = identify(synthetic_dataset(0.1), Polynomial(3))
     files.write_document(tmp_path / "model.json", fit.model.document())
     files.write_document(tmp_path / "p.json", fit.proof.document(fit.model, "model.json"))
     assert "every input" in check(tmp_path / "p.json").statement
@@ -97,12 +106,12 @@ def test_one_output_and_one_input_get_a_difference_equation_with_a_proof(tmp_pat
 
 def test_data_that_cannot_tell_are_refused() -> None:
     with pytest.raises(DataError, match="4 regressors"):
-        identify_linear_states(states(A, samples=4))
+        identified(states(A, samples=4))
     data = states(A)
     trial = data.trajectories[0]
     twice = np.column_stack([trial.y[:, 0], 2.0 * trial.y[:, 0]])
     with pytest.raises(DataError, match="not independent"):
-        identify_linear_states(Dataset((Trajectory(t=trial.t, y=twice, u=trial.u, name="r"),)))
+        identified(Dataset((Trajectory(t=trial.t, y=twice, u=trial.u, name="r"),)))
     flat = Trajectory(t=trial.t, y=trial.y, u=np.ones_like(trial.u), name="r")
     with pytest.raises(DataError, match="u0 is constant"):
-        identify_linear_states(Dataset((flat,)))
+        identified(Dataset((flat,)))

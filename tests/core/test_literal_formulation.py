@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from examples import one_dimensional
-from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.closed_loop import closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.dynamics import Nominal, VectorField
@@ -26,7 +26,7 @@ def hanging() -> FunnelDesign:
     field = VectorField.from_function(pendulum, 2, 1)
     t = np.linspace(0, 2, 21)
     nominal: Nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
-    return design_funnel(field, nominal, goal=20 * np.eye(2))
+    return design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
 
 
 def literal_margin(design: FunnelDesign, piece: int, degree: int) -> tuple[float, float]:

@@ -11,18 +11,13 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import Infeasible, OptionError
 from nlsid_core.identification import (
-    CertifiedRse,
-    CertifiedSem,
+    Degrees,
     Fit,
-    ImplicitClass,
     LeastSquares,
-    LinearClass,
-    LinearStateClass,
-    MomentRie,
-    MonotoneClass,
+    Polynomial,
     Rie,
     Rse,
-    StateAffineClass,
+    Sem,
     identify,
 )
 from nlsid_core.identification.rates import default_max_rate, searched_rate
@@ -48,60 +43,59 @@ def radii_of(fit: Fit[DifferenceEquation]) -> FloatArray:
 def test_the_default_is_the_time_constant_of_the_longest_trial() -> None:
     data = Dataset((drifting([0.5], 40), drifting([0.5], 90, seed=1)))
     assert default_max_rate(data) == pytest.approx(math.exp(-1 / 90))
-    fit = identify(data, LinearClass(1))
+    fit = identify(data, Polynomial(1))
     assert fit.max_rate == default_max_rate(data)
     assert fit.slowest == "slowest rate allowed: 0.9890 (9 s) a sample", "it is not active"
     assert fit.slowest in str(fit)
 
 
-@pytest.mark.parametrize("method", [Rse(), CertifiedSem()])
+@pytest.mark.parametrize("method", [Rse(), Sem(certified=True)])
 def test_an_integrator_is_answered_by_the_slowest_rate_that_is_allowed(
-    method: Rse | CertifiedSem,
+    method: Rse | Sem,
 ) -> None:
     data = Dataset((drifting([1.0, 0.4]),))
-    fit = identify(data, LinearClass(2), method=method)
+    fit = identify(data, Polynomial(2), method=method)
     assert fit.proof.rate <= default_max_rate(data) < 1.0
     assert radii_of(fit).max() == pytest.approx(searched_rate(default_max_rate(data)), abs=2e-3)
     assert "This bound is active: the model is proved at 0.99" in fit.slowest
-    unheard = identify(data, LinearClass(2), method=method, max_rate=1.0 - 1e-7)
+    unheard = identify(data, Polynomial(2), method=method, max_rate=1.0 - 1e-7)
     assert radii_of(unheard).max() > 0.9975, "the limit is what kept the pole"
 
 
 @pytest.mark.parametrize("rate", slow_among([0.7, 0.9], {0.7}))
 @pytest.mark.parametrize(
-    "method", [Rse(), CertifiedSem(), CertifiedRse(4)], ids=["rse", "sem_certified", "certified"]
+    "method",
+    [Rse(), Sem(certified=True), Rse(4, certified=True)],
+    ids=["rse", "sem_certified", "certified"],
 )
-def test_every_search_keeps_a_rate_that_is_asked_for(
-    rate: float, method: Rse | CertifiedSem | CertifiedRse
-) -> None:
+def test_every_search_keeps_a_rate_that_is_asked_for(rate: float, method: Rse | Sem) -> None:
     data = Dataset((drifting([0.95, 0.3]),))
-    model_class = StateAffineClass(2) if isinstance(method, CertifiedRse) else LinearClass(2)
-    fit = identify(data, model_class, method=method, comparators=(), max_rate=rate)
+    fit = identify(data, Polynomial(2), method=method, comparators=(), max_rate=rate)
     assert fit.proof.rate <= rate
     assert fit.errors["train"][method.name] < 100.0
 
 
 def test_models_with_products_of_lags_and_inputs_keep_it_too() -> None:
     data = Dataset((drifting([0.9], 200),))
-    model_class = StateAffineClass(1, leading_degree=1, lagged_degree=1)
-    fit = identify(data, model_class, method=CertifiedRse(3), comparators=(), max_rate=0.8)
+    model_class = Polynomial(1, degrees=Degrees(leading=1, lagged=1))
+    fit = identify(data, model_class, method=Rse(3, certified=True), comparators=(), max_rate=0.8)
     assert fit.proof.rate <= 0.8
 
 
 def test_bounds_on_the_identification_error_keep_it() -> None:
     data = Dataset((drifting([0.95, 0.3]),))
-    affine = identify(data, StateAffineClass(2), method=Rie(), comparators=(), max_rate=0.8)
+    affine = identify(data, Polynomial(2), method=Rie(), comparators=(), max_rate=0.8)
     assert affine.proof.rate <= 0.8
-    states = identify(data, LinearStateClass(), max_rate=0.8)
+    states = identify(data, Polynomial(1, (1,), set="2.19"), max_rate=0.8)
     known = np.zeros((1, 1))
     assert abs(states.model.jacobian(known, known, known)[0, 0, 0]) <= 0.8
-    implicit = ImplicitClass(2, left_degree=1)
+    implicit = Polynomial(2, set="2.11")
     for rate in (0.6, 0.999):
         found = identify(data, implicit, method=Rie(), comparators=(), max_rate=rate)
         none = np.zeros((1, 2))
         A = found.model.jacobian(none, none, np.zeros((1, 3)))[0, :, :2]
         assert np.abs(np.linalg.eigvals(A)).max() <= rate
-    monotone = identify(Dataset(pair(1500, 1)), CLASS, method=MomentRie(), max_rate=0.5)
+    monotone = identify(Dataset(pair(1500, 1)), CLASS, method=Rie(), max_rate=0.5)
     assert monotone.proof.rate <= 0.5
 
 
@@ -110,7 +104,7 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
     exact = replace(trial, y=lfilter([0.0, 1.0], [1.0, -0.97], trial.u[:, 0]))
     data = Dataset((exact,))
     fit = identify(
-        data, LinearClass(1), method=LeastSquares(), comparators=(), max_rate=0.9,
+        data, Polynomial(1), method=LeastSquares(), comparators=(), max_rate=0.9,
         allow_unproved=True,
     )  # fmt: skip
     assert fit.chosen.proof is None
@@ -119,20 +113,20 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
     )
     assert fit.chosen.remark in str(fit)
     with pytest.raises(Infeasible, match=r"proved only at 0\.9715"):
-        identify(data, LinearClass(1), method=LeastSquares(), comparators=(), max_rate=0.9)
-    assert identify(data, LinearClass(1), method=LeastSquares()).proof.rate < 0.972
+        identify(data, Polynomial(1), method=LeastSquares(), comparators=(), max_rate=0.9)
+    assert identify(data, Polynomial(1), method=LeastSquares()).proof.rate < 0.972
 
 
 @pytest.mark.parametrize("rate", [0.0, 1.0, float("nan")])
 def test_a_rate_that_is_none_is_refused(rate: float) -> None:
     with pytest.raises(OptionError, match="max_rate"):
-        identify(Dataset((drifting([0.5]),)), LinearClass(1), max_rate=rate)
+        identify(Dataset((drifting([0.5]),)), Polynomial(1), max_rate=rate)
 
 
 def test_a_monotone_equation_can_be_held_to_it() -> None:
     data = Dataset((drifting([0.9]),))
     for rate in (0.6, 0.95):
         fit = identify(
-            data, MonotoneClass(1, (1,), degree=1), method=Rie(), comparators=(), max_rate=rate
+            data, Polynomial(1, (1,), set="3.8"), method=Rie(), comparators=(), max_rate=rate
         )
         assert fit.proof.rate <= rate

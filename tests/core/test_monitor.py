@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.funnels.tube import Tube
@@ -55,7 +55,9 @@ def test_the_worst_disturbance_nearly_reaches_the_boundary(
     design: OutputTubeDesign, train: Dataset
 ) -> None:
     prediction = design_output_tube(
-        design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0, lqr_weights=None
+        OutputTube(
+            design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0, lqr_weights=None
+        )
     )
     model, tube, samples = prediction.model, prediction.funnel.tubes[1], 70
     L = tube.L[:, 0]
@@ -215,6 +217,8 @@ def test_around_the_simulation_the_tube_goes_on_after_the_plan(
 def test_parts_that_do_not_belong_together_are_refused(
     design: OutputTubeDesign, train: Dataset
 ) -> None:
-    other = design_output_tube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
+    other = design_output_tube(
+        OutputTube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
+    )
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor(design.model, other.policy, design.funnel)

@@ -3,7 +3,7 @@
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
@@ -16,12 +16,14 @@ def designs(design: OutputTubeDesign, train: Dataset) -> list[OutputTubeDesign]:
     """Tubes for one model with other profiles, horizons and safety factors."""
     return [
         design_output_tube(
-            design.model,
-            train,
-            profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.3 + 0.02 * i), (7.0, 0.4)],
-            horizon=5.0 + 0.2 * i,
-            safety_factor=1.0 + 0.1 * i,
-            inlet=0.01 * i,
+            OutputTube(
+                design.model,
+                train,
+                profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.3 + 0.02 * i), (7.0, 0.4)],
+                horizon=5.0 + 0.2 * i,
+                safety_factor=1.0 + 0.1 * i,
+                inlet=0.01 * i,
+            )
         )
         for i in range(4)
     ]

@@ -8,9 +8,8 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification import LeastSquares, Rie, Sem, identify, prove_stability
+from nlsid_core.identification import LeastSquares, Polynomial, Rie, Sem, identify, prove_stability
 from nlsid_core.identification.polynomial.moment_rie import MomentFit
-from nlsid_core.identification.polynomial.moments import MonotoneClass
 from nlsid_core.identification.polynomial.monotone import (
     identify_from_repeats,
     simulate_banded,
@@ -109,6 +108,6 @@ def test_a_resonance_is_identified_by_a_linear_equation() -> None:
     resonant = replace(truth(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]), c=0.0)
     u = rng.uniform(-1.0, 1.0, 1500)
     data = Dataset((Trajectory(t=0.01 * np.arange(1500), y=resonant.simulate(u), u=u),))
-    fit = identify(data, MonotoneClass(2, (0,), degree=1), method=LeastSquares(), comparators=())
+    fit = identify(data, Polynomial(2, (0,), set="3.8"), method=LeastSquares(), comparators=())
     assert fit.errors["train"]["least_squares"] < 1e-6
     assert fit.proof.rate < 0.98

@@ -298,7 +298,7 @@ def test_where_float64_has_no_digits_for_a_tube_nothing_is_judged_and_none_is_de
     trials = dataset(model, 0, 6, 200)
     quiet = [replace(trial, y=simulate_trial(model, trial) + noise) for trial in trials]
     with pytest.raises(DataError, match="cannot be monitored in float64: rounding can hide"):
-        design_output_tube(far, Dataset(tuple(quiet)))
+        design_output_tube(OutputTube(far, Dataset(tuple(quiet))))
     made = design("linear")
     tubes = [replace(tube, half_widths=1e-3 * tube.half_widths) for tube in made.funnel.tubes]
     elsewhere = replace(made.funnel, model=files.digest(far.document()), tubes=tuple(tubes))
@@ -362,17 +362,15 @@ def test_a_funnel_reads_back_as_it_was_written() -> None:
 @pytest.mark.slow
 def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() -> None:
     model = MODELS["linear"]()
-    made = design_output_tube(model, dataset(model, 0, 6))
+    made = design_output_tube(OutputTube(model, dataset(model, 0, 6)))
     tube = made.funnel.tubes[0]
     assert [name for name, _ in tube.designed_on] == ["trial 0", "trial 2", "trial 4"]
     assert [name for name, _ in tube.measured_on] == ["trial 1", "trial 3", "trial 5"]
     with pytest.raises(DataError, match="for the design and for the calibration"):
-        design_output_tube(model, dataset(model, 0, 3), dataset(model, 2, 3))
-    single = design_output_tube(model, dataset(model, 0, 1, 1200))
-    assert (
-        "windows of one recording are hardly exchangeable"
-        in of_funnel(model.document(), single.funnel.document()).said[0]
-    )
+        design_output_tube(OutputTube(model, dataset(model, 0, 3), dataset(model, 2, 3)))
+    single = design_output_tube(OutputTube(model, dataset(model, 0, 1, 1200)))
+    said = of_funnel(model.document(), single.funnel.document()).said[0]
+    assert "windows of one recording are hardly exchangeable" in said
 
 
 @pytest.mark.slow
@@ -402,7 +400,9 @@ def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None
 def test_two_slow_coupled_outputs_have_a_tube() -> None:
     """With the multipliers as unknowns the solver makes them 10^4 times too large to be decided."""
     model = recorded(implicit_models.linear(np.array([[0.93, 0.02], [0.04, 0.95]])), (0, 1))
-    made = design_output_tube(model, dataset(model, 0, 3, 300), dataset(model, 100, 3, 300))
+    made = design_output_tube(
+        OutputTube(model, dataset(model, 0, 3, 300), dataset(model, 100, 3, 300))
+    )
     assert (made.funnel.half_widths < 2.0).all()
 
 

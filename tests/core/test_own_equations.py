@@ -222,7 +222,7 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
     skewed = P.copy()
     skewed[0, 1] += 4e-15
     found = [
-        design_funnel(pendulum, upright(), goal=goal).funnel.rho
+        design_funnel(ContinuousTracking(pendulum, upright(), goal=goal)).funnel.rho
         for goal in (widths, P, skewed, Goal(np.zeros(2), P))
     ]
     for rho in found[1:]:
@@ -245,12 +245,14 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
 )
 def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
     with pytest.raises(DataError, match=said):
-        design_funnel(pendulum, upright(), **options)
+        design_funnel(ContinuousTracking(pendulum, upright(), **options))
 
 
 @pytest.mark.slow
 def test_limits_are_pairs_too() -> None:
-    found = design_funnel(pendulum, upright(), goal=[0.2, 0.5], limits=[[-6, 6]])
+    found = design_funnel(
+        ContinuousTracking(pendulum, upright(), goal=[0.2, 0.5], limits=[[-6, 6]])
+    )
     assert found.policy.limits.tolist() == [[0, -6, 6]]
 
 
@@ -335,7 +337,7 @@ def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
         lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
     )
     found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
-    assert found.found.tried.startswith("found with 0.25 R: with R as it is by default")
+    assert found.found.tried.startswith("found with a quarter of R; as it is: none at")
 
 
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:
@@ -358,7 +360,7 @@ def test_a_shape_that_cannot_be_found_keeps_what_is_proved(
     t = np.linspace(0, 1, 5)
     rate = lambda x: [-x[0] + x[0] ** 3, -x[1]]  # noqa: E731 - a function of x alone
     still = integrate_nominal(rate, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
-    found = design_funnel(rate, still, goal=[0.3, 0.3], shape="P")
+    found = design_funnel(ContinuousTracking(rate, still, goal=[0.3, 0.3], shape="P"))
     assert "shape rho kept: nothing better" in found.found.history[-1][0]
     assert found.verdict.margin > 0
 
@@ -368,7 +370,7 @@ def test_bounds_of_a_w_that_a_polynomial_does_not_have_are_refused() -> None:
         return [x[1], x[0] - x[0] ** 3 / 6 + u[0]]
 
     with pytest.raises(DataError, match="no argument w"):
-        design_funnel(falls, upright(), goal=[0.2, 0.5], uncertain=[[-1, 1]])
+        design_funnel(ContinuousTracking(falls, upright(), goal=[0.2, 0.5], uncertain=[[-1, 1]]))
 
 
 @pytest.mark.parametrize(
@@ -465,4 +467,4 @@ def test_functions_of_math_are_refused_with_what_to_take() -> None:
         return [x[1], math.sin(x[0]) + u[0]]
 
     with pytest.raises(NlsidError, match=r"take NumPy's, such as np\.sin"):
-        design_funnel(falls, upright(), goal=[0.2, 0.5])
+        design_funnel(ContinuousTracking(falls, upright(), goal=[0.2, 0.5]))

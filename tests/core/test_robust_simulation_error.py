@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.newton import (
     Descent,
@@ -20,13 +21,11 @@ from nlsid_core.identification.polynomial.rie import (
     IdentificationErrorBound,
     robust_identification_error,
 )
-from nlsid_core.identification.polynomial.rows import (
-    StateAffineClass,
-    build_state_affine_rows,
-)
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.prediction import one_step_residual
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
+LINEAR = Polynomial(2, (0, 1, 2))  # with delays it is a state-affine model
 SOLVER = 1e-6  # agreement with a cone solver's optimum
 
 
@@ -139,7 +138,7 @@ def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
     for seed, noise in ((3, 0.05), (5, 1.0)):
         stacked = problem(
             trials=1, samples=26, noise=noise, seed=seed,
-            model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+            model_class=Polynomial(2, degrees=Degrees(leading=1, lagged=lagged_degree)),
         )  # fmt: skip
         rows = stacked.rows
         found = minimise(Bound(rows, None), rows.identity)
@@ -158,7 +157,7 @@ def test_robust_simulation_error_is_at_most_the_robust_identification_error() ->
     for seed in range(4):
         stacked = problem(
             trials=1, samples=80, seed=seed, noise=0.2,
-            model_class=StateAffineClass(2, leading_degree=1),
+            model_class=Polynomial(2, degrees=Degrees(leading=1)),
         )  # fmt: skip
         rows = stacked.rows
         _, J_identification = robust_identification_error(stacked)
@@ -200,9 +199,7 @@ def test_theorem_4_7_the_bound_per_sample_tends_to_an_integral_over_frequencies(
 def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19() -> None:
     """Σ ε² sup_z |e₁'(zI - A)⁻¹e₁|², conservative where the model is lightly damped."""
     for seed in range(4):
-        stacked = problem(
-            trials=1, samples=120, seed=seed, noise=0.1, model_class=StateAffineClass(2)
-        )
+        stacked = problem(trials=1, samples=120, seed=seed, noise=0.1, model_class=LINEAR)
         model, J = robust_identification_error(stacked)
         trial = stacked.dataset.trajectories[0]
         errors = one_step_residual(model, trial)[:, 0] / model.y_scale[0]
@@ -221,7 +218,7 @@ def test_the_identification_error_is_the_worst_case_over_states_and_above_both_b
     """(2.28) maximised row by row, from the polynomials of the model, for the P that was found."""
     stacked = problem(
         trials=1, samples=120, outputs=outputs, noise=0.1,
-        model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+        model_class=Polynomial(2, degrees=Degrees(leading=1, lagged=lagged_degree)),
     )  # fmt: skip
     bound = IdentificationErrorBound(stacked)
     found = minimise(bound, bound.start(), inequalities=(bound.storage(),)).point
@@ -272,7 +269,7 @@ def burst_rows(N: int) -> Rows:
     burst = np.exp(-np.arange(N + 2) / 10.0) * rng.standard_normal(N + 2)
     u = rng.uniform(-1.0, 1.0, N + 2)
     data = Dataset((Trajectory(t=np.arange(N + 2) * 1.0, y=burst, u=u, name="burst"),))
-    model_class = StateAffineClass(2, leading_degree=1, lagged_degree=1)
+    model_class = Polynomial(2, degrees=Degrees(leading=1, lagged=1))
     return build_state_affine_rows(data, model_class).rows
 
 
@@ -301,7 +298,7 @@ def slow_outputs() -> Rows:
     y = x @ C.T
     y += 0.05 * np.std(y, axis=0) * rng.standard_normal(y.shape)
     data = Dataset((Trajectory(t=np.arange(len(u)) * 1.0, y=y, u=u, name="slow"),))
-    return build_state_affine_rows(data, StateAffineClass(2, (1,))).rows
+    return build_state_affine_rows(data, Polynomial(2, (1,))).rows
 
 
 def test_where_newton_stalls_on_its_way_the_minimiser_inside_is_found() -> None:

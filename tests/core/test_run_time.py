@@ -17,7 +17,7 @@ from bags.monitoring.watch import Watch
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import factor
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
@@ -272,7 +272,9 @@ def test_what_float64_cannot_hold_is_refused_by_the_monitor_and_at_design(
     with pytest.raises(DataError, match="too ill-conditioned"):
         Monitor(model, policy, funnel)
     with pytest.raises(DataError, match="too ill-conditioned"):
-        design_output_tube(design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0)
+        design_output_tube(
+            OutputTube(design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0)
+        )
 
 
 def test_a_lost_first_message_does_not_shift_the_plan() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import plan_motion
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
@@ -189,14 +190,18 @@ def test_commissioning_on_the_fitting_bags_is_refused_before_anything_is_written
     base = tracked()
     borrowed = replace(assumption(), measured_on=base.model.bags)
     with pytest.raises(CertificateRejected, match="fitted on"):
-        design_state_funnel(base.model, base.policy, base.feedback, assumption=borrowed)
+        design_state_funnel(
+            SampledTracking(base.model, base.policy, base.feedback, assumption=borrowed)
+        )
 
 
 def test_a_disturbance_too_large_for_the_goal_is_infeasible_and_says_where() -> None:
     base = tracked()
     with pytest.raises(Infeasible, match="at sample"):
         design_state_funnel(
-            base.model, base.policy, base.feedback, assumption=assumption("peak", 1.0)
+            SampledTracking(
+                base.model, base.policy, base.feedback, assumption=assumption("peak", 1.0)
+            )
         )
 
 
@@ -204,7 +209,9 @@ def test_a_start_beyond_the_inlet_is_refused() -> None:
     base = tracked()
     with pytest.raises(DataError, match="inlet"):
         design_state_funnel(
-            base.model, base.policy, base.feedback, assumption=assumption(), start=100.0
+            SampledTracking(
+                base.model, base.policy, base.feedback, assumption=assumption(), start=100.0
+            )
         )
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import tvlqr
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, Infeasible
@@ -189,7 +190,7 @@ def test_energy_is_refused_for_an_implicit_model_before_any_work() -> None:
     design, a = designed(), assumption("energy")
     feedback = tvlqr(design.model, design.policy.x, design.policy.u, input_weight=0.3)
     with pytest.raises(Infeasible, match="response or peak"):
-        design_state_funnel(design.model, design.policy, feedback, assumption=a)
+        design_state_funnel(SampledTracking(design.model, design.policy, feedback, assumption=a))
 
 
 def test_the_monitor_flags_a_step_that_ends_at_a_root_beyond_the_proved_ones() -> None:

@@ -16,7 +16,13 @@ from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    Goal,
+    design_funnel,
+    integrate_nominal,
+)
 from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import Graded, monomials_of
 from nlsid_core.dynamics import Nominal, VectorField, constant_on
@@ -40,10 +46,11 @@ def still(field: VectorField, knots: int, seconds: float) -> Nominal:
 def design() -> FunnelDesign:
     """The pendulum with less torque, for the last 0.5 s."""
     field, _ = pendulum.problem()
+    weights: Any = {"Q": pendulum.Q, "R": pendulum.R}
+    limits = [[0, -LIMIT, LIMIT]]
     return design_funnel(
-        field, still(field, 21, 0.5), goal=GOAL, Q=pendulum.Q, R=pendulum.R,
-        limits=[[0, -LIMIT, LIMIT]],
-    )  # fmt: skip
+        ContinuousTracking(field, still(field, 21, 0.5), goal=GOAL, limits=limits, **weights)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +231,9 @@ def test_a_saturated_funnel_comes_near_the_radius_known_in_closed_form() -> None
     """ẋ = x + clip(u, ±1), |x(1)| ≤ 0.2: at the limit x(0) = 1 - 0.8/e, and no start beyond it."""
     field = VectorField.from_function(lambda x, u: np.array([x[0] + u[0]]), 1, 1)
     found = design_funnel(
-        field, still(field, 41, 1.0), goal=np.array([[25.0]]), limits=[[0, -1.0, 1.0]]
+        ContinuousTracking(
+            field, still(field, 41, 1.0), goal=np.array([[25.0]]), limits=[[0, -1.0, 1.0]]
+        )
     )
     radius = 1 / np.sqrt(found.funnel.shape(0.0)[0, 0])
     best = 1 - 0.8 / np.e
@@ -238,10 +247,9 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
         return np.array([x[0] + x[0] ** 3 / 6 + u[0], x[1] / 2 + x[0] / 4 + u[1]])
 
     field = VectorField.from_function(pair, 2, 2)
-    found = design_funnel(
-        field, still(field, 9, 0.4), goal=4 * np.eye(2),
-        limits=[[0, -0.9, 0.9], [1, -0.6, 0.8]], Q=np.eye(2), R=np.eye(2),
-    )  # fmt: skip
+    options: Any = {"Q": np.eye(2), "R": np.eye(2), "limits": [[0, -0.9, 0.9], [1, -0.6, 0.8]]}
+    problem = ContinuousTracking(field, still(field, 9, 0.4), goal=4 * np.eye(2), **options)
+    found = design_funnel(problem)
     assert len(np.unique(found.found.proved.pieces.mode, axis=0)) == 9
     edge = found.funnel.outline(0.0, (0, 1))
     asked = -(edge - found.policy.x(0.0)) @ found.policy.K(0.0).T
@@ -260,7 +268,9 @@ def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
 
     bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=[[2, -1.0, 1.0]])
-    found = design_funnel(field, still(field, 13, 0.6), goal=20 * np.eye(2), limits=[[0, -0.5, 1]])
+    found = design_funnel(
+        ContinuousTracking(field, still(field, 13, 0.6), goal=20 * np.eye(2), limits=[[0, -0.5, 1]])
+    )
     assert found.found.proved.pieces.kappa is not None
     assert demand(found, 0.0) > 0.6
     assert check(found.save(tmp_path)[-1]).margin > 0
@@ -293,7 +303,7 @@ def test_a_nominal_beyond_the_limits_is_refused() -> None:
     field, _ = pendulum.problem()
     nominal = still(field, 5, 0.2)
     with pytest.raises(DataError, match="no room is left"):
-        design_funnel(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]])
+        design_funnel(ContinuousTracking(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]]))
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import StateAffineClass, identify, prove_stability
+from nlsid_core.identification import Degrees, Polynomial, identify, prove_stability
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 
@@ -58,7 +58,7 @@ def test_two_coupled_outputs_are_identified_to_the_truth_and_proved() -> None:
         u = rng.uniform(-2.0, 2.0, (200 + 30 * seed, 1))
         y = model.simulate(u) + 1e-3 * model.y_scale * rng.standard_normal((len(u), 2))
         trials.append(Trajectory(t=0.01 * np.arange(len(u)), y=y, u=u, name=f"run {seed}"))
-    found = identify(Dataset(tuple(trials)), StateAffineClass(2, delays=(1,), right_degree=2))
+    found = identify(Dataset(tuple(trials)), Polynomial(2, (1,), Degrees(inputs=2)))
     assert found.errors["train"][found.method.name] < 1.0
     own, truth = found.model.document(), block_matrix(model)
     assert own["on_out_of_range"] == "clip"

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import ShapeError, SolverError
 from nlsid_core.identification import (
-    CertifiedSem,
-    LinearClass,
+    Degrees,
+    Polynomial,
     Rse,
+    Sem,
     identify,
     prove_stability,
     trail,
@@ -28,16 +30,12 @@ from nlsid_core.identification.polynomial.certified import (
     certified_simulation_error,
     descend_certified,
 )
-from nlsid_core.identification.polynomial.linear import (
-    build_regression,
-    least_squares,
-    minimise_simulation_error,
-)
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
-from nlsid_core.identification.searches import _tried
+from nlsid_core.identification.polynomial.explicit import equation_error, minimise_simulation_error
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.starts import companion, reduced, reflected, stable_starts
+from nlsid_core.identification.trail import tried
 from nlsid_core.identification.validation import simulation_percent, validate
-from nlsid_core.models import StateAffineModel
+from nlsid_core.models import DifferenceEquation
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
 from tests.marks import slow_among
@@ -118,22 +116,23 @@ def test_iterates_never_go_up_and_end_at_the_simulation_error() -> None:
 @pytest.mark.slow
 def test_the_last_step_of_a_linear_model_keeps_its_proof_and_never_goes_up() -> None:
     dataset = synthetic_dataset(0.4)
-    regression = build_regression(dataset, 3)
-    start = least_squares(regression)
+    regression = build_state_affine_rows(dataset, Polynomial(3))
+    start = equation_error(regression)
+    assert isinstance(start, DifferenceEquation)
     assert prove_stability(start) is not None
-    found = minimise_simulation_error(regression, start, stable=True)
+    found = minimise_simulation_error(regression, np.r_[1.0, -start.a], stable=True)
     assert prove_stability(found) is not None
     assert simulation_percent(found, dataset) < 0.999 * simulation_percent(start, dataset)
-    fit = identify(dataset, LinearClass(3))
-    again = minimise_simulation_error(regression, fit.model, stable=True)
+    fit = identify(dataset, Polynomial(3))
+    again = minimise_simulation_error(regression, np.r_[1.0, -fit.model.a], stable=True)
     assert simulation_percent(again, dataset) <= simulation_percent(fit.model, dataset) * (1 + 1e-9)
 
 
-def training_error(model: StateAffineModel, rows: Rows) -> float:
+def training_error(model: Any, rows: Rows) -> float:
     return SimulationError(rows).at(np.concatenate([g.coefficients.ravel() for g in model.G])).J
 
 
-def checked(model: StateAffineModel, folder: Path) -> str:
+def checked(model: Any, folder: Path) -> str:
     proof = prove_stability(model)
     assert proof is not None
     files.write_document(folder / "model.json", model.document())
@@ -145,7 +144,7 @@ def checked(model: StateAffineModel, folder: Path) -> str:
 def test_the_last_step_of_a_state_affine_model_keeps_its_proof(tmp_path: Path) -> None:
     """From the first certified iterate, so that there is something left to gain."""
     stacked = problem(
-        trials=1, samples=400, noise=0.2, model_class=StateAffineClass(2, leading_degree=2)
+        trials=1, samples=400, noise=0.2, model_class=Polynomial(2, degrees=Degrees(leading=2))
     )
     first = next(certified_simulation_error(stacked))
     model = stacked.model(first.point.theta, first.point.p)
@@ -167,7 +166,7 @@ def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Pat
     flow, temperature = heat_exchanger(folder)
     train = single("exchanger", flow[:800], temperature[:800], 1.0)
     stacked = build_state_affine_rows(
-        train, StateAffineClass(2, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),))
+        train, Polynomial(2, degrees=Degrees(inputs=3, leading=2), input_range=((0.1, 0.7),))
     )
     first = next(certified_simulation_error(stacked))
     model = stacked.model(first.point.theta, first.point.p)
@@ -181,13 +180,13 @@ def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Pat
 
 def test_the_last_step_refuses_classes_it_has_no_certificate_for() -> None:
     stacked = problem(
-        trials=1, samples=400, noise=0.2, model_class=StateAffineClass(2, leading_degree=2)
+        trials=1, samples=400, noise=0.2, model_class=Polynomial(2, degrees=Degrees(leading=2))
     )
     first = next(certified_simulation_error(stacked))
     model = stacked.model(first.point.theta, first.point.p)
     proof = prove_stability(model)
     assert proof is not None
-    other = problem(model_class=StateAffineClass(2, lagged_degree=2, delays=(0,)))
+    other = problem(model_class=Polynomial(2, (0,), Degrees(lagged=2)))
     with pytest.raises(ShapeError, match="degree 1 at most"):
         descend_certified(other, model, proof)
 
@@ -219,10 +218,10 @@ def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_mi
     seed: int, noise: float, lags: int, stuck: float, reached: float
 ) -> None:
     data = two_resonances(seed, noise=noise)
-    regression = build_regression(data, lags)
+    regression = build_state_affine_rows(data, Polynomial(lags))
     *_, last = robust_simulation_error(regression.rows)
     assert simulation_percent(regression.model(last.theta, last.p), data) > stuck
-    fit = identify(data, LinearClass(lags), method=CertifiedSem())
+    fit = identify(data, Polynomial(lags), method=Sem(certified=True))
     errors = fit.errors["train"]
     assert errors["rse"] < reached
     assert errors["sem_certified"] <= errors["sem"] * (1 + 1e-3) < reached
@@ -246,10 +245,10 @@ def test_three_resonances_from_rest_are_found_to_the_noise_where_the_identity_is
     y = lfilter(np.concatenate([[0.0], 0.1 * rng.normal(size=6)]), np.poly(poles).real, u)
     y += 0.1 * np.std(y) * rng.normal(size=len(u)) * moving
     data = Dataset((Trajectory(t=0.002 * np.arange(len(u)), y=y, u=u, name="arm"),))
-    regression = build_regression(data, 6)
+    regression = build_state_affine_rows(data, Polynomial(6))
     *_, stuck = robust_simulation_error(regression.rows)
     assert simulation_percent(regression.model(stuck.theta, stuck.p), data) > 15.0
-    fit = identify(data, LinearClass(6), method=CertifiedSem())
+    fit = identify(data, Polynomial(6), method=Sem(certified=True))
     assert 9.0 < fit.errors["train"]["sem_certified"] < 10.3
     assert fit.proof.rate <= fit.max_rate
 
@@ -266,7 +265,7 @@ def beside_another_output(data: Dataset) -> Dataset:
 def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(outputs: int) -> None:
     one = two_resonances(4, noise=0.1)
     data, lags, least = (one, 2, 17.3) if outputs == 1 else (beside_another_output(one), 1, 11.0)
-    model_class = StateAffineClass(lags)
+    model_class = Polynomial(lags)
     stacked = build_state_affine_rows(data, model_class)
     *_, stuck = robust_simulation_error(stacked.rows)
     assert simulation_percent(stacked.model(stuck.theta, stuck.p), data) > 90.0
@@ -278,7 +277,7 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
 @pytest.mark.slow
 def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> None:
     data = beside_another_output(two_resonances(1, noise=0.1))
-    rows = build_state_affine_rows(data, StateAffineClass(2)).rows
+    rows = build_state_affine_rows(data, Polynomial(2)).rows
     start = dict(stable_starts(data, 2))["from least squares"]
     few = list(robust_simulation_error(rows, start=start, iterations=60, steps=2))
     *_, last = robust_simulation_error(rows, start=start, iterations=60)
@@ -290,9 +289,9 @@ def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> N
 @pytest.mark.slow
 def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
     data = two_resonances(1, noise=0.1)
-    whole = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    whole = identify(data, Polynomial(4), method=Rse(), comparators=())
     monkeypatch.setattr(rse, "WORK", 1.0)
-    short = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    short = identify(data, Polynomial(4), method=Rse(), comparators=())
     assert len(whole.history.steps) > trail.FEWEST_BOUNDS == len(short.history.steps)
     assert whole.errors["train"]["rse"] < short.errors["train"]["rse"] < 18.0
 
@@ -307,14 +306,14 @@ def test_among_poles_at_the_slowest_rate_the_last_step_is_not_above_the_iterates
     y = lfilter([0.0, 0.1, 0.2, 0.1], np.poly(poles).real, u)
     y += 0.1 * np.std(y) * rng.standard_normal(600)
     data = Dataset((Trajectory(t=0.1 * np.arange(600), y=y, u=u),))
-    fit = identify(data, LinearClass(4), method=CertifiedSem(10))
+    fit = identify(data, Polynomial(4), method=Sem(10, certified=True))
     assert fit.errors["train"]["sem_certified"] <= fit.errors["train"]["rse"] * (1 + 1e-9)
     assert fit.errors["train"]["rse"] < 20.0
     assert fit["rse"].proof is not None
 
 
 def test_iterates_from_a_given_start_go_on_to_the_minimum() -> None:
-    regression = build_regression(two_resonances(1, noise=0.1), 4)
+    regression = build_state_affine_rows(two_resonances(1, noise=0.1), Polynomial(4))
     start = dict(stable_starts(regression.dataset, 4))["from a longer model"]
     found = list(robust_simulation_error(regression.rows, start=start))
     assert len(found) > 5
@@ -352,7 +351,7 @@ def test_reflected_poles_of_several_outputs_are_inside_and_the_others_stay() -> 
 def test_a_longer_model_is_reduced_to_the_poles_it_has() -> None:
     """Extra poles that zeros cancel do not show in the impulse response."""
     data = two_resonances(0, noise=0.0)
-    short = least_squares(build_regression(data, 4))
+    short: Any = equation_error(build_state_affine_rows(data, Polynomial(4)))
     extra = np.poly([0.7, -0.6]).real
     a = -np.convolve(np.concatenate([[1.0], -short.a]), extra)[1:]
     found = reduced(a[:, None, None], np.convolve(short.b, extra)[:, None, None], 4)
@@ -363,7 +362,7 @@ def test_a_longer_model_is_reduced_to_the_poles_it_has() -> None:
 
 
 def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
-    stacked = problem(model_class=StateAffineClass(1, input_range=((-0.5, 0.5),)))
+    stacked = problem(model_class=Polynomial(1, input_range=((-0.5, 0.5),)))
     *_, last = robust_simulation_error(stacked.rows, iterations=3)
     model = stacked.model(last.theta, last.p)
     scores = validate(model, stacked.dataset)
@@ -382,15 +381,15 @@ def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
     assert scores.simulation_percent == pytest.approx(100 * rms / spread)
 
 
-def test_a_start_whose_simulation_overflows_leaves_the_other_starts_to_be_tried() -> None:
+def test_a_start_whose_simulation_overflows_leaves_the_other_starts_to_betried() -> None:
     """A pole at 1.3 over 2000 samples: its errors are beyond all numbers, and no traceback."""
     rng, N = np.random.default_rng(0), 2000
     walk = np.cumsum(rng.standard_normal((N, 1)), axis=0)
     trial = Trajectory(t=np.arange(N) * 1.0, y=walk, u=rng.standard_normal((N, 1)))
-    rows = build_regression(Dataset((trial,)), 2).rows
+    rows = build_state_affine_rows(Dataset((trial,)), Polynomial(2)).rows
     starts = [np.array([1.0, -2.2, 1.17]), np.array([1.0, -1.4, 0.45])]
     error = SimulationError(rows)
-    found = [_tried(start.copy, lambda theta: error.at(theta).J) for start in starts]
+    found = [tried(start.copy, lambda theta: error.at(theta).J) for start in starts]
     assert found[0] is None
     assert found[1] is not None
 

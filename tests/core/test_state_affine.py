@@ -12,14 +12,10 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import Degrees, Polynomial, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.certified import certified_simulation_error
-from nlsid_core.identification.polynomial.rows import (
-    StateAffineClass,
-    StateAffineRows,
-    build_state_affine_rows,
-)
+from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
@@ -38,7 +34,7 @@ def recording(samples: int = 300, noise: float = 0.02, seed: int = 0) -> Traject
 
 @pytest.fixture(scope="module")
 def stacked() -> StateAffineRows:
-    model_class = StateAffineClass(2, leading_degree=2, right_degree=2, input_range=((0.0, 2.0),))
+    model_class = Polynomial(2, degrees=Degrees(inputs=2, leading=2), input_range=((0.0, 2.0),))
     dataset = Dataset((recording(), recording(seed=1)))
     return build_state_affine_rows(dataset, model_class)
 
@@ -46,7 +42,8 @@ def stacked() -> StateAffineRows:
 @pytest.fixture(scope="module")
 def model(stacked: StateAffineRows) -> StateAffineModel:
     *_, last = certified_simulation_error(stacked, iterations=4)
-    return stacked.model(last.point.theta, last.point.p)
+    made: StateAffineModel = stacked.model(last.point.theta, last.point.p)
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -130,23 +127,25 @@ def test_a_rank_deficient_basis_is_refused() -> None:
     y = np.random.default_rng(0).standard_normal(300)
     dataset = Dataset((Trajectory(t=np.arange(300.0), y=y, u=u),))
     with pytest.raises(DataError, match="does not excite"):
-        build_state_affine_rows(dataset, StateAffineClass(1, right_degree=2))
+        build_state_affine_rows(dataset, Polynomial(1, degrees=Degrees(inputs=2)))
 
 
 def test_more_parameters_than_equations_are_refused() -> None:
     with pytest.raises(DataError, match="equations for"):
         build_state_affine_rows(
-            Dataset((recording(samples=30),)), StateAffineClass(4, right_degree=3)
+            Dataset((recording(samples=30),)), Polynomial(4, degrees=Degrees(inputs=3))
         )
 
 
 def test_certified_iterates_refuse_degrees_they_have_no_set_for() -> None:
-    for degrees in ((3, 0), (0, 2), (2, 1)):
-        model_class = StateAffineClass(1, (0,), *degrees)
+    for leading, lagged in ((3, 0), (0, 2), (2, 1)):
+        model_class = Polynomial(1, (0,), Degrees(leading=leading, lagged=lagged))
         stacked = build_state_affine_rows(Dataset((recording(),)), model_class)
         with pytest.raises(ShapeError, match="at most"):
             next(certified_simulation_error(stacked))
-    many = build_state_affine_rows(Dataset((recording(),)), StateAffineClass(12, lagged_degree=1))
+    many = build_state_affine_rows(
+        Dataset((recording(),)), Polynomial(12, degrees=Degrees(lagged=1))
+    )
     with pytest.raises(ShapeError, match=r"2\^13 corners .* fewer delays"):
         next(certified_simulation_error(many))
 
@@ -167,7 +166,7 @@ def test_five_inputs_multiply_the_past_in_a_certified_iterate() -> None:
         ]
     y += 0.05 * rng.standard_normal(300)
     data = Dataset((Trajectory(t=0.1 * np.arange(300), y=y, u=u),))
-    stacked = build_state_affine_rows(data, StateAffineClass(1, lagged_degree=1))
+    stacked = build_state_affine_rows(data, Polynomial(1, degrees=Degrees(lagged=1)))
     first = next(certified_simulation_error(stacked))
     model = stacked.model(first.point.theta, first.point.p)
     corners = np.array(list(product(*stacked.window_range())))

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import cart_pole, planar_quadrotor, torque_limited_pendulum
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import FunnelDesign, design_funnel, nominal_through
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, nominal_through
 from nlsid_core.dynamics import Rates, VectorField, solve, taylor_field
 from nlsid_core.dynamics.taylor_model import BASE, variables_of
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeError
@@ -223,7 +223,7 @@ def caught() -> tuple[VectorField, FunnelDesign]:
     x = np.zeros((9, 2))
     field = taylor_field(swinging, t, x, np.zeros((9, 1)), radius=[0.4, 3.0, 30.0])
     nominal = nominal_through(t, x, np.zeros((9, 1)), field)
-    return field, design_funnel(field, nominal, goal=30 * np.eye(2))
+    return field, design_funnel(ContinuousTracking(field, nominal, goal=30 * np.eye(2)))
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +261,7 @@ def test_bounds_of_one_span_do_not_hold_in_another() -> None:
     tight = VectorField(field.pieces, 2, 1, field.breaks, field.uncertain, rows)
     t, x = np.linspace(0, 0.4, 9), np.zeros((9, 2))
     nominal = nominal_through(t, x, np.zeros((9, 1)), tight)
-    found = design_funnel(tight, nominal, goal=30 * np.eye(2)).funnel
+    found = design_funnel(ContinuousTracking(tight, nominal, goal=30 * np.eye(2))).funnel
     for k, most in ((5, 0.0401), (6, 0.0401)):
         assert np.abs(found.outline(float(found.t[k]), (0, 1))[:, 0]).max() <= most
     with pytest.raises(DataError, match="the span where only one is meant"):

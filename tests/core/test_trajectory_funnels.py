@@ -18,7 +18,13 @@ from examples import one_dimensional, pendulum
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    Goal,
+    design_funnel,
+    integrate_nominal,
+)
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.dynamics import (
     Nominal,
@@ -41,7 +47,7 @@ from tests.funnel_files import saved, write
 def satellite() -> FunnelDesign:
     """The satellite's funnel with 25 knots."""
     field, nominal, weights = problem(25)
-    return design_funnel(field, nominal, goal=goal_matrix(), **weights)
+    return design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
 
 
 def damped(t: Any, x: Any, u: Any) -> Any:
@@ -85,7 +91,7 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
 @pytest.mark.slow
 def test_alternation_ends_where_the_sweep_does() -> None:
     field, nominal = hanging()
-    design = design_funnel(field, nominal, goal=20 * np.eye(2))
+    design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
     steps = LSteps(field)
     start = exponential_start(steps, design.policy, design.funnel.P)
     found = alternate_rho(steps, design.policy, start, stop=0.002)
@@ -96,22 +102,24 @@ def test_alternation_ends_where_the_sweep_does() -> None:
 @pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])
 def test_every_kind_of_gain_is_proved(gain: str) -> None:
     field, nominal = hanging()
-    design = design_funnel(field, nominal, goal=20 * np.eye(2), gain=gain)
+    design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2), gain=gain))
     assert np.min(design.found.proved.margins) > 0
 
 
 def test_p_grows_beyond_rho_and_is_proved() -> None:
     field, nominal = hanging(9)
-    rho = design_funnel(field, nominal, goal=20 * np.eye(2))
+    rho = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
     with ThreadPoolExecutor(2) as threads:
-        P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P", executor=threads)
+        P = design_funnel(
+            ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"), executor=threads
+        )
     assert P.funnel.volume_integral() > rho.funnel.volume_integral()
     assert np.min(P.found.proved.margins) > 0
 
 
 def test_only_dynamics_nominal_and_weights_are_needed() -> None:
     field, nominal = hanging(9)
-    design = design_funnel(damped, nominal, Q=np.eye(2), R=np.eye(1))
+    design = design_funnel(ContinuousTracking(damped, nominal, Q=np.eye(2), R=np.eye(1)))
     assert np.min(design.found.proved.margins) > 0
     assert design.model.document() == field.document()
 
@@ -133,8 +141,8 @@ def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path
     bounds = [[-0.02, 0.02], [0.15, 0.25]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds)
     plain, nominal = hanging()
-    design = design_funnel(field, nominal, goal=20 * np.eye(2))
-    calm = design_funnel(plain, nominal, goal=20 * np.eye(2))
+    design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
+    calm = design_funnel(ContinuousTracking(plain, nominal, goal=20 * np.eye(2)))
     assert design.funnel.volume_integral() < calm.funnel.volume_integral()
     verdict = check(design.save(tmp_path)[-1])
     assert any("w0 in [-0.02, 0.02]" in text for text in verdict.assumptions)
@@ -157,7 +165,14 @@ def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
     second = VectorField.from_function(heavier, 2, 1)
     field = VectorField(plain.pieces + second.pieces, 2, 1, np.array([1.0]))
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=np.linspace(0, 2, 21), start=[0, 0])
-    assert np.min(design_funnel(field, nominal, goal=20 * np.eye(2)).found.proved.margins) > 0
+    assert (
+        np.min(
+            design_funnel(
+                ContinuousTracking(field, nominal, goal=20 * np.eye(2))
+            ).found.proved.margins
+        )
+        > 0
+    )
 
 
 def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_valid(
@@ -170,7 +185,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     valid: list[list[float]] = [[0, -0.2, 0.2], [2, -9, 9]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
     _, nominal = hanging()
-    design = design_funnel(field, nominal, goal=30 * np.eye(2))
+    design = design_funnel(ContinuousTracking(field, nominal, goal=30 * np.eye(2)))
     assert design.found.proved.pieces.kappa is not None
     assert not design.found.proved.pieces.vertex.any()
     proof = design.save(tmp_path)[-1]
@@ -238,9 +253,14 @@ def test_containment_is_decided_at_the_touching_ellipsoid() -> None:
 def test_a_funnel_may_end_in_a_goal_around_another_point() -> None:
     field, nominal = hanging(9)
     goal = Goal(np.array([0.05, 0.0]), 20 * np.eye(2))
-    assert np.min(design_funnel(field, nominal, goal=goal).found.proved.margins) > 0
+    assert (
+        np.min(design_funnel(ContinuousTracking(field, nominal, goal=goal)).found.proved.margins)
+        > 0
+    )
     with pytest.raises(DataError, match="ends outside the goal"):
-        design_funnel(field, nominal, goal=Goal(np.array([0.5, 0.0]), 20 * np.eye(2)))
+        design_funnel(
+            ContinuousTracking(field, nominal, goal=Goal(np.array([0.5, 0.0]), 20 * np.eye(2)))
+        )
 
 
 # -- nouns -----------------------------------------------------------------------------------

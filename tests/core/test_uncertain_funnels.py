@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.thesis.soundness import simulate_boundary
-from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.proofs import check
@@ -52,7 +52,7 @@ def design(kind: str) -> FunnelDesign:
     field = VectorField.from_function(dynamics, 2, 1, uncertain=bounds)
     t = np.linspace(0, 2, 21)
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
-    return design_funnel(field, nominal, goal=20 * np.eye(2))
+    return design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
 
 
 def test_the_certificate_states_the_bounds(kind: str, design: FunnelDesign, tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, apart, percent
+from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.linear import build_regression, least_squares
-from nlsid_core.identification.polynomial.rows import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.polynomial.explicit import equation_error
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.prediction import predict
-from nlsid_core.identification.validation import validate, without_missing
+from nlsid_core.identification.validation import validate
 from nlsid_core.models import DifferenceEquation, Signal
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
 
@@ -63,7 +64,7 @@ def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
     dataset = synthetic_dataset(0.02, trials=1, samples=80)
     trial = dataset.trajectories[0]
     linear = truth()
-    stacked = build_state_affine_rows(dataset, StateAffineClass(2, leading_degree=1))
+    stacked = build_state_affine_rows(dataset, Polynomial(2, degrees=Degrees(leading=1)))
     iterate = next(iter(robust_simulation_error(stacked.rows)))
     for model in (linear, stacked.model(iterate.theta, iterate.p)):
         horizon = 4
@@ -80,22 +81,10 @@ def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
 
 def test_errors_grow_with_the_horizon_towards_the_simulation_error() -> None:
     dataset = synthetic_dataset(0.02, trials=4, samples=200)
-    model = least_squares(build_regression(dataset, 2))
+    model = equation_error(build_state_affine_rows(dataset, Polynomial(2)))
     found = validate(model, dataset, horizons=(1, 3, 100))
     assert found.fit_percent == 100.0 - found.simulation_percent
     assert found.prediction_percent[100] == pytest.approx(found.simulation_percent, rel=0.2)
-
-
-def test_missing_segments_are_skipped_with_a_count() -> None:
-    trial = synthetic_dataset(0.0, trials=1, samples=80).trajectories[0]
-    missing = np.zeros(80, dtype=bool)
-    missing[[20, 21, 25, 60]] = True
-    parts, skipped = without_missing(trial, missing, shortest=5)
-    assert [len(part) for part in parts] == [20, 34, 19]
-    assert skipped == 4 + 3  # and the stretch 22 … 24, which is too short
-    assert parts[1].t[0] == trial.t[26]
-    with pytest.raises(DataError, match="no stretch of 50"):
-        without_missing(trial, missing, shortest=50)
 
 
 def test_trials_too_short_for_the_tests_are_refused() -> None:

@@ -231,3 +231,20 @@ def test_a_recorder_names_publishers_in_turn_and_one_that_says_nothing_and_follo
         assert source.count("/driver") == 1
         [counts] = [batch.sequence for _, batch in source.batches(["/odom"])]
     assert counted_in_turn(counts), "the bag shows it too"
+
+
+@pytest.mark.parametrize(
+    ("asked", "deaf"),
+    [(qos.STREAM, ""), (qos.SENSOR, ""), (qos.DOCUMENT, "/cmd_vel: /test_base cannot hear it: ")],
+)
+def test_only_who_asks_for_more_than_is_offered_cannot_hear_commands(
+    asked: QoSProfile, deaf: str
+) -> None:
+    with node_here("test_driver") as (driver, spin_until), node_here("test_base") as (base, _):
+        commands = driver.create_publisher(TwistStamped, "/cmd_vel", qos.command(0.025))
+        base.create_subscription(TwistStamped, "/cmd_vel", lambda _: None, asked)
+        spin_until(lambda: driver.count_publishers("/cmd_vel") == 1)
+        spin_until(lambda: driver.count_subscribers("/cmd_vel") == 1)
+        said = graph.rivals(driver, commands)
+    assert said.startswith(deaf)
+    assert bool(said) is bool(deaf)

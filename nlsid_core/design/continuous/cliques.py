@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.design.continuous.lstep import LSteps, Section
+from nlsid_core.design.continuous.lstep import TOLERANCE, LSteps, Section
 from nlsid_core.design.continuous.pieces import substitution
 from nlsid_core.dynamics import VectorField
 from nlsid_core.polynomial.maps import monomials
@@ -131,7 +131,7 @@ class CliqueSteps(LSteps):
         return cls(steps, cliques)
 
     def __init__(self, steps: LSteps, cliques: tuple[tuple[int, ...], ...]) -> None:
-        super().__init__(steps.field, nonlinear=steps.nonlinear, tolerance=steps.tolerance)
+        super().__init__(steps.field, nonlinear=steps.nonlinear)
         self.cliques = Cliques(self.field.n, self.nonlinear, cliques)
 
     @cached_property
@@ -146,7 +146,7 @@ class CliqueSteps(LSteps):
         """φ, of the only case; `start` and `enough` change nothing."""
         del case, start, enough
         P, g = self._posed(section, rho)
-        found = self.cliques.small.solve(P, g, tolerance=FINER * self.tolerance)
+        found = self.cliques.small.solve(P, g, tolerance=FINER * TOLERANCE)
         basis = self.cliques.basis
         Q = np.zeros((len(basis), len(basis)))
         for at, gram in zip(self.cliques.at, found.grams, strict=True):

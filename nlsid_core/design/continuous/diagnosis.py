@@ -4,8 +4,9 @@ The dual solution of an L-step weighs the boundary's points so that the weighted
 the largest margin there is. -Ẇ/ρ is a sum of terms, so each term's weighted mean is its share.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -92,11 +93,22 @@ class Diagnosis:
 
 
 class NoFunnel(Infeasible):
-    """No ρ at an instant; diagnosis: why."""
+    """No ρ at t, in s. left: what the margin was short of there, in 1/s, if it is known.
 
-    def __init__(self, diagnosis: Diagnosis) -> None:
-        super().__init__(str(diagnosis))
-        self.diagnosis = diagnosis
+    diagnosis: why, worked out by `why` when somebody asks: a search refuses much on its way.
+    """
+
+    def __init__(self, t: float, why: Callable[[], Diagnosis], left: float = -np.inf) -> None:
+        super().__init__(f"no funnel at t = {t:.6g} s")
+        self.t, self.left, self._why = t, left, why
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """What lets V fall there, and what takes it away."""
+        return self._why()
+
+    def __str__(self) -> str:
+        return str(self.diagnosis)
 
 
 def diagnosed(

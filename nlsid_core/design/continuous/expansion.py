@@ -4,7 +4,8 @@ The box on which a Taylor model is bounded has to hold the funnel, and what the 
 makes the funnel smaller: so the sweep chooses ρ and the box of every interval together.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from traceback import extract_tb
 
@@ -215,8 +216,8 @@ def sweep_expanded(
                 k -= 1
                 continue
             except NoFunnel as found:
-                if k < farthest or (k == farthest and found.diagnosis.left > left):
-                    farthest, refusal, left = k, found, found.diagnosis.left
+                if k < farthest or (k == farthest and found.left > left):
+                    farthest, refusal, left = k, found, found.left
                 back += 1
                 if back > most_back:
                     raise refusal from None
@@ -295,6 +296,7 @@ class _Interval:
         Where a bound from the last programs promises what the next do not keep, ρ falls anyway.
         """
         rho, most, fall = min(self.after * ratio, cap), cap, FALL
+        left = -np.inf
         for _ in range(MAX_TRIES):
             if known is not None:
                 rho = self.bracketed(min(rho, most), known, most)
@@ -308,7 +310,8 @@ class _Interval:
                 return rho, known
             most, fall = rho * fall, fall * fall
             rho = most
-        raise NoFunnel(self.diagnosis(known))
+        kept = replace(self, steps=self.steps.as_it_is())
+        raise NoFunnel(self.pair[0].t, partial(kept.diagnosis, known), left)
 
     def bracketed(self, rho: float, known: Ends, most: float) -> float:
         """The largest ρ ≤ most, nearly, at which the bound leaves the margin; or 0."""

@@ -85,7 +85,7 @@ def refusal_time(refusal: Infeasible) -> float | None:
     """When in the motion something was refused; None if it says nothing about that."""
     if isinstance(refusal, Unproved):
         return refusal.t
-    return refusal.diagnosis.t if isinstance(refusal, NoFunnel) else None
+    return refusal.t if isinstance(refusal, NoFunnel) else None
 
 
 def _first(chosen: BoolArray, order: FloatArray, count: int) -> BoolArray:

@@ -40,8 +40,9 @@ class HeldSteps(LSteps):
     ) -> None:
         super().__init__(
             steps.field, setting.policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            tolerance=steps.tolerance, widths=table[-1].copy(), tightness=steps.tightness,
+            widths=table[-1].copy(),
         )  # fmt: skip
+        self.tightness = steps.tightness
         self.free, self.table = free, table
 
     def bound_pushes(self, section: Section, rho: float) -> None:
@@ -79,11 +80,8 @@ class HeldSteps(LSteps):
 
 def with_widths(setting: Setting, field: VectorField) -> LSteps:
     """The setting's L-steps, of this field, with what an input is off: nothing yet."""
-    steps, policy = setting.steps, setting.policy
-    return LSteps(
-        field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-        widths=np.zeros((len(policy.t) - 1, field.m)), tightness=steps.tightness,
-    )  # fmt: skip
+    policy = setting.policy
+    return setting.steps.like(field, policy, np.zeros((len(policy.t) - 1, field.m)))
 
 
 def changes_by_size(setting: Setting, expansion: Expansion | None) -> dict[float, Changes]:
@@ -91,8 +89,8 @@ def changes_by_size(setting: Setting, expansion: Expansion | None) -> dict[float
 
     A key is a copy's half-widths over those of the free funnel.
     """
-    free, policy, P = setting.free, setting.policy, setting.P
-    assert free is not None  # a search for a hold begins without one
+    assert setting.hold is not None  # a search for a hold begins with what is found without one
+    free, policy, P = setting.hold.free, setting.policy, setting.P
     found = {}
     for size in (1.0,) if expansion is None else EXPANDED:
         rho, field = size**2 * free, setting.steps.field
@@ -128,8 +126,8 @@ def held_sweep(
 
     table: see `HeldSteps`. caps: (K,) that ρ keeps below. Raises Infeasible.
     """
-    free, policy, P = setting.free, setting.policy, setting.P
-    assert free is not None  # a search for a hold begins without one
+    assert setting.hold is not None  # a search for a hold begins with what is found without one
+    free, policy, P = setting.hold.free, setting.policy, setting.P
     steps = HeldSteps(setting.steps, setting, free, table)
     rho_final = min(setting.rho_final, float(caps[-1]))
     margin = setting.margin(rho_final)

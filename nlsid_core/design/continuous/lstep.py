@@ -5,6 +5,7 @@ depend on ρ̇. Source: thesis (6.4), in the sphere form.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -22,6 +23,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
 MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
+TOLERANCE = 1e-5  # of the spread of -Ẇ/ρ: margins are 50 times as much
 NO_PUSH = 1e-12  # of |x̄'Pg|: less moves nothing, and κ stays finite
 FINENESS = 64.0  # of κ's digits: few, for the kernel
 
@@ -121,9 +123,7 @@ class LSteps:
         *,
         nonlinear: tuple[int, ...] | None = None,
         pushed: bool | None = None,
-        tolerance: float = 1e-5,
         widths: FloatArray | None = None,
-        tightness: FloatArray | None = None,
     ) -> None:
         refuse_degree(field)
         self.field = field
@@ -133,11 +133,10 @@ class LSteps:
         self.nonlinear = taken if nonlinear is None else nonlinear
         self.local: dict[int, Cubic] = {}
         self._pushes: dict[int, FloatArray] = {}
-        self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
         self.widths = widths
-        self.tightness = tightness
+        self.tightness: FloatArray | None = None
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
         self._reduced = not limited
@@ -148,6 +147,23 @@ class LSteps:
             self.vertices = field.uncertain.mean(axis=1)[None]
         else:
             self.vertices = field.vertices()
+
+    def like(
+        self, field: VectorField, policy: ContinuousPolicy, widths: FloatArray | None = None
+    ) -> "LSteps":
+        """L-steps of another field and policy that take states and pushes alike."""
+        made = LSteps(field, policy, nonlinear=self.nonlinear, pushed=self.pushed, widths=widths)
+        made.tightness = self.tightness
+        return made
+
+    def as_it_is(self) -> "LSteps":
+        """A copy that keeps what the search changes."""
+        kept = copy(self)
+        kept.local = dict(self.local)
+        kept.kappa, kept.widths = (
+            None if part is None else part.copy() for part in (self.kappa, self.widths)
+        )
+        return kept
 
     @cached_property
     def program(self) -> SphereProgram | LineProgram:
@@ -290,7 +306,7 @@ class LSteps:
         if len(self.limits):
             tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
             g = g - products
-        solved = self.program.solve(g, tolerance=self.tolerance, start=start, enough=enough)
+        solved = self.program.solve(g, tolerance=TOLERANCE, start=start, enough=enough)
         return replace(solved, tau=tau)
 
     def predicted(

@@ -3,10 +3,8 @@
 Everything that can be wrong with what a user gives is found here, before anything slow.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -23,6 +21,7 @@ from nlsid_core.design.continuous.lstep import (
     section_at,
 )
 from nlsid_core.design.continuous.pieces import affine
+from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
 from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
 from nlsid_core.dynamics import Nominal, Rates, VectorField
@@ -35,7 +34,6 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 
 MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its own
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
-START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 DECAY = 3.0  # c of the thesis's first guess for the satellite
@@ -45,28 +43,12 @@ AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀
 
 
 @dataclass(frozen=True, eq=False)
-class Goal:
-    """{x : |x - centre|²_P ≤ 1}, the set to end in. centre: (n,), P: (n, n) ≻ 0."""
-
-    centre: FloatArray
-    P: FloatArray
-
-    @classmethod
-    def start_of(cls, funnel: ContinuousFunnel) -> "Goal":
-        """A little less than where `funnel` starts, so that the two compose."""
-        P = START_ROOM * funnel.P[0] / funnel.rho[0]
-        return cls(funnel.x.ends()[0], np.asarray((P + P.T) / 2))
-
-
-@dataclass(frozen=True, eq=False)
 class Setting:
     """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it.
 
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not.
-    rates: (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n)
-    and R (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved.
-    free: (K,) ρ as it was found without the hold, of which nothing may be proved.
+    weights: Q (n, n) and R (m, m) of the feedback.
     """
 
     steps: LSteps
@@ -77,9 +59,6 @@ class Setting:
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
-    rates: FloatArray | None = None
-    needed: float = 0.0
-    free: FloatArray | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
@@ -92,11 +71,12 @@ class Setting:
 
         basis: (k, n) of the proof's pieces.
         """
-        if self.hold is None or not self.hold.period or self.rates is None:
+        if self.hold is None or not self.hold.period or self.hold.rates is None:
             return {}
+        rates = self.hold.rates
         return {
-            "rates": self.rates.tolist(),
-            "rate_pieces": prove_rates(self.steps, self.policy, funnel, self.rates, basis),
+            "rates": rates.tolist(),
+            "rate_pieces": prove_rates(self.steps, self.policy, funnel, rates, basis),
             "sides": affine(funnel.n).tolist(),
         }
 
@@ -112,41 +92,33 @@ class Setting:
                 self.steps.local[last] = around((LOWEST * rho, rho))
         self.steps.bound_pushes(end, rho)
         own = MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
-        return max(own, self.needed)
+        return own if self.hold is None else max(own, self.hold.needed)
 
 
-def prepare(
-    dynamics: VectorField | Callable[..., Any],
-    nominal: Nominal,
-    *,
-    goal: Goal | ArrayLike | None,
-    policy: ContinuousPolicy | None,
-    Q: ArrayLike | None,
-    R: ArrayLike | None,
-    gain: str,
-    limits: ArrayLike | None = None,
-    uncertain: ArrayLike | None = None,
-    hold: float | Literal["largest"] | None = None,
-    error: ArrayLike | None = None,
-) -> Setting:
-    """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
-    sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
-    held = Hold.of(hold, error, sizes[0])
-    field, expansion = _dynamics(
-        dynamics, nominal, sizes, uncertain, held, fixed=policy is not None
-    )
+def prepare(problem: ContinuousTracking) -> Setting:
+    """The problem, checked and completed; see `design_funnel` for what is raised."""
+    nominal = problem.nominal
+    held = Hold.of(problem.hold, problem.error, nominal.x.control.shape[2])
+    field, expansion = _dynamics(problem, held)
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
-    wanted = _wanted_goal(goal, nominal, field.n)
+    wanted = _wanted_goal(problem.goal, nominal, field.n)
     weights = default_weights(field, nominal, wanted)
-    Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
-    R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
-    gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
-    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
+    Q = definite(weights[0] if problem.Q is None else problem.Q, field.n, "Q", strict=False)
+    R = definite(weights[1] if problem.R is None else problem.R, field.m, "R", strict=True)
+    final = _final_shape(field, nominal, wanted, (Q, R))
+    if problem.policy is None:
+        jumps = problem.gain == "constant" and problem.hold is not None  # a held one may not
+        gain = "linear" if jumps else problem.gain
+        tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+    else:
+        refuse_other(problem.policy, field, nominal)
+        P = lyapunov(field, problem.policy, Q=Q, P_final=final)
+        tracking = Tracking(problem.policy, P)
     policy, S = tracking.policy, tracking.S
-    if limits is not None:
-        policy = replace(policy, limits=limits_of(limits, field.m))
+    if problem.limits is not None:
+        policy = replace(policy, limits=limits_of(problem.limits, field.m))
     refuse_saturated(policy)
     pushed = field.only_pushes and (field.is_pushed or expansion is not None)
     nonlinear = None
@@ -191,19 +163,15 @@ def limits_of(limits: ArrayLike, m: int) -> FloatArray:
 
 
 def _dynamics(
-    dynamics: VectorField | Callable[..., Any],
-    nominal: Nominal,
-    sizes: tuple[int, int],
-    uncertain: ArrayLike | None,
-    held: Hold | None,
-    *,
-    fixed: bool,
+    problem: ContinuousTracking, held: Hold | None
 ) -> tuple[VectorField, Expansion | None]:
     """The field; or, where it is no polynomial of a degree that fits, its linearisation.
 
-    A hold needs fields that are affine in each input, and cubics at most. fixed: whether the motion
-    keeps its knots, else it gets more where they are too far apart to expand anything.
+    A hold needs fields that are affine in each input, and cubics at most. Without a given policy
+    the motion gets more knots where they are too far apart to expand anything.
     """
+    dynamics, nominal, uncertain = problem.dynamics, problem.nominal, problem.uncertain
+    sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
     if isinstance(dynamics, VectorField):
         if uncertain is not None:
             raise DataError("a vector field states its own bounds of w: leave out `uncertain`")
@@ -217,7 +185,9 @@ def _dynamics(
     except NotPolynomial:
         pass
     rates = Rates.of(dynamics, *sizes, uncertain, affine=held is not None)
-    expansion = Expansion(rates, nominal).refined(len(nominal.t) if fixed else MOST_KNOTS)
+    expansion = Expansion(rates, nominal).refined(
+        MOST_KNOTS if problem.policy is None else len(nominal.t)
+    )
     return expansion.linear(), expansion
 
 
@@ -287,37 +257,34 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
     return wanted
 
 
-def _tracking(
+def _final_shape(
     field: VectorField,
     nominal: Nominal,
     goal: Goal | None,
-    policy: ContinuousPolicy | None,
-    Q: FloatArray,
-    R: FloatArray,
-    gain: str,
-) -> Tracking:
-    """ContinuousPolicy and P(t): of the LQR, or the given policy with its Lyapunov equation."""
+    weights: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """P(t_f): a little more than the goal's, or of the LQR that holds at the end."""
     if goal is not None:
-        final = GOAL_ROOM * goal.P
-    else:
-        A, B = field.jacobians(float(nominal.t[-1]), nominal.x.ends()[-1], nominal.u.ends()[-1])
-        try:
-            final = solve_continuous_are(A, B, Q, R)
-            final = (final + final.T) / 2
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise Infeasible(
-                "the linearisation at the nominal's end cannot be stabilised by any gain "
-                f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal "
-                "and a policy."
-            ) from error
-    if policy is None:
-        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+        return GOAL_ROOM * goal.P
+    A, B = field.jacobians(float(nominal.t[-1]), nominal.x.ends()[-1], nominal.u.ends()[-1])
+    try:
+        final = solve_continuous_are(A, B, *weights)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise Infeasible(
+            "the linearisation at the nominal's end cannot be stabilised by any gain "
+            f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal "
+            "and a policy."
+        ) from error
+    return np.asarray((final + final.T) / 2)
+
+
+def refuse_other(policy: ContinuousPolicy, field: VectorField, nominal: Nominal) -> None:
+    """Raise DataError unless the policy was made for these dynamics and this motion."""
     if policy.vector_field != files.digest(field.document()):
         raise DataError("the policy was made for other dynamics")
     same = np.array_equal(policy.x.control, nominal.x.control)
     if not same or not np.array_equal(policy.t, nominal.t):
         raise DataError("the policy is around another nominal")
-    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
 
 
 def _kept(

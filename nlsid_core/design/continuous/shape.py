@@ -5,6 +5,7 @@ What holds at knots alone proves nothing: the last funnel that can be proved for
 Source: thesis (6.8).
 """
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -97,7 +98,6 @@ def enlarge_shape(
     funnel: ContinuousFunnel,
     *,
     margin: float,
-    objective: str = "volume",
     iterations: int = MAX_ITERATIONS,
     executor: Executor | None = None,
     progress: Progress = silent,
@@ -106,18 +106,16 @@ def enlarge_shape(
 
     The funnel stays where the dynamics are valid: there I + D ⪰ rr' for all `validity_rows`.
 
-    objective: "volume", linearised within a trust region, or "reference", the thesis's largest
-    scaled copies of the ellipsoids it starts from. Raises Infeasible if none could be proved.
+    The volume is linearised within a trust region. Raises Infeasible if none could be proved.
     """
     margin *= SHAPE_MARGIN
     volume_before, kappa = funnel.volume_integral(), steps.kappa
     steps.kappa = None if kappa is None else kappa.copy()
     present = _normalised(steps, policy, funnel, ROOM * margin)
-    first = present.P
     found = [_Kept(present, steps.kappa)]
     ends = solve_ends(steps, policy, present, executor=executor)
     for iteration in range(iterations):
-        enlarged = _enlarged(steps, policy, present, ends, margin, objective, first, executor)
+        enlarged = _enlarged(steps, policy, present, ends, margin, executor)
         if enlarged is None:
             break
         candidate, ends = enlarged
@@ -171,18 +169,27 @@ def solve_ends(
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     *,
+    near: Sequence[Ends] | None = None,
     executor: Executor | None = None,
 ) -> list[Ends]:
-    """L-steps at both ends of every interval; they are independent, and an executor shares them."""
+    """L-steps at both ends of every interval; they are independent, and an executor shares them.
+
+    near: those of a funnel that is much the same.
+    """
     solve = partial(_ends_of, steps, policy, funnel)
     intervals = range(len(funnel.t) - 1)
-    return list(map(solve, intervals) if executor is None else executor.map(solve, intervals))
+    starts = [None] * len(intervals) if near is None else near
+    return list((map if executor is None else executor.map)(solve, intervals, starts))
 
 
-def _ends_of(steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, k: int) -> Ends:
+def _ends_of(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, k: int, near: Ends | None
+) -> Ends:
     start, end = (section_at(steps, policy, funnel.P, k, float(s)) for s in (0, 1))
-    first = steps.solve(start, float(funnel.rho[k]))
-    return Ends(first, steps.solve(end, float(funnel.rho[k + 1]), first))
+    at_start = None if near is None else near.start
+    first = steps.solve(start, float(funnel.rho[k]), at_start)
+    at_end = first if near is None else near.end
+    return Ends(first, steps.solve(end, float(funnel.rho[k + 1]), at_end))
 
 
 def _enlarged(
@@ -191,8 +198,6 @@ def _enlarged(
     funnel: ContinuousFunnel,
     ends: list[Ends],
     margin: float,
-    objective: str,
-    reference: FloatArray,
     executor: Executor | None,
 ) -> tuple[ContinuousFunnel, list[Ends]] | None:
     """One V-step for all knots but the last, with its L-steps; None if none was found that holds.
@@ -205,12 +210,9 @@ def _enlarged(
     share = (np.r_[h, 0] + np.r_[0, h])[:-1] / 2
     volumes = np.array([funnel.volume(float(t)) for t in funnel.t[:-1]])
     weights = share * volumes / (share * volumes).max()
-    copies = None
-    if objective == "reference":
-        copies = np.array([T.T @ P @ T for T, P in zip(forms.frames, reference[:-1], strict=False)])
     try:
         D = improve(forms.samples, forms.pairs, len(weights), proof_basis(steps.program),
-                    weights=weights, margins=forms.margins, trust=TRUST, reference=copies,
+                    weights=weights, margins=forms.margins, trust=TRUST,
                     bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)])  # fmt: skip
     except SolverError:
         return None
@@ -225,7 +227,7 @@ def _enlarged(
             steps.kappa = kappa.copy()
             for k in range(len(kappa)):
                 steps.bound_pushes(section_at(steps, policy, moved, k, 1.0), 1.0)
-        ends = solve_ends(steps, policy, candidate, executor=executor)
+        ends = solve_ends(steps, policy, candidate, near=ends, executor=executor)
         if min(s.m for pair in ends for s in (*pair.start, *pair.end)) >= margin / 4:  # ρ = 1
             return candidate, ends
     steps.kappa = kappa

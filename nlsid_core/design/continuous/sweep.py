@@ -6,12 +6,13 @@ follows from ρ_{k+1}: no alternation, no objective.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.diagnosis import NoFunnel, diagnosed
+from nlsid_core.design.continuous.diagnosis import Diagnosis, NoFunnel, diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
@@ -63,7 +64,10 @@ def sweep_rho(
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))
         if cap <= LOWEST * rho[k + 1]:  # ρ̇ cannot be large enough for this end
-            raise NoFunnel(diagnosed(steps, [end], [rho[k + 1]], rho[k + 1] / h))
+            after = float(rho[k + 1])
+            raise NoFunnel(
+                end.t, partial(diagnosed, steps.as_it_is(), [end], [after], after / h), phi - margin
+            )
         if caps is not None:
             cap = min(cap, float(caps[k]))
         for section in between:
@@ -127,9 +131,14 @@ def _largest(
             infeasible = min(infeasible, rho)
         duals, exact = found, True
     if best is None:
-        levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
-        rho = max(levels, key=lambda r: slack(r, steps.predicted(section, here(r), duals)))
-        raise NoFunnel(diagnosed(steps, [section], [here(rho)], (after - rho) / h))
+        kept = steps.as_it_is()
+
+        def why() -> Diagnosis:
+            levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
+            rho = max(levels, key=lambda r: slack(r, kept.predicted(section, here(r), duals)))
+            return diagnosed(kept, [section], [here(rho)], (after - rho) / h)
+
+        raise NoFunnel(section.t, why)
     return feasible, best
 
 

@@ -128,22 +128,20 @@ def improve(
     margins: list[float],
     trust: float,
     bounds: Sequence[FloatArray] = (),
-    reference: FloatArray | None = None,
 ) -> FloatArray:
     """D (free, n, n) for the free knots 0..free-1; D = 0 for knots beyond.
 
     samples and knots: c at each sample, and (own, other) knot, neighbours. basis: (k, n) exponents
     of v. margins: what c keeps above zero at each sample, in 1/s. weights: (free,) of each knot's
     volume. bounds: per free knot (R, n) rows r: |r'z| ≤ 1 in the set, I + D ⪰ rr'.
-    reference: (free, n, n) matrices of the reference ellipsoids in the knots' coordinates: then the
-    objective is Σ weights·r with I + D ⪯ r·reference; else the linearised volume. trust: of |D|.
+    trust: of |D|; the linearised volume is what is enlarged.
     Raises SolverError if it ends at no point that keeps the margins.
     """
     n, d = basis.shape[1], samples[0].own.shape[1]
     p, q = np.triu_indices(n)
     units = np.zeros((d, n, n))
     units[range(d), p, q] = units[range(d), q, p] = 1.0
-    # F (free, L, 1 + unknowns, n, n): trust·I ± D, and r·reference - I - D.
+    # F (free, L, 1 + unknowns, n, n): trust·I ± D, and I + D - rr'.
     rows = [np.concatenate([trust * np.eye(n)[None], sign * units]) for sign in (1.0, -1.0)]
     F = np.repeat(np.array(rows)[None], free, axis=0)
     most = max((len(r) for r in bounds), default=0)
@@ -153,15 +151,6 @@ def improve(
     F = np.concatenate([F, inside], axis=1)
     cost = np.tile(np.trace(units, axis1=1, axis2=2), (free, 1))
     x = np.zeros((free, d))
-    if reference is not None:
-        copies = np.concatenate([-np.eye(n)[None], -units])
-        copies = np.repeat(np.concatenate([copies, np.zeros((1, n, n))])[None], free, axis=0)
-        copies[:, -1] = reference
-        F = np.pad(F, ((0, 0), (0, 0), (0, 1), (0, 0), (0, 0)))
-        F = np.concatenate([F, copies[:, None]], axis=1)
-        cost = np.pad(np.zeros_like(cost), ((0, 0), (0, 1)), constant_values=1.0)
-        x = np.pad(x, ((0, 0), (0, 1)))
-        x[:, -1] = 2.0 / np.linalg.eigvalsh(reference)[:, 0]
     V, table = _at_points(basis.tobytes(), n)
     places = np.array(knots)
     targets = np.array([s.constant for s in samples])

@@ -12,6 +12,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design.problems import SampledTracking
 from nlsid_core.design.sampled.closed_loop import Frame, half_widths
 from nlsid_core.design.sampled.explicit import ExplicitStep
 from nlsid_core.design.sampled.implicit import ImplicitFunnelStep
@@ -57,23 +58,15 @@ def frame(model: MeasuredState, policy: SampledPolicy, feedback: Feedback) -> Fr
     return Frame(S, T, np.array(A), np.array(cap))
 
 
-def design_state_funnel(
-    model: MeasuredState,
-    policy: SampledPolicy,
-    feedback: Feedback,
-    *,
-    assumption: DisturbanceAssumption,
-    goal: float | None = None,
-    start: float | None = None,
-    progress: Progress = silent,
-) -> TrackingDesign:
-    """The largest inlet that reaches the goal, and the tube from it; see `SampledTracking`.
+def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent) -> TrackingDesign:
+    """The largest inlet that reaches the goal, and the tube from it.
 
     Raises CertificateRejected if the assumption is not one a checker would accept,
     Infeasible if the disturbance leaves no inlet, DataError if `start` is beyond the inlet.
     """
+    model, policy, assumption = problem.model, problem.policy, problem.assumption
     refuse_assumption(model, assumption)
-    norms = frame(model, policy, feedback)
+    norms = frame(model, policy, problem.feedback)
     cap = norms.cap - assumption.widens
     if np.min(cap) <= 0:
         k = int(np.argmin(cap))
@@ -86,9 +79,9 @@ def design_state_funnel(
     steps = [kind.at(model, policy, norms, k, assumption) for k in range(len(policy))]
     for k, step in enumerate(steps):
         cap[k] = step.largest(float(cap[k]))
-    inlet, to_goal = _inlet(steps, cap, goal, progress)
+    inlet, to_goal = _inlet(steps, cap, problem.goal, progress)
     roots = ROOTS * (inlet + assumption.widens)
-    first = float(inlet[0]) if start is None else start
+    first = float(inlet[0]) if problem.start is None else problem.start
     if not 0 < first <= inlet[0]:
         raise DataError(
             f"start {first:.4g} should be positive and at most the inlet {inlet[0]:.4g}"

@@ -43,22 +43,20 @@ def robust_simulation_error(
     iterations: int = 40,
     tolerance: float = 1e-6,
     steps: int | None = None,
-    exact_first: bool = False,
 ) -> Iterator[Iterate]:
     """Yield the minimiser of each bound, first to last.
 
     start: left parameters at which the first bound is exact (None: the first bound is that of
     G_m = I). Stops after `iterations` bounds or when J falls by less than `tolerance` of itself.
     steps: of Newton's method for each bound, at most (None: to its minimum): J goes down all the
-    same, as each bound is exact where it begins. exact_first: the first one to its minimum.
+    same, as each bound is exact where it begins.
     Raises SolverError if Newton's method cannot go on.
     """
     linearised_at = start
     previous = float("inf")
-    for number in range(iterations):
+    for _ in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at
-        limit = None if exact_first and number == 0 else steps
-        found = minimise(Bound(rows, linearised_at), start, steps=limit)
+        found = minimise(Bound(rows, linearised_at), start, steps=steps)
         point = found.point
         yield Iterate(point.theta, point.p, point.J, found.on_boundary)
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:

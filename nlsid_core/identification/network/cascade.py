@@ -1,19 +1,17 @@
 """`identify_block_cascade`: datasets in, a stable block cascade with its proof out.
 
-Random starts on a part of the data, then all of it; the number of phases, of knots and the
-smoothing are chosen by the simulation error on validation data.
+Random starts on a part of the data, then all of it; the number of phases and of knots are
+chosen by the simulation error on validation data.
 """
 
-import time
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
-from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.identification.fit import Step
 from nlsid_core.identification.network.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
 from nlsid_core.identification.network.cascade_starts import (
     best_start,
@@ -21,115 +19,45 @@ from nlsid_core.identification.network.cascade_starts import (
     with_intervals,
     with_phases,
 )
+from nlsid_core.identification.network.options import FilterMapFilter, Network
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import BlockCascade
 from nlsid_core.models.signal import signals_of
-from nlsid_core.options import require_one_of, require_whole
 from nlsid_core.progress import Progress, silent
 
 STEPS = 40
 TOLERANCE = 1e-3  # relative gain of a step below which a choice of knots and phases is judged
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
-MAX_PHASES_TRIED = 4
-MOST_STARTS, MOST_SAMPLES = 1000, 2**31
+START_SAMPLES = 10_000  # of each trial, for the starts
+SMOOTHING = 1e-8  # of the spline
 START_COEFFICIENTS = 15  # of f, at the start
-
-Begin = Literal["measured", "rest"]
-
-
-@dataclass(frozen=True)
-class CascadeChoice:
-    """One choice of phases, knot intervals and smoothing; rms simulation errors in y's unit."""
-
-    phases: int
-    intervals: int
-    smoothing: float
-    train_rms: float
-    validation_rms: float
-    seconds: float
-
-    def __str__(self) -> str:
-        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
-        return f"{phases}, {self.intervals} intervals, smoothing {self.smoothing:.0e}"
-
-
-@dataclass(frozen=True)
-class BlockCascadeClass:
-    """A filter, a static nonlinearity, a filter. Source: `theory-cascades-and-moments.md`.
-
-    orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models.
-    phases: tried, each 1 to 4; several presume an input without power near half the sampling
-    frequency. intervals: of knots, tried, ascending, while that helps. smoothing: of the spline,
-    tried; validation data choose all three. starts: random ones, 1 to 1000. start_samples: of each
-    trial, for the starts. seed: of the starts. begin: how trials begin, "measured" (in motion,
-    `BlockCascade.simulate` from the first measured outputs) or "rest" (from zero states).
-    """
-
-    orders: tuple[int, int] = (3, 3)
-    phases: tuple[int, ...] = (1, 2)
-    intervals: tuple[int, ...] = (24, 48, 96)
-    smoothing: tuple[float, ...] = (1e-8,)
-    starts: int = 12
-    start_samples: int = 10_000
-    seed: int = 0
-    begin: Begin = "measured"
-    kind: ClassVar[type[BlockCascade]] = BlockCascade
-
-    def __post_init__(self) -> None:
-        if len(self.orders) != 2 or min(self.orders) < 0 or not 1 <= max(self.orders) <= MOST_LAGS:
-            allowed = f"two whole numbers from 0 to {MOST_LAGS}, not both zero"
-            raise OptionError("orders", self.orders, allowed)
-        if not self.phases or not all(1 <= M <= MAX_PHASES_TRIED for M in self.phases):
-            raise OptionError("phases", self.phases, f"between 1 and {MAX_PHASES_TRIED} each")
-        if not self.intervals or min(self.intervals) < 1:
-            raise OptionError("intervals", self.intervals, "at least 1 each")
-        if not self.smoothing or not min(self.smoothing) >= 0:
-            raise OptionError("smoothing", self.smoothing, "0 or more each")
-        require_whole(self, "starts", 1, MOST_STARTS)
-        require_whole(self, "start_samples", 1, MOST_SAMPLES)
-        require_whole(self, "seed", 0, MOST_SAMPLES)
-        require_one_of(self, "begin", get_args(Begin))
 
 
 @dataclass(frozen=True, eq=False)
-class CascadeFit:
-    """The model, its proof, the choice that made it, and all choices that were tried.
+class Choice:
+    """What was fitted with a number of phases and of knots, and its rms errors in y's unit."""
 
-    again: rms error on all that the choice was fitted to again, in y's unit (None: it was not).
-    """
-
-    model: BlockCascade
-    proof: StabilityProof
-    chosen: CascadeChoice
-    choices: tuple[CascadeChoice, ...]
-    seconds: float
-    again: float | None = None
+    parameters: Parameters
+    train_rms: float
+    validation_rms: float
 
     def __str__(self) -> str:
-        unit = self.model.y.unit
-        rows = [
-            f"  {c}: train "
-            f"{c.train_rms:.4g} {unit}, validation {c.validation_rms:.4g} {unit}, {c.seconds:.1f} s"
-            for c in self.choices
-        ]
-        head = (
-            f"block cascade of orders {len(self.model.a1)} and {len(self.model.a2)}, proved "
-            f"stable at rate {self.proof.rate:.4f}, {self.seconds:.1f} s"
-        )
-        return "\n".join([head, *rows])
+        M = len(self.parameters.b1)
+        phases = "1 phase" if M == 1 else f"{M} phases"
+        return f"{phases}, {self.parameters.f.intervals} intervals"
 
 
 def identify_block_cascade(
     train: Dataset,
     validation: Dataset,
-    model_class: BlockCascadeClass,
+    model_class: Network[FilterMapFilter],
     *,
     whole: Dataset | None = None,
     transient: int = 0,
     slowest: float = MAX_RADIUS,
     progress: Progress = silent,
-) -> CascadeFit:
-    """Identify a `BlockCascade` by simulation error, proved incrementally stable.
+) -> tuple[BlockCascade, StabilityProof, tuple[Step, ...]]:
+    """A `BlockCascade` by simulation error, proved stable, and the rms errors of the choices.
 
     whole: trials to which what was chosen is fitted again (None: it stays fitted to `train`).
     transient: samples at the start of each trajectory that are simulated and not scored. slowest:
@@ -137,62 +65,61 @@ def identify_block_cascade(
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
     Infeasible if the minimum found has no proof.
     """
-    started = time.perf_counter()
-    orders, phases, intervals = model_class.orders, model_class.phases, model_class.intervals
-    smoothing, starts = model_class.smoothing, model_class.starts
+    made = model_class.structure
+    orders, phases, intervals, starts = made.orders, made.phases, made.intervals, made.starts
     scales = _scales(train)
     fitted, judged = (_trials(data, scales, transient, model_class) for data in (train, validation))
     needed = 2 * (sum(orders) + 2) + START_COEFFICIENTS
     if sum(len(trial.y) - trial.transient for trial in fitted) < needed:
         raise DataError(f"fewer than {needed} scored samples for orders {orders}; give more data")
     first = best_start(
-        tuple(_shortened(trial, model_class.start_samples) for trial in fitted),
+        tuple(_shortened(trial, START_SAMPLES) for trial in fitted),
         orders,
-        smoothing=smoothing[0],
+        smoothing=SMOOTHING,
         starts=starts,
         rng=np.random.default_rng(model_class.seed),
         radius=slowest,
     )
-    total = len(phases) * len(intervals) * len(smoothing) + 2
+    total = len(phases) * len(intervals) + 2
     progress(f"best of {starts} starts", 1 / total)
     single = minimise(
         fitted,
         with_intervals(first, fitted, intervals[0]),
-        smoothing=smoothing[0],
+        smoothing=SMOOTHING,
         steps=STEPS,
         tolerance=TOLERANCE,
         radius=slowest,
     ).parameters
-    tried: list[tuple[CascadeChoice, Parameters]] = []
+    tried: list[Choice] = []
     for M in phases:
         base = single if M == 1 else with_phases(single, fitted, M)
         coarser = float("inf")
         for K in intervals:
             base = with_intervals(base, fitted, K)
-            for weight in smoothing:
-                tried.append(_choice(base, fitted, judged, scales[1], weight, radius=slowest))
-                progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
-            finer = min(tried[-len(smoothing) :], key=_validation_error)
-            if _validation_error(finer) > coarser:
+            finer = _choice(base, fitted, judged, scales[1], radius=slowest)
+            tried.append(finer)
+            progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
+            if finer.validation_rms > coarser:
                 break  # finer knots still would fit noise
-            coarser, base = finer[0].validation_rms, finer[1]
-    chosen, parameters = min(tried, key=_validation_error)
+            coarser, base = finer.validation_rms, finer.parameters
+    history = [Step(str(choice), choice.validation_rms) for choice in tried]
+    best = min(tried, key=lambda choice: choice.validation_rms)
     polished = _choice(
-        parameters, fitted, judged, scales[1], chosen.smoothing,
+        best.parameters, fitted, judged, scales[1],
         steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
     )  # fmt: skip
-    tried.append(polished)
-    chosen, parameters = min(tried, key=_validation_error)
-    again = None
+    history.append(Step(f"{polished}, minimised further", polished.validation_rms))
+    parameters = min(best, polished, key=lambda choice: choice.validation_rms).parameters
     if whole is not None:
         progress("fitted to all trials", 1.0 - 1.0 / total)
         all_trials = _trials(whole, scales, transient, model_class)
-        refitted, parameters = _choice(
-            with_intervals(parameters, all_trials, chosen.intervals), all_trials, all_trials,
-            scales[1], chosen.smoothing,
+        refitted = _choice(
+            with_intervals(parameters, all_trials, parameters.f.intervals), all_trials, all_trials,
+            scales[1],
             steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
         )  # fmt: skip
-        again = refitted.train_rms
+        parameters = refitted.parameters
+        history.append(Step("fitted to all trials, training error", refitted.train_rms))
     progress("minimised further", 1.0)
     model = _model(parameters, scales, train)
     proof = prove_stability(model)
@@ -202,9 +129,7 @@ def identify_block_cascade(
             f"no proof for the minimum found (slowest pole {radius:.6f}); try lower orders, "
             "more starts or more data"
         )
-    return CascadeFit(
-        model, proof, chosen, tuple(c for c, _ in tried), time.perf_counter() - started, again
-    )
+    return model, proof, tuple(history)
 
 
 def _choice(
@@ -212,29 +137,16 @@ def _choice(
     fitted: tuple[Trial, ...],
     judged: tuple[Trial, ...],
     unit: float,
-    smoothing: float,
     *,
     radius: float,
     steps: int = STEPS,
     tolerance: float = TOLERANCE,
-) -> tuple[CascadeChoice, Parameters]:
-    started = time.perf_counter()
+) -> Choice:
     found = minimise(
-        fitted, start, smoothing=smoothing, steps=steps, tolerance=tolerance, radius=radius
+        fitted, start, smoothing=SMOOTHING, steps=steps, tolerance=tolerance, radius=radius
     )
-    choice = CascadeChoice(
-        phases=len(start.b1),
-        intervals=start.f.intervals,
-        smoothing=smoothing,
-        train_rms=unit * found.cost**0.5,
-        validation_rms=unit * mean_square(found.parameters, judged) ** 0.5,
-        seconds=time.perf_counter() - started,
-    )
-    return choice, found.parameters
-
-
-def _validation_error(entry: tuple[CascadeChoice, Parameters]) -> float:
-    return entry[0].validation_rms
+    validation = mean_square(found.parameters, judged)
+    return Choice(found.parameters, unit * found.cost**0.5, unit * validation**0.5)
 
 
 def _scales(train: Dataset) -> tuple[float, float]:
@@ -252,10 +164,15 @@ def _scales(train: Dataset) -> tuple[float, float]:
 
 
 def _trials(
-    data: Dataset, scales: tuple[float, float], transient: int, model_class: BlockCascadeClass
+    data: Dataset,
+    scales: tuple[float, float],
+    transient: int,
+    model_class: Network[FilterMapFilter],
 ) -> tuple[Trial, ...]:
-    from_rest = model_class.begin == "rest"
-    skipped = transient if from_rest else max(transient, model_class.orders[1])  # given, not made
+    from_rest = model_class.structure.begin == "rest"
+    skipped = (
+        transient if from_rest else max(transient, model_class.structure.orders[1])
+    )  # given, not made
     for trajectory in data:
         if transient < 0 or len(trajectory) <= 3 * skipped:
             raise DataError(

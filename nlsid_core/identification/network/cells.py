@@ -12,7 +12,6 @@ with exact sensitivities: with all signals known they solve one bidiagonal syste
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
-from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -21,14 +20,14 @@ from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification.fit import Step
+from nlsid_core.identification.network.options import CellRow, Network
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from nlsid_core.models.signal import signals_of
-from nlsid_core.options import require_one_of, require_whole
 
-MOST_CELLS, MOST_INTERVALS, MOST_START_SAMPLES = 3, 30, 10_000
+SMOOTHING = 1e-6  # of slopes of neighbouring intervals
 POLES = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)  # of the cells, at the start
 LEAST_FRICTION = 1e-6
 FRICTIONS = (0.1, 0.5)  # in spreads of y, what it takes from y at rest, at the start
@@ -37,35 +36,6 @@ STARTS, KEPT = 3, 2  # combinations of poles; minima that are refined
 START_SAMPLES, START_STEPS, START_INTERVALS = 5000, 20, 2
 TOLERANCE = 1e-6
 DIVERGED = 1e6  # a state in spreads: what the minimiser should not visit
-
-
-Limit = Literal["top", "friction", "none"]
-
-
-@dataclass(frozen=True)
-class CellClass:
-    """Scalar states in a row, each contracting by a map of its own; the last is the output.
-
-    cells: 1 to 3, the others hidden. intervals: between the knots of a map, 1 to 30. limit: of the
-    states, "top" (cells flow over into the next), "friction" (dry, of the output) or "none".
-    start_samples: at the start of a trial, that show its first state and are not scored, 1 to
-    10000. smoothing: of slopes of neighbouring intervals.
-    """
-
-    cells: int = 2
-    intervals: int = 6
-    limit: Limit = "top"
-    start_samples: int = 20
-    smoothing: float = 1e-6
-    kind: ClassVar[type[CellNetwork]] = CellNetwork
-
-    def __post_init__(self) -> None:
-        require_whole(self, "cells", 1, MOST_CELLS)
-        require_whole(self, "intervals", 1, MOST_INTERVALS)
-        require_whole(self, "start_samples", 1, MOST_START_SAMPLES)
-        require_one_of(self, "limit", get_args(Limit))
-        if not 0.0 <= self.smoothing < np.inf:
-            raise OptionError("smoothing", self.smoothing, "0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +195,7 @@ class Cascade:
 
 
 def identify_cells(
-    train: Dataset, model_class: CellClass, *, transient: int = 0, slowest: float, steps: int
+    train: Dataset, model_class: Network[CellRow], *, transient: int = 0, slowest: float, steps: int
 ) -> tuple[CellNetwork, StabilityProof, tuple[Step, ...]]:
     """A `CellNetwork` by simulation error, proved stable, and the rms errors of the search's steps.
 
@@ -253,23 +223,28 @@ def identify_cells(
     ]
     short = _shortened(trials)
     tried, done = [], []
-    for poles in _best_poles(short, model_class.cells, slowest):
-        limits = list(product(TOPS, repeat=model_class.cells - 1))
-        if model_class.limit != "top":
-            limits = [(h,) for h in FRICTIONS] if model_class.limit == "friction" else [()]
+    for poles in _best_poles(short, model_class.structure.cells, slowest):
+        limits = list(product(TOPS, repeat=model_class.structure.cells - 1))
+        if model_class.structure.limit != "top":
+            limits = (
+                [(h,) for h in FRICTIONS] if model_class.structure.limit == "friction" else [()]
+            )
         for levels in limits:
             start = _start(short, poles, levels, model_class, -scales[2] / scales[3])
-            tried.append(_minimised(start, short, model_class, slowest, START_STEPS))
+            tried.append(_minimised(start, short, slowest, START_STEPS))
             named = ", ".join(f"{pole:g}" for pole in poles)
             done.append(
-                Step(f"poles {named}, {model_class.limit} {levels}", scales[3] * tried[-1][0])
+                Step(
+                    f"poles {named}, {model_class.structure.limit} {levels}",
+                    scales[3] * tried[-1][0],
+                )
             )
     found = []
     for _, cascade in sorted(tried, key=lambda entry: entry[0])[:KEPT]:
         wide = _with_trials(cascade, short, trials)
-        finer = _with_intervals(wide, trials, model_class.intervals)
-        found.append(_minimised(finer, trials, model_class, slowest, steps))
-        done.append(Step(f"{model_class.intervals} intervals", scales[3] * found[-1][0]))
+        finer = _with_intervals(wide, trials, model_class.structure.intervals)
+        found.append(_minimised(finer, trials, slowest, steps))
+        done.append(Step(f"{model_class.structure.intervals} intervals", scales[3] * found[-1][0]))
     model = _network(min(found, key=lambda entry: entry[0])[1], scales, train, model_class)
     proof = prove_stability(model)
     if proof is None:
@@ -285,7 +260,7 @@ def _hinges(knots: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _minimised(
-    start: Cascade, trials: Sequence[Trial], model_class: CellClass, slowest: float, steps: int
+    start: Cascade, trials: Sequence[Trial], slowest: float, steps: int
 ) -> tuple[float, Cascade]:
     """(rms error in spreads of y, the cascade) at a local minimum with slopes in [0, slowest]."""
     places, theta = start.places(), start.pack()
@@ -302,7 +277,7 @@ def _minimised(
     bend = np.zeros((len(smooth), len(theta)))
     for row, (first, second) in enumerate(smooth):
         bend[row, first], bend[row, second] = -1.0, 1.0
-    bend *= np.sqrt(model_class.smoothing)
+    bend *= np.sqrt(SMOOTHING)
     samples = np.sqrt(sum(len(trial.y) - trial.skipped for trial in trials))
 
     def residual(values: FloatArray) -> FloatArray:
@@ -370,7 +345,7 @@ def _start(
     trials: Sequence[Trial],
     poles: Sequence[float],
     levels: Sequence[float],
-    model_class: CellClass,
+    model_class: Network[CellRow],
     still: float,
 ) -> Cascade:
     """The linear cascade with these poles, hidden states in their spreads; still: y of 0."""
@@ -392,10 +367,10 @@ def _start(
     b = np.zeros((cells, q))
     b[0] = (1.0 - pole[0]) * gains[:-1] / spread[0]
     top, half, rest = np.full(cells, np.inf), np.full(cells, np.nan), np.zeros(cells)
-    if model_class.limit == "top":
+    if model_class.structure.limit == "top":
         parts = zip(x, spread, (*levels, 1.0), strict=True)
         top = np.array([float(np.quantile(part / s, quantile)) for part, s, quantile in parts])
-    elif model_class.limit == "friction":
+    elif model_class.structure.limit == "friction":
         half[-1], rest[-1] = levels[0] * (1.0 - pole[-1]), still
         level[-1] -= still
     x0 = np.array([[path[i][0, 0] / spread[i] for i in range(cells)] for path in paths])
@@ -443,7 +418,7 @@ def _network(
     cascade: Cascade,
     scales: tuple[FloatArray, FloatArray, float, float],
     train: Dataset,
-    model_class: CellClass,
+    model_class: Network[CellRow],
 ) -> CellNetwork:
     """The cascade as a network of recorded signals: the only place where scaling is undone."""
     cells, q = cascade.b.shape

@@ -11,14 +11,13 @@ loop that answers a stronger input well thus hands that on. K is chosen by held-
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification.fit import Step
 from nlsid_core.identification.network.feedback_fit import (
     DIVERGED,
@@ -34,16 +33,15 @@ from nlsid_core.identification.network.feedback_fit import (
     simulate_stages,
     stage_errors,
 )
+from nlsid_core.identification.network.options import Feedback, Network
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.regressors import signal_scale
 from nlsid_core.identification.starts import autoregression, reflected
 from nlsid_core.models import CellNetwork, PiecewiseLinear
-from nlsid_core.models.cell_network import MAX_MAPS, PRIOR
+from nlsid_core.models.cell_network import PRIOR
 from nlsid_core.models.signal import signals_of
-from nlsid_core.options import require_whole
 from nlsid_core.progress import Progress
 
-MOST_LAGS, MOST_INTERVALS, MOST_START_SAMPLES = 8, 30, 10_000
 SHAPES: tuple[Callable[[FloatArray], FloatArray], ...] = (  # of φ at the start, y in its range
     lambda y: y**3,
     lambda y: y**2,
@@ -52,42 +50,11 @@ SHAPES: tuple[Callable[[FloatArray], FloatArray], ...] = (  # of φ at the start
 ROOM = 1.3  # times the range of y: where the maps end, and the largest of the inputs imitated
 SIZES = (0.9, 1.5)  # of these inputs, in those of the trials
 LENGTH = 500  # samples of an input that is imitated
-MOST_IMITATED = 10_000
 FITTED = 30_000  # samples of the trials that the stages are fitted to, beside them
 LOOP_STEPS, LOOP_TOLERANCE = 60, 1e-4
 TOLERANCE = 2e-3  # relative gain of a step of the stages
 WORTH = 0.98  # of the held-back error, that a further stage has to reach
 SMALLEST = 1e-3  # rms error in spreads of y, below which a start is not trusted
-
-
-@dataclass(frozen=True)
-class FeedbackClass:
-    """A filter with feedback through a static map of its output, of any number of inputs.
-
-    lags: of output and inputs, 1 to 8. intervals: of the map's spline, 1 to 30 (1 is a cubic).
-    stages: of the unrolled equation that are tried, 1 to 8; each is one map of the proof.
-    imitated: inputs that nobody recorded, on which the stages do as the loop does, 0 to 10000.
-    start_samples: at the start of a trial, that show its first state and are not scored, 1 to
-    10000. seed: of the inputs that are imitated.
-    """
-
-    lags: int = 3
-    intervals: int = 4
-    stages: int = 4
-    imitated: int = 96
-    start_samples: int = 20
-    seed: int = 0
-    kind: ClassVar[type[CellNetwork]] = CellNetwork
-
-    def __post_init__(self) -> None:
-        require_whole(self, "lags", 1, MOST_LAGS)
-        require_whole(self, "intervals", 1, MOST_INTERVALS)
-        require_whole(self, "stages", 1, MAX_MAPS)
-        require_whole(self, "imitated", 0, MOST_IMITATED)
-        require_whole(self, "start_samples", 1, MOST_START_SAMPLES)
-        require_whole(self, "seed", 0, 2**31)
-        if self.start_samples < self.lags:
-            raise OptionError("start_samples", self.start_samples, f"at least the {self.lags} lags")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +67,11 @@ class Scaled:
 
     @classmethod
     def of(
-        cls, data: Dataset, model_class: FeedbackClass, transient: int, like: "Scaled | None" = None
+        cls,
+        data: Dataset,
+        model_class: Network[Feedback],
+        transient: int,
+        like: "Scaled | None" = None,
     ) -> "Scaled":
         """Raises ShapeError for several outputs, DataError on too little or constant data."""
         if data.trajectories[0].y.shape[1] != 1:
@@ -108,7 +79,7 @@ class Scaled:
                 "feedback through a map has one output; the data have "
                 f"{data.trajectories[0].y.shape[1]}"
             )
-        n, skipped = model_class.lags, max(transient, 0)
+        n, skipped = model_class.structure.lags, max(transient, 0)
         for trial in data:
             if len(trial) <= 3 * max(skipped, model_class.start_samples):
                 raise DataError(
@@ -129,7 +100,7 @@ class Scaled:
 
 
 def identify_loop(
-    scaled: Scaled, model_class: FeedbackClass
+    scaled: Scaled, model_class: Network[Feedback]
 ) -> tuple[float, Stage, Basis, list[Trial]]:
     """(rms error in spreads of y, the loop, its maps, the trials with the starts that fit it).
 
@@ -137,8 +108,8 @@ def identify_loop(
     none that does not diverge.
     """
     y = np.concatenate([trial.y for trial in scaled.trials])
-    basis = _basis(y, model_class.intervals)
-    n, q = model_class.lags, scaled.trials[0].u.shape[1]
+    basis = _basis(y, model_class.structure.intervals)
+    n, q = model_class.structure.lags, scaled.trials[0].u.shape[1]
     half, middle = 0.5 * np.ptp(y), 0.5 * (y.max() + y.min())
     found = []
     for shape in SHAPES:
@@ -187,7 +158,9 @@ def imitated(
     return made
 
 
-def identify_unproved(train: Dataset, model_class: FeedbackClass, *, transient: int) -> CellNetwork:
+def identify_unproved(
+    train: Dataset, model_class: Network[Feedback], *, transient: int
+) -> CellNetwork:
     """The loop as a network, which may be proved or not. Raises as `identify_feedback`."""
     scaled = Scaled.of(train, model_class, transient)
     error, loop, basis, trials = identify_loop(scaled, model_class)
@@ -198,7 +171,7 @@ def identify_feedback(
     train: Dataset,
     fitted: Dataset,
     judged: Dataset,
-    model_class: FeedbackClass,
+    model_class: Network[Feedback],
     *,
     transient: int,
     slowest: float,
@@ -224,11 +197,11 @@ def identify_feedback(
     known = _known(first_loop, first_basis, few_trials, model_class)
     others = Scaled.of(judged, model_class, transient, scaled).trials
     rng = np.random.default_rng(model_class.seed + 1)
-    unseen = imitated(first_loop, first_basis, few_trials, model_class.imitated // 4, rng)
-    stages, history, best = _linear(known, model_class.lags, slowest), [], np.inf
+    unseen = imitated(first_loop, first_basis, few_trials, model_class.structure.imitated // 4, rng)
+    stages, history, best = _linear(known, model_class.structure.lags, slowest), [], np.inf
     chosen = stages
     further = replace(first_loop, a=_within(first_loop.a, slowest))
-    for maps in range(1, model_class.stages + 1):
+    for maps in range(1, model_class.structure.stages + 1):
         _, stages = minimise_stages(
             [*stages, further], first_basis, known,
             radius=slowest, steps=steps, tolerance=TOLERANCE,
@@ -236,7 +209,7 @@ def identify_feedback(
         further = stages[-1]
         reached = _rms(stages, first_basis, [*others, *unseen])
         history.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * reached))
-        progress(history[-1].what, 0.2 + 0.6 * maps / model_class.stages)
+        progress(history[-1].what, 0.2 + 0.6 * maps / model_class.structure.stages)
         if reached < WORTH * best:
             best, chosen = reached, stages
     _, stages = minimise_stages(
@@ -253,11 +226,14 @@ def identify_feedback(
 
 
 def _known(
-    loop: Stage, basis: Basis, trials: Sequence[Trial], model_class: FeedbackClass
+    loop: Stage, basis: Basis, trials: Sequence[Trial], model_class: Network[Feedback]
 ) -> list[Trial]:
     """What stages are fitted to: trials, and what the loop makes of inputs that nobody recorded."""
     rng = np.random.default_rng(model_class.seed)
-    return [*_shortened(trials), *imitated(loop, basis, trials, model_class.imitated, rng)]
+    return [
+        *_shortened(trials),
+        *imitated(loop, basis, trials, model_class.structure.imitated, rng),
+    ]
 
 
 def _linear(known: Sequence[Trial], lags: int, radius: float) -> list[Stage]:
@@ -281,7 +257,7 @@ def network_of(
     scaled: Scaled,
     trials: Sequence[Trial],
     train: Dataset,
-    model_class: FeedbackClass,
+    model_class: Network[Feedback],
     error: float,
     *,
     closed: bool = False,

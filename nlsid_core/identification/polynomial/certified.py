@@ -153,6 +153,7 @@ def descend_certified(
             break
         theta, J = found, point.J
         lower = problem.model(theta, point.p)
+        assert isinstance(lower, StateAffineModel), "as the model that it began with"
         proved = prove_stability(lower)
         if proved is None:
             break

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification.polynomial.implicit_rows import (
-    DELAYED,
     FARTHEST,
     LARGEST_BLOCK,
     SLOW,
     ImplicitRows,
 )
+from nlsid_core.identification.polynomial.options import DELAYED
 from nlsid_core.identification.proofs import conditions
 from nlsid_core.identification.proofs.conditions import GAP, Inequality, constraint
 from nlsid_core.identification.proofs.sets import Names
@@ -94,7 +94,7 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
     model, proof = kept_in_set(rows, *best, lowest)
     if proof is None:
         raise Infeasible(
-            f"no exact proof in set {rows.model_class.set} for the minimiser; try lower degrees, "
+            f"no exact proof in set {rows.set} for the minimiser; try lower degrees, "
             "a box, or more data"
         )
     return ImplicitFit(model, proof, bound, *best)
@@ -108,7 +108,7 @@ def refuse_large_program(rows: ImplicitRows) -> None:
     size = max(cone.size for cone in compile_program(program).layout.cones if cone.kind == "psd")
     if size > LARGEST_BLOCK:
         raise DataError(
-            f"a semidefinite block of order {size} in set {rows.model_class.set}, more than "
+            f"a semidefinite block of order {size} in set {rows.set}, more than "
             f"{LARGEST_BLOCK}: {SLOW}; {FEWER}"
         )
 
@@ -152,7 +152,7 @@ def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitP
     gaps = dict(zip((*rows.names.v, *known), (*spread[:n_v], *spread), strict=True))
     scale |= {name + GAP: gaps[name] for name in (*rows.names.v, *rows.names.x)}
     return prove_implicit(
-        model, delta=delta, set=made.set, ends=rows.ends,
+        model, delta=delta, set=rows.set, ends=rows.ends,
         storage_degree=made.storage_degree, scale=scale,
     )  # fmt: skip
 
@@ -162,7 +162,7 @@ def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
     names = rows.names
     known = (*names.x, *names.w)
     e, f = (np.empty(len(rows.y_scale[0]), dtype=object) for _ in range(2))
-    symmetric = symmetric_template("E", len(e)) if rows.model_class.set == "2.19" else None
+    symmetric = symmetric_template("E", len(e)) if rows.set == "2.19" else None
     for i in range(len(e)):
         if symmetric is None:
             e[i] = template(f"e{i}", rows.left, names.v)
@@ -179,12 +179,12 @@ def set_constraints(
     names, made, Q = rows.names, rows.model_class, rows.weight
     domain = _domain(rows, (*names.x, *names.w))
     of_set: list[Inequality] = []
-    if made.set in DELAYED:
-        storage = storage_template(made.set, names, made.storage_degree)
+    if rows.set in DELAYED:
+        storage = storage_template(rows.set, names, made.storage_degree)
         h, n_v = e - f, len(e)
         shift = np.array(variables(names.x)[: len(names.x) - n_v], dtype=object)
         inside = domain + _domain(rows, names.v)
-        if made.set == "2.10":
+        if rows.set == "2.10":
             assert isinstance(storage, Polynomial)
             kept = _form(S, names.gaps(names.v)) + _form(Q, names.gaps(names.x))
             part = conditions.implicit_increments(
@@ -202,23 +202,23 @@ def set_constraints(
             of_set = [_minus(part, _diagonal(S, Q)), Inequality(storage)]
     else:
         e_of_x = np.array([_renamed(p, names) for p in e], dtype=object)
-        if made.set == "2.19":
+        if rows.set == "2.19":
             E, F = (
                 np.array([[p.derivative(x) for x in names.x] for p in part], dtype=object)
                 for part in (e_of_x, f)
             )
             part = conditions.linear(E, F, 0, rate=rate)
         else:
-            P = storage_template(made.set, names, 0)
+            P = storage_template(rows.set, names, 0)
             assert isinstance(P, np.ndarray)
-            of = conditions.increments if made.set == "2.12" else conditions.derivatives
+            of = conditions.increments if rows.set == "2.12" else conditions.derivatives
             part = of(e_of_x, f, P, names.x, delta=0, rate=rate, domain=domain)
         corner = Q
-        if made.set == "2.12":
+        if rows.set == "2.12":
             corner = np.array([[_form(Q, names.gaps(names.x))]], dtype=object)
         of_set = [_minus(part, _diagonal(corner, S))]
     found: list[Constraint] = [
-        constraint(part.relevant(), name=f"set {made.set}, {k}") for k, part in enumerate(of_set)
+        constraint(part.relevant(), name=f"set {rows.set}, {k}") for k, part in enumerate(of_set)
     ]
     return [*found, _monotone(e, S, names)]
 
@@ -256,7 +256,7 @@ def _residual(rows: ImplicitRows) -> Objects:
 
 def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
     """The decisions in e of equation i, in the order of the rows' monomials."""
-    if rows.model_class.set != "2.19":
+    if rows.set != "2.19":
         return list(variables([f"e{i}[{k}]" for k in range(len(rows.left))]))
     E = symmetric_template("E", n_v)
     return [E[i, int(np.argmax(unit))] for unit in rows.left]

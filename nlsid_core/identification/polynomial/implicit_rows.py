@@ -1,4 +1,4 @@
-"""`ImplicitClass`: implicit models of recorded signals, and a dataset as rows of their equation.
+"""Implicit models of recorded signals: a dataset as rows of their equation.
 
     e(y(t)) = f(x(t), w(t)),   x = [y(t-1); …; y(t-n)],   w stacks delayed inputs
 Signals are scaled to zero mean and unit spread, undone once in `ImplicitRows.model`. The equation
@@ -10,7 +10,6 @@ Source: thesis (2.4), (2.7).
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
-from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -18,13 +17,12 @@ from scipy.linalg import solve_triangular
 from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.identification.polynomial.options import Polynomial as Options
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import signals_of
-from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
 
@@ -32,133 +30,7 @@ MOST_TERMS = 1000  # of e and f: with 10 000 samples a step takes 2.5 s and 0.8 
 MOST_MONOMIALS = 1000  # of a square in an inequality of the set, before it is built
 LARGEST_BLOCK = 60  # of a program: measured 1 to 6 s each at order 55, 22 s and 1 GB at 84
 SLOW = "each of some fifty programs of a search would take longer than ten seconds"
-DELAYED = ("2.10", "2.11")  # the sets for more than one lag; the others have no known structure ã
 FARTHEST = 0.01  # weight of the outputs before the newest in the error that is bounded
-Box = tuple[tuple[float, float], ...]
-StableSet = Literal["2.10", "2.11", "2.12", "2.13", "2.19"]
-
-
-@dataclass(frozen=True)
-class ImplicitClass:
-    """e(y(t)) = f(past outputs, inputs), and the set of stable models to search.
-
-    lags: n, 1 to 100 samples; delays: of the inputs in w, each 0 to 100 samples (None: 0 … n).
-    Measured states, x⁺ one sample ahead, are lags 1 and delays (1,). set: of thesis Chapter 2,
-    "2.10" to "2.13", "2.19" for linear models; more than one lag needs "2.10" or "2.11".
-    left_degree: of e, odd, 1 to 9; right_degree: of f in x, 1 to 5; input_degree: of f in w, 1 to
-    5. coupled: whether w is multiplied with x to total degree right_degree instead of added. box:
-    (low, high) of every output, then every input, in their units, for stability on it (None:
-    everywhere).
-    storage_degree: of the storage's metric in "2.10", 0 to 4. continuous: of measured states, only
-    models that E dx/dt = g(x) + r(u) makes by the trapezoidal rule, e = Ex - hg/2 and f = Ex + hg/2
-    + hr: `dynamics.identified_field` is then the equation itself.
-    Raises OptionError, or DataError for a combination that no model can satisfy.
-    """
-
-    lags: int = 1
-    delays: tuple[int, ...] | None = None
-    set: StableSet = "2.11"
-    left_degree: int = 3
-    right_degree: int = 1
-    input_degree: int = 1
-    coupled: bool = False
-    box: Box | None = None
-    storage_degree: int = 0
-    continuous: bool = False
-    kind: ClassVar[type[ImplicitModel]] = ImplicitModel
-
-    def __post_init__(self) -> None:
-        require_whole(self, "lags", 1, MOST_LAGS)
-        require_delays(self, "delays", MOST_LAGS)
-        require_one_of(self, "set", get_args(StableSet))
-        if self.lags > 1 and self.set not in DELAYED:
-            raise DataError(f"set {self.set} is for 1 lag; {' and '.join(DELAYED)} are for more")
-        require_one_of(self, "left_degree", (1, 3, 5, 7, 9))  # an even e would not be increasing
-        require_whole(self, "right_degree", 1, 5)
-        require_whole(self, "input_degree", 1, 5)
-        require_whole(self, "storage_degree", 0, 4)
-        require_ranges(self, "box")
-        if self.storage_degree and self.set != "2.10":
-            raise DataError(f"storage_degree is for set 2.10, not {self.set}")
-        if self.set == "2.19" and (self.left_degree, self.right_degree, self.box) != (1, 1, None):
-            raise DataError("set 2.19 is linear: left_degree 1, right_degree 1, no box")
-        if self.continuous and (self.lags, self.delays, self.coupled) != (1, (1,), False):
-            raise DataError("continuous models have measured states: lags 1, delays [1], uncoupled")
-        if self.continuous and self.left_degree != self.right_degree:
-            raise DataError(
-                f"continuous models have left_degree and right_degree the same, not "
-                f"{self.left_degree} and {self.right_degree}"
-            )
-        if self.box is None:
-            self._refuse_growth()
-
-    def _refuse_growth(self) -> None:
-        """Without a box f must not grow faster than the set allows."""
-        if self.coupled:
-            raise DataError("a product of states and inputs is stable on a box only: give one")
-        if self.storage_degree >= self.left_degree:
-            raise DataError(
-                f"storage_degree {self.storage_degree} needs left_degree "
-                f"{self.storage_degree + 1} or a box, not {self.left_degree}"
-            )
-        if self.right_degree == 1:
-            return
-        growth = 2 * (self.right_degree - 1)  # of |f - f̂|² for one gap
-        what, where = f"right_degree {self.right_degree} needs", f"a box in set {self.set}"
-        if self.set == "2.11":
-            raise DataError(f"{what} {where}")
-        if self.left_degree < growth + 1:
-            raise DataError(f"{what} left_degree {growth + 1} or {where}, not {self.left_degree}")
-        if self.set == "2.10" and self.storage_degree < growth:
-            raise DataError(f"{what} storage_degree {growth} or {where}, not {self.storage_degree}")
-
-    def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
-        """(input, delay) of each entry of w."""
-        delays = tuple(range(self.lags + 1)) if self.delays is None else self.delays
-        return tuple((i, d) for d in delays for i in range(inputs))
-
-    def right(self, states: int, inputs: int) -> IntArray:
-        """(m, states + inputs) exponents of f, the constant among them."""
-        if self.coupled:
-            return monomials(states + inputs, range(self.right_degree + 1))
-        of_x = monomials(states, range(self.right_degree + 1))
-        of_w = monomials(inputs, range(1, self.input_degree + 1))
-        return np.vstack([
-            np.hstack([of_x, np.zeros((len(of_x), inputs), dtype=np.int64)]),
-            np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
-        ])  # fmt: skip
-
-    def refuse_large(self, outputs: int, inputs: int) -> None:
-        """DataError for more terms or larger squares than a search should begin with.
-
-        Counted before anything is built: a polynomial of degree d in k variables has
-        binomial(k + d, d) terms, and so has a square's factor with half the degree.
-        """
-        n, m = self.lags * outputs, len(self.window(inputs))
-        k, d = (n + m, self.right_degree) if self.coupled else (n, self.right_degree)
-        terms = comb(outputs + self.left_degree, self.left_degree) - 1 + comb(k + d, d)
-        if not self.coupled:
-            terms += comb(m + self.input_degree, self.input_degree) - 1
-        if terms > MOST_TERMS:
-            raise DataError(
-                f"{terms} terms an equation of {n} past outputs and {m} delayed inputs, more than "
-                f"{MOST_TERMS}; {FEWER}"
-            )
-        if outputs + n > LARGEST_BLOCK:
-            raise DataError(
-                f"a semidefinite block of {outputs} outputs and {n} states, more than "
-                f"{LARGEST_BLOCK}: {SLOW}; use fewer lags"
-            )
-        curved = self.coupled or self.right_degree > 1 or self.storage_degree > 0
-        inside = outputs + (k if curved else 0)
-        half = max(self.left_degree, self.right_degree, self.storage_degree + 2) // 2
-        curves, flat = (outputs + n, 0) if curved else (outputs, n)
-        square = curves * comb(inside + half, half) + flat
-        if square > MOST_MONOMIALS:
-            raise DataError(
-                f"{square} monomials in a square of set {self.set}, more than {MOST_MONOMIALS}; "
-                f"{FEWER}"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +45,7 @@ class ImplicitRows:
     right: IntArray
     y_scale: tuple[FloatArray, FloatArray]
     u_scale: tuple[FloatArray, FloatArray]
-    model_class: ImplicitClass
+    model_class: Options
     dataset: Dataset
 
     @property
@@ -182,6 +54,12 @@ class ImplicitRows:
         n_v, m = len(self.y_scale[0]), self.right.shape[1] - self.states
         return Names(*(tuple(f"{c}{i}" for i in range(k))
                        for c, k in (("v", n_v), ("x", self.states), ("w", m))))  # fmt: skip
+
+    @property
+    def set(self) -> str:
+        """The set of the models."""
+        assert self.model_class.form is not None, "equations of Chapter 4 have rows of their own"
+        return self.model_class.form
 
     @property
     def states(self) -> int:
@@ -228,12 +106,12 @@ class ImplicitRows:
     @property
     def ends(self) -> list[tuple[float, float]]:
         """The box of every state and input, in the signals' units; empty: everywhere."""
-        box, n_v = self.model_class.box, len(self.y_scale[0])
-        if box is None:
+        box, n_v = self.model_class.box or (), len(self.y_scale[0])
+        if not box:
             return []
         if len(box) != n_v + len(self.u_scale[0]):
             raise DataError(
-                f"the box has {len(box)} intervals for {n_v} outputs and "
+                f"output_range and input_range have {len(box)} intervals for {n_v} outputs and "
                 f"{len(self.u_scale[0])} inputs"
             )
         of_u = [i for i, _ in self.model_class.window(len(self.u_scale[0]))]
@@ -266,7 +144,7 @@ class ImplicitRows:
             weight = largest**2 / float(self.y_scale[1][i])
             parts.append((p.substitute(inside) * weight).over(everything))
         h = _stacked(parts)
-        if self.model_class.set == "2.19":
+        if self.set == "2.19":
             h = _with_symmetric_left(h, n_v)
         first, window = self.dataset.trajectories[0], self.model_class.window(len(self.u_scale[0]))
         lags = range(1, self.model_class.lags + 1)
@@ -283,20 +161,20 @@ class ImplicitRows:
         return with_signals(model, self.dataset, window)
 
 
-def build_implicit_rows(dataset: Dataset, model_class: ImplicitClass) -> ImplicitRows:
+def build_implicit_rows(dataset: Dataset, model_class: Options) -> ImplicitRows:
     """The rows t = h … of every trial. Raises DataError on too little or too poor data."""
     y_scale, u_scale = signal_scale(dataset, "y"), signal_scale(dataset, "u")
     n_v, window = len(y_scale[0]), model_class.window(len(u_scale[0]))
     n = n_v * model_class.lags
-    history = max(model_class.lags, *(d for _, d in window))
+    history = model_class.history
     for trial in dataset:
         if history >= len(trial):
             raise DataError(
                 f"{trial.name}: {len(trial)} samples, a history of {history} needs more"
             )
-    model_class.refuse_large(n_v, len(u_scale[0]))
-    left = monomials(n_v, range(1, model_class.left_degree + 1))
-    right = model_class.right(n, len(window))
+    refuse_large(model_class, n_v, len(u_scale[0]))
+    left = monomials(n_v, range(1, model_class.degrees.left + 1))
+    right = right_basis(model_class, n, len(window))
     rows = []
     for trial in dataset:
         N = len(trial)
@@ -310,6 +188,53 @@ def build_implicit_rows(dataset: Dataset, model_class: ImplicitClass) -> Implici
     made = ImplicitRows(R, left, right, y_scale, u_scale, model_class, dataset)
     _refuse_data_outside(made)
     return made
+
+
+def right_basis(model_class: Options, states: int, inputs: int) -> IntArray:
+    """(m, states + inputs) exponents of f, the constant among them."""
+    d = model_class.degrees
+    if d.lagged:
+        return monomials(states + inputs, range(d.past + 1))
+    of_x = monomials(states, range(d.past + 1))
+    of_w = monomials(inputs, range(1, d.inputs + 1))
+    return np.vstack([
+        np.hstack([of_x, np.zeros((len(of_x), inputs), dtype=np.int64)]),
+        np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
+    ])  # fmt: skip
+
+
+def refuse_large(model_class: Options, outputs: int, inputs: int) -> None:
+    """DataError for more terms or larger squares than a search should begin with.
+
+    Counted before anything is built: a polynomial of degree d in k variables has
+    binomial(k + d, d) terms, and so has a square's factor with half the degree.
+    """
+    n, m = model_class.lags * outputs, len(model_class.window(inputs))
+    d, coupled = model_class.degrees, bool(model_class.degrees.lagged)
+    k = n + m if coupled else n
+    terms = comb(outputs + d.left, d.left) - 1 + comb(k + d.past, d.past)
+    if not coupled:
+        terms += comb(m + d.inputs, d.inputs) - 1
+    if terms > MOST_TERMS:
+        raise DataError(
+            f"{terms} terms an equation of {n} past outputs and {m} delayed inputs, more than "
+            f"{MOST_TERMS}; {FEWER}"
+        )
+    if outputs + n > LARGEST_BLOCK:
+        raise DataError(
+            f"a semidefinite block of {outputs} outputs and {n} states, more than "
+            f"{LARGEST_BLOCK}: {SLOW}; use fewer lags"
+        )
+    curved = coupled or d.past > 1 or model_class.storage_degree > 0
+    inside = outputs + (k if curved else 0)
+    half = max(d.left, d.past, model_class.storage_degree + 2) // 2
+    curves, flat = (outputs + n, 0) if curved else (outputs, n)
+    square = curves * comb(inside + half, half) + flat
+    if square > MOST_MONOMIALS:
+        raise DataError(
+            f"{square} monomials in a square of set {model_class.form}, more than "
+            f"{MOST_MONOMIALS}; {FEWER}"
+        )
 
 
 def with_signals(
@@ -333,7 +258,7 @@ def _refuse_data_outside(rows: ImplicitRows) -> None:
             if values.min() < low or values.max() > high:
                 raise DataError(
                     f"{trial.name}: {getattr(trial, names)[j]} reaches "
-                    f"[{values.min():g}, {values.max():g}], outside the box [{low:g}, {high:g}]"
+                    f"[{values.min():g}, {values.max():g}], outside the range [{low:g}, {high:g}]"
                 )
 
 

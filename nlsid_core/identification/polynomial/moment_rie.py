@@ -24,8 +24,9 @@ from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.errors import DataError, Infeasible, ShapeError
-from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.identification.polynomial.moments import Moments, Offsets
+from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.signal import signals_of
@@ -38,91 +39,45 @@ POWER_FLOOR = 1e-3  # an estimated mean square of yᵏ below this part of (mean 
 @dataclass(frozen=True, eq=False)
 class MomentFit:
     """model; proof; bound: tr(R M), an upper bound of the mean squared simulation error (squared
-    unit of y) as far as the moments are right; R of the solution; P in the scale of
-    the model;
-    negative: the most negative eigenvalue of the scaled moments before projection.
+    unit of y) as far as the moments are right.
     """
 
     model: MonotoneEquation
     proof: StabilityProof
     bound: float
-    R: FloatArray
-    P: FloatArray
-    negative: float
-    solution: conic.ConeSolution
-
-    def __str__(self) -> str:
-        unit = self.model.y.unit
-        return (
-            f"monotone equation of {len(self.model)} lags, proved stable at rate "
-            f"{self.proof.rate:.4f}; rms simulation error at most {self.bound**0.5:.4g} {unit} on "
-            f"its moments; {self.solution}"
-        )
 
 
 def minimise_moment_rie(
     moments: Moments,
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     template: Trajectory,
     offsets: Offsets,
     *,
-    kappa: float | None = None,
     slowest: float = 1.0,
 ) -> MomentFit:
     """The stable model with the least bound on these moments, and its exact proof.
 
-    template: names, units and sample time. kappa: bound on |R|_F in the model's units (None: none).
-    slowest: V shrinks by its square or more, a sample.
+    template: names, units and sample time. slowest: V shrinks by its square or more, a sample.
     Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
     exact proof, SolverError if the solver gives up.
     """
     problem = Problem.of(moments, model_class.lags, slowest)
-    solution = problem.solve(kappa=kappa)
-    x = problem.columns * solution.x
-    layout = problem.layout
-    scale = float(x[layout.c[0]])  # e'(0): the scale of e and f together means nothing
-    model = equation(x[layout.c] / scale, model_class, template, offsets)
-    P = x[layout.P] / scale
+    solution = problem.solve()
+    c = (problem.columns * solution.x)[problem.layout.c]
+    model = equation(c / c[0], model_class, template, offsets)  # the scale of both sides is free
     proof = prove_stability(model)
     if proof is None:
         raise Infeasible(
             f"no exact proof for the minimiser ({solution}); try fewer lags, or give more data"
         )
-    return MomentFit(
-        model=model,
-        proof=proof,
-        bound=float(solution.objective * problem.unit**2),
-        R=x[layout.R],
-        P=P,
-        negative=problem.negative,
-        solution=solution,
-    )
-
-
-def moment_bound(model: MonotoneEquation, moments: Moments, *, kappa: float | None = None) -> float:
-    """J(a, M): the least tr(R M) with this model, e and f scaled by a common factor; ≥ 0.
-
-    The moments have to be about the model's offsets. Source: thesis (3.6), J_κ.
-    Raises ShapeError or DataError on moments of another class, Infeasible if no V, R of this class
-    prove the model stable.
-    """
-    if len(model) + len(model.window) != moments.mixed.shape[1]:
-        raise ShapeError(
-            f"moments of {moments.mixed.shape[1]} lags and window entries do not fit a model of "
-            f"{len(model)} and {len(model.window)}"
-        )
-    if model.e[moments.degree :].any():
-        raise DataError("moments for a linear e do not judge a model whose e is cubic")
-    problem = Problem.of(moments, len(model))
-    coefficients = np.concatenate([model.e[: moments.degree], [-model.c], -model.a, -model.b])
-    return float(problem.solve(fixed=coefficients, kappa=kappa).objective * problem.unit**2)
+    return MomentFit(model, proof, float(solution.objective * problem.unit**2))
 
 
 def equation(
-    c: FloatArray, model_class: MonotoneClass, template: Trajectory, offsets: Offsets
+    c: FloatArray, model_class: Polynomial, template: Trajectory, offsets: Offsets
 ) -> MonotoneEquation:
     """The model ε = c'Λ = 0."""
-    D, n = model_class.degree, model_class.lags
+    D, n = model_class.degrees.left, model_class.lags
     return MonotoneEquation(
         e=np.concatenate([c[:D], np.zeros(3 - D)]),
         a=-c[D + 1 : D + 1 + n],
@@ -267,7 +222,6 @@ class Problem:
     columns: FloatArray
     stability: AffineMatrix
     error_bound: AffineMatrix
-    negative: float
 
     @classmethod
     def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "Problem":
@@ -295,45 +249,19 @@ class Problem:
             columns=columns,
             stability=layout.stability(DELTA, slowest).scaled(rows8, columns),
             error_bound=layout.error_bound().scaled(rows9, columns),
-            negative=float(min(values[0], 0.0)),
         )
 
-    def solve(
-        self, *, fixed: FloatArray | None = None, kappa: float | None = None
-    ) -> conic.ConeSolution:
-        """Minimise tr(R M); `fixed` gives c up to a nonnegative factor, in physical units."""
-        layout = self.layout
-        q = np.zeros(layout.unknowns)
-        np.add.at(q, layout.R.ravel(), self.M.ravel())
+    def solve(self) -> conic.ConeSolution:
+        """Minimise tr(R M)."""
+        q = np.zeros(self.layout.unknowns)
+        np.add.at(q, self.layout.R.ravel(), self.M.ravel())
         blocks = [self.stability, self.error_bound]
-        A = [-block.slope for block in blocks]
-        b = [block.constant for block in blocks]
-        cones = [Cone("psd", block.order) for block in blocks]
-        if kappa is not None:
-            upper = layout.R[np.triu_indices(layout.monomials)]
-            double = np.where(np.eye(layout.monomials)[np.triu_indices(layout.monomials)], 1, 2)
-            weights = np.sqrt(double) * self.columns[upper]
-            rows = np.arange(1, len(upper) + 1)
-            shape = (len(upper) + 1, layout.unknowns)
-            A.append(sp.csr_matrix((-weights, (rows, upper)), shape))
-            b.append(np.concatenate([[kappa], np.zeros(len(upper))]))
-            cones.append(Cone("second_order", len(upper) + 1))
-        stacked = sp.vstack(A, format="csc")
-        lift = sp.identity(layout.unknowns, format="csc")
-        if fixed is not None:
-            others = np.setdiff1d(np.arange(layout.unknowns), layout.c)
-            direction = sp.csc_matrix(
-                (fixed / self.columns[layout.c], (layout.c, np.zeros(len(fixed), dtype=int))),
-                (layout.unknowns, 1),
-            )
-            lift = sp.hstack([lift[:, others], direction], format="csc")
-        free = lift.shape[1]
         program = ConeProgram(
-            P=sp.csc_matrix((free, free)),
-            q=lift.T @ q,
-            A=sp.csc_matrix(stacked @ lift),
-            b=np.concatenate(b),
-            cones=tuple(cones),
+            P=sp.csc_matrix((len(q), len(q))),
+            q=q,
+            A=sp.csc_matrix(sp.vstack([-block.slope for block in blocks])),
+            b=np.concatenate([block.constant for block in blocks]),
+            cones=tuple(Cone("psd", block.order) for block in blocks),
         )
         return conic.solve(program)
 

@@ -15,50 +15,17 @@ from functools import reduce
 from itertools import combinations
 from math import comb
 from operator import add
-from typing import ClassVar
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification.methods.options import MOST_LAGS
+from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.regressors import FEWER
-from nlsid_core.models import MonotoneEquation
-from nlsid_core.options import require_delays, require_one_of, require_whole
 
-DEGREES = (1, 3)  # of e
 CONSTANT = 1e-10  # relative rms below which an input minus its mean is rounding
 RANK_TOLERANCE = 1e-12  # relative eigenvalue of unit moments at which inputs repeat each other
-
-
-@dataclass(frozen=True)
-class MonotoneClass:
-    """e(y) affine in past outputs and in inputs, e increasing. Source: thesis (3.14).
-
-    lags: n of the output, 1 to 100 samples; delays: of the inputs, each 0 to 100 samples (None:
-    0 … n). degree: of e, 1 or 3.
-    """
-
-    lags: int
-    delays: tuple[int, ...] | None = None
-    degree: int = 3
-    kind: ClassVar[type[MonotoneEquation]] = MonotoneEquation
-
-    def __post_init__(self) -> None:
-        require_whole(self, "lags", 1, MOST_LAGS)
-        require_delays(self, "delays", MOST_LAGS)
-        require_one_of(self, "degree", DEGREES)
-
-    def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
-        """(input, delay) of each entry of w."""
-        delays = tuple(range(self.lags + 1)) if self.delays is None else self.delays
-        return tuple((i, d) for d in delays for i in range(inputs))
-
-    @property
-    def history(self) -> int:
-        """Samples before the first row."""
-        return max(self.lags, *(self.delays or (0,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +115,7 @@ def offsets_of(trials: Sequence[Trajectory]) -> Offsets:
 
 def repeated_moments(
     groups: Sequence[Sequence[Trajectory]],
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     offsets: Offsets,
     *,
     executor: Executor | None = None,
@@ -172,7 +139,7 @@ def repeated_moments(
 
 
 def refuse_unexcited(
-    moments: Moments, model_class: MonotoneClass, template: Trajectory, offsets: Offsets
+    moments: Moments, model_class: Polynomial, template: Trajectory, offsets: Offsets
 ) -> None:
     """DataError if an input is constant, or the window of inputs and a constant repeat themselves.
 
@@ -202,7 +169,7 @@ def refuse_unexcited(
 
 def plain_moments(
     trials: Sequence[Trajectory],
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     offsets: Offsets,
     *,
     executor: Executor | None = None,
@@ -217,7 +184,7 @@ def plain_moments(
 
 
 def _pair(
-    first: Trajectory, second: Trajectory, model_class: MonotoneClass, offsets: Offsets
+    first: Trajectory, second: Trajectory, model_class: Polynomial, offsets: Offsets
 ) -> Moments:
     N = min(len(first), len(second))
     if model_class.history >= N:
@@ -226,18 +193,18 @@ def _pair(
         )
     one, other = (_rows(trial, N, model_class, offsets) for trial in (first, second))
     if first is second:
-        return _sums(one, one, model_class.degree)
-    return _sums(one, other, model_class.degree) + _sums(other, one, model_class.degree)
+        return _sums(one, one, model_class.degrees.left)
+    return _sums(one, other, model_class.degrees.left) + _sums(other, one, model_class.degrees.left)
 
 
 def _rows(
-    trial: Trajectory, samples: int, model_class: MonotoneClass, offsets: Offsets
+    trial: Trajectory, samples: int, model_class: Polynomial, offsets: Offsets
 ) -> tuple[FloatArray, FloatArray]:
     """Powers y⁰ … (orders, T), and χ (m, T), of the first `samples` samples."""
     y, u = trial.y[:samples, 0] - offsets.y, trial.u[:samples] - offsets.u
     h = model_class.history
     now = y[h:]
-    powers = np.ones((max(2 * model_class.degree, 3), len(now)))
+    powers = np.ones((max(2 * model_class.degrees.left, 3), len(now)))
     for a in range(1, len(powers)):
         np.multiply(powers[a - 1], now, out=powers[a])
     lagged = [y[h - k : samples - k] for k in range(1, model_class.lags + 1)]

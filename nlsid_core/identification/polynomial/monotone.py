@@ -21,11 +21,11 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.polynomial.moment_rie import MomentFit, equation, minimise_moment_rie
 from nlsid_core.identification.polynomial.moments import (
     Moments,
-    MonotoneClass,
     Offsets,
     offsets_of,
     repeated_moments,
 )
+from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.repeats import refuse_false_repeats
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.monotone_equation import is_increasing
@@ -40,9 +40,8 @@ DIVERGED = 1e6  # residual of a simulation that is not finite
 
 def identify_from_repeats(
     data: Dataset,
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     *,
-    kappa: float | None = None,
     transient: int = 0,
     accept_untested_repeats: bool = False,
     slowest: float = 1.0,
@@ -67,13 +66,11 @@ def identify_from_repeats(
         refuse_false_repeats(data, transient=transient)
     offsets = offsets_of([trial for group in groups for trial in group])
     moments = repeated_moments(groups, model_class, offsets, executor=executor)
-    return minimise_moment_rie(
-        moments, model_class, groups[0][0], offsets, kappa=kappa, slowest=slowest
-    )
+    return minimise_moment_rie(moments, model_class, groups[0][0], offsets, slowest=slowest)
 
 
 def least_squares_equation(
-    moments: Moments, model_class: MonotoneClass, template: Trajectory, offsets: Offsets
+    moments: Moments, model_class: Polynomial, template: Trajectory, offsets: Offsets
 ) -> MonotoneEquation:
     """Minimise the mean squared equation error over increasing e; nothing makes the result stable.
 

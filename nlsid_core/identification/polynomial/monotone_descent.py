@@ -18,8 +18,9 @@ from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification.methods.descent import Outputs, Step, descend
 from nlsid_core.identification.polynomial.moment_rie import Problem, equation
-from nlsid_core.identification.polynomial.moments import Moments, MonotoneClass, Offsets
+from nlsid_core.identification.polynomial.moments import Moments, Offsets
 from nlsid_core.identification.polynomial.monotone import sensitivities, simulate_banded
+from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.models import MonotoneEquation
 
 
@@ -31,7 +32,7 @@ class MonotoneSet:
     """
 
     problem: Problem
-    model_class: MonotoneClass
+    model_class: Polynomial
     offsets: Offsets
     trials: Sequence[Trajectory]
 
@@ -52,7 +53,7 @@ class MonotoneSet:
                 return None
             r.append((simulated - trial.y[:, 0])[model.history :])
             moved = sensitivities(model, trial)  # in e₂, e₃, c, a, b
-            J.append(np.hstack([moved[:, : self.model_class.degree - 1], -moved[:, 2:]]))
+            J.append(np.hstack([moved[:, : self.model_class.degrees.left - 1], -moved[:, 2:]]))
         return Outputs(np.concatenate(r), np.concatenate(J))
 
     def cost(self, theta: FloatArray) -> float:
@@ -87,7 +88,7 @@ class MonotoneSet:
 def minimise_certified(
     start: MonotoneEquation,
     moments: Moments,
-    model_class: MonotoneClass,
+    model_class: Polynomial,
     trials: Sequence[Trajectory],
     *,
     slowest: float = 1.0,
@@ -100,7 +101,7 @@ def minimise_certified(
     offsets = Offsets(start.y_offset, start.u_offset)
     problem = Problem.of(moments, len(start), slowest)
     inside = MonotoneSet(problem, model_class, offsets, trials)
-    e = start.e[: model_class.degree]
+    e = start.e[: model_class.degrees.left]
     c = np.concatenate([e, [-start.c], -start.a, -start.b]) / e[0]
     found = descend(inside, c[1:], steps=steps)
     return None if found is None else inside.model(found)

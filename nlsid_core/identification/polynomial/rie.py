@@ -12,6 +12,7 @@ Source: thesis (2.28), Lemma 2.16 and Proposition 4.4.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -20,13 +21,14 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.methods.inequalities import MatrixInequality
 from nlsid_core.identification.methods.newton import Point, minimise, project_columns
 from nlsid_core.identification.polynomial.rows import StateAffineRows
-from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values
 
 ROOM = 0.5  # of the first storage function: V exceeds |x - x̃|²_Q by it
 
 
-def robust_identification_error(problem: StateAffineRows) -> tuple[StateAffineModel, float]:
+def robust_identification_error(
+    problem: StateAffineRows,
+) -> tuple[Any, float]:
     """The model that minimises the RIE, and the RIE itself (scaled, as J).
 
     Raises SolverError if no minimiser is found.

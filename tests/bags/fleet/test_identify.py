@@ -39,7 +39,7 @@ signals:
   excitation: {name: command, unit: m/s, path: "/cmd_vel:twist.linear.x"}
 grid: {period: 0.025, max_gap: 0.1}
 split: {test: ["*_0"]}
-identification: {lags: 2, method: rse_first}
+identification: {lags: 2, iterations: 1}
 """
 FILES = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
 

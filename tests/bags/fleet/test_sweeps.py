@@ -14,7 +14,7 @@ from bags.designs import documents
 from bags.fleet.workers import Workers
 from bags.samples import f1tenth
 from nlsid_core import files
-from nlsid_core.design import design_funnel, integrate_nominal
+from nlsid_core.design import ContinuousTracking, design_funnel, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError
 from tests.bags.fleet.deadly import die
@@ -28,7 +28,7 @@ grid: {period: 0.025, max_gap: 0.1}
 split: {test: ["*0"], validation: ["*5"]}
 identification: IDENTIFICATION
 """
-LAGS = "{lags: 1, method: rse_first}\nselect: {lags: [1, 2, 100]}"
+LAGS = "{lags: 1, iterations: 1}\nselect: {lags: [1, 2, 100]}"
 SEEDS = """{model: block_cascade, orders: [1, 0], phases: [1], intervals: [3], starts: 1}
 select: {seed: [0, 1]}"""
 
@@ -71,9 +71,11 @@ def test_the_l_steps_of_a_funnel_are_the_same_whoever_solves_them() -> None:
     field = VectorField.from_function(pendulum, 2, 1)
     t = np.linspace(0, 2, 5)
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
-    here = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P")
+    here = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"))
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
-        shared = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P", executor=executor)
+        shared = design_funnel(
+            ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"), executor=executor
+        )
     assert len(here.found.history) > 1
     assert here.found.history == shared.found.history
     assert [files.canonical(d.funnel.document()) for d in (here, shared)] == 2 * [

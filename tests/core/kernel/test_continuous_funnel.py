@@ -12,7 +12,13 @@ import pytest
 
 from nlsid_core import files as documents
 from nlsid_core import proofs
-from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    Goal,
+    design_funnel,
+    integrate_nominal,
+)
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.kernel import continuous_funnel, held
@@ -262,7 +268,7 @@ def design() -> FunnelDesign:
     )
     nominal = integrate_nominal(field, lambda _: [0.0], t=np.linspace(0, 0.5, 5), start=[0.0])
     goal = Goal(np.array([0.0625]), np.array([[1.0]]))
-    return design_funnel(field, nominal, goal=goal, limits=[[0, -1.5, 2.0]])
+    return design_funnel(ContinuousTracking(field, nominal, goal=goal, limits=[[0, -1.5, 2.0]]))
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from nlsid_core import proofs
+from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import track, tvlqr
@@ -141,7 +142,7 @@ def test_a_spurious_root_within_the_bound_makes_a_claim_false_and_is_refused() -
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
     design = design_state_funnel(
-        model, policy, feedback, assumption=assumption("peak", 0.01), goal=0.2
+        SampledTracking(model, policy, feedback, assumption=assumption("peak", 0.01), goal=0.2)
     )
     spurious, rest = [Fraction(4)], [Fraction(0)] * 2
     after, h = oracle.implicit_next(model.document(), policy.document(), 0, rest, spurious)

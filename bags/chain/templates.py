@@ -1,0 +1,125 @@
+"""What the names of `identification.model` stand for: structures of the two families of models.
+
+A name opens some options of its family under the keys of the configuration, and fixes others.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any, get_type_hints
+
+from nlsid_core.identification import (
+    CellRow,
+    Degrees,
+    Feedback,
+    FilterMapFilter,
+    ModelClass,
+    Network,
+    Polynomial,
+)
+
+
+@dataclass(frozen=True)
+class Template:
+    """One name.
+
+    says: in a sentence, what such models are. part: whose options are the structure. keys: the
+    option that each key of the configuration sets, of the part or of its family. fixed: options
+    that are not the family's default; a key may change them. needed: keys that have to be given.
+    """
+
+    says: str
+    part: type[Any]
+    keys: Mapping[str, str]
+    fixed: Mapping[str, object] = field(default_factory=dict)
+    needed: tuple[str, ...] = ()
+
+    @property
+    def family(self) -> type[Any]:
+        """The class of the models."""
+        return Polynomial if self.part is Degrees else Network
+
+    def hints(self) -> dict[str, Any]:
+        """The type of each key's values."""
+        known = get_type_hints(self.family) | get_type_hints(self.part)
+        return {key: known[option] for key, option in self.keys.items()}
+
+    def make(self, values: Mapping[str, object]) -> ModelClass:
+        """The class with these values of keys; raises as the family does."""
+        options = {**self.fixed, **{self.keys[key]: value for key, value in values.items()}}
+        own = {option.name for option in fields(self.part)}
+        inner = {name: value for name, value in options.items() if name in own}
+        outer = {name: value for name, value in options.items() if name not in own}
+        place = "degrees" if self.part is Degrees else "structure"
+        made: ModelClass = self.family(**{place: self.part(**inner)}, **outer)
+        return made
+
+    def default(self, key: str) -> object:
+        """What the key is where it is not given."""
+        made: Any = self.make({})
+        for part in (getattr(made, "degrees", None), getattr(made, "structure", None), made):
+            if hasattr(part, self.keys[key]):
+                return getattr(part, self.keys[key])
+        raise KeyError(key)
+
+
+def _same(*keys: str) -> dict[str, str]:
+    """Keys that are called as the options are."""
+    return {key: key for key in keys}
+
+
+TEMPLATES: Mapping[str, Template] = MappingProxyType(
+    {
+        "linear": Template(
+            "Linear difference equations of one input and one output",
+            Degrees,
+            _same("lags"),
+            needed=("lags",),
+        ),
+        "state_affine": Template(
+            "Linear in the outputs, polynomial in the inputs",
+            Degrees,
+            _same("lags", "delays")
+            | {"leading_degree": "leading", "lagged_degree": "lagged", "right_degree": "inputs"}
+            | _same("input_range", "on_out_of_range"),
+            needed=("lags",),
+        ),
+        "monotone": Template(
+            "e(y) affine in past outputs and in inputs, e increasing",
+            Degrees,
+            _same("lags", "delays") | {"degree": "left"},
+            {"left": 3, "set": "3.8"},
+            ("lags",),
+        ),
+        "implicit": Template(
+            "e(y(t)) = f(past outputs, inputs), in a stable set",
+            Degrees,
+            _same("lags", "delays", "set")
+            | {"left_degree": "left", "right_degree": "past", "input_degree": "inputs"}
+            | {"lagged_degree": "lagged"}
+            | _same("output_range", "input_range", "continuous"),
+            {"left": 3, "set": "2.11"},
+        ),
+        "linear_states": Template(
+            "Stable linear models whose state is the measured outputs: x⁺ = A x + B u + c",
+            Degrees,
+            {},
+            {"lags": 1, "delays": (1,), "set": "2.19"},
+        ),
+        "block_cascade": Template(
+            "A filter, a static map, a filter, of one input and one output",
+            FilterMapFilter,
+            _same("orders", "phases", "intervals", "starts", "begin", "seed"),
+        ),
+        "cells": Template(
+            "Scalar states in a row, each contracting by a map of its own; the last is the output",
+            CellRow,
+            _same("cells", "intervals", "limit", "start_samples"),
+        ),
+        "feedback": Template(
+            "A filter with feedback through a static map of its output",
+            Feedback,
+            _same("lags", "intervals", "stages", "imitated", "start_samples", "seed"),
+        ),
+    }
+)

@@ -1,0 +1,235 @@
+"""One setting in, its funnel out: ρ by the backward sweep, and a proof of it for every t.
+
+Nothing is tried here but what the setting says; `attempts` says which settings.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.cliques import CliqueSteps
+from nlsid_core.design.continuous.diagnosis import NoFunnel
+from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.finer import Unproved
+from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
+from nlsid_core.design.continuous.held_sweep import (
+    changes_by_size,
+    held_sweep,
+    widths_by_size,
+    with_widths,
+)
+from nlsid_core.design.continuous.lstep import sections
+from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
+from nlsid_core.design.continuous.setting import Setting
+from nlsid_core.design.continuous.shape import validity_caps
+from nlsid_core.design.continuous.sweep import Ends, sweep_rho
+from nlsid_core.dynamics.taylor import field_of
+from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.factor import refuse_unmonitorable
+from nlsid_core.progress import Progress
+
+MARGINS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)  # times the first, until every piece is proved
+SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
+STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
+
+
+class Found(NamedTuple):
+    """A funnel that is proved for every t, what it was found for, and the margin in 1/s."""
+
+    setting: Setting
+    funnel: ContinuousFunnel
+    proved: Proved
+    margin: float
+
+
+class Swept(NamedTuple):
+    """ρ (K,), the L-steps at the knots if they are at hand, and the setting of their field."""
+
+    setting: Setting
+    rho: FloatArray
+    ends: list[Ends] | None
+
+
+def search(setting: Setting, progress: Progress) -> Found:
+    """ρ by the backward sweep, and its proof; where inputs are held, for bounds of their change.
+
+    Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
+    """
+    expansion, hold = setting.expansion, setting.hold
+    if hold is None or expansion is not None:
+        first = _unheld(setting, progress)
+        if hold is None:
+            return first
+        hold = replace(hold, free=first.funnel.rho, needed=first.margin)
+        setting = replace(first.setting, expansion=None, hold=hold)
+    else:
+        hold = replace(hold, free=_free(setting, progress))
+        setting = replace(setting, hold=hold)
+    span = float(setting.policy.t[-1] - setting.policy.t[0])
+    if hold.shortest > span:
+        raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
+
+    changes = changes_by_size(setting, expansion) if hold.period else {}
+
+    def held(period: float) -> Found:
+        return _held(setting, expansion, replace(hold, period=period), changes, progress)
+
+    if not hold.longest:
+        return held(hold.period)
+    return _longest(held)
+
+
+def _longest(held: Callable[[float], Found]) -> Found:
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for.
+
+    It is looked for in larger and larger steps, and then between the last two.
+    """
+    shorter = -1
+    for step in STEPS:
+        try:
+            found = held(LONGEST / 2 ** (step / 2))
+        except Infeasible as error:
+            refusal, shorter = error, step
+            continue
+        for between in range(shorter + 1, step):
+            with suppress(Infeasible):
+                return held(LONGEST / 2 ** (between / 2))
+        return found
+    raise refusal
+
+
+def _held(
+    setting: Setting, expansion: Expansion | None, hold: Hold, changes: dict[float, Changes],
+    progress: Progress,
+) -> Found:  # fmt: skip
+    """The funnel for one hold, in one that a sweep expects within scaled copies of the free one.
+
+    changes: of the free funnel by size; empty without a hold.
+    """
+    policy, free, t = setting.policy, hold.free, setting.policy.t
+    reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
+    table = widths_by_size(changes, setting, hold)
+    widths = table[-1]
+    for scale in SCALES:
+        try:
+            rho, field = held_sweep(setting, expansion, table, scale * free, progress)
+            policy = replace(policy, vector_field=files.digest(field.document()))
+            outer = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, "")
+            steps = with_widths(replace(setting, policy=policy), field)
+            rates: FloatArray = np.zeros(widths.shape)
+            widths = hold.widths(policy, rates)
+            if hold.period:
+                rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
+            steps.widths = widths
+            caps = validity_caps(field, policy, setting.P, widths)
+            bounded = replace(hold, rates=rates)
+            held = replace(setting, steps=steps, policy=policy, hold=bounded)
+            return _swept(held, np.minimum(caps, rho), progress)
+        except (Infeasible, DataError) as error:
+            refusal = error
+        if isinstance(refusal, NoFunnel):
+            if refusal.t >= reached:  # a smaller copy gets no farther back in time
+                break
+            reached = refusal.t
+    k, i = np.unravel_index(np.argmax(widths), widths.shape)
+    off = f"input {i} is then off by up to {widths[k, i]:.3g} at {policy.t[k]:.3g} s"
+    if not hold.period:
+        raise Infeasible(
+            f"no funnel in which the state may be wrong by {hold.error.tolist()}, not even without "
+            f"a hold: {off}. Take smaller errors, a larger goal, or a larger R ({refusal})"
+        ) from refusal
+    plan = (
+        hold.period
+        * np.abs(np.diff(policy.u.control, axis=1)).sum(axis=1)
+        / np.diff(policy.t)[:, None]
+    )
+    shorter = "" if hold.longest else "a shorter hold (hold='largest' looks for one), "
+    raise Infeasible(
+        f"no funnel in which the input may be {hold.period:g} s old and the state wrong by "
+        f"{hold.error.tolist()}: {off}, of which {plan[k, i]:.3g} is the plan's own change. Take "
+        f"{shorter}a smoother plan, a larger goal, or Q and R that decay faster ({refusal})"
+    ) from refusal
+
+
+def _free(setting: Setting, progress: Progress) -> FloatArray:
+    """ρ (K,) as it is found if nothing is held."""
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    caps = validity_caps(steps.field, policy, P)
+    rho_final = min(setting.rho_final, float(caps[-1]))
+    rho, _ = sweep_rho(
+        steps, sections(steps, policy, P), margin=setting.margin(rho_final),
+        rho_final=rho_final, caps=caps, progress=progress,
+    )  # fmt: skip
+    return rho
+
+
+def _unheld(setting: Setting, progress: Progress) -> Found:
+    """The funnel if nothing is held."""
+    if setting.expansion is not None:
+        return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
+    caps = validity_caps(setting.steps.field, setting.policy, setting.P)
+    cliques = CliqueSteps.of(setting.steps)
+    if cliques is not None:
+        with suppress(Infeasible, SolverError):  # then with every product
+            _, funnel, proved, margin = _swept(replace(setting, steps=cliques), caps, progress)
+            return Found(setting, funnel, proved, margin)
+    return _swept(setting, caps, progress)
+
+
+def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
+    """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    pairs = sections(steps, policy, P)
+    rho_final = min(setting.rho_final, float(caps[-1]))
+
+    expected = setting.hold is not None and setting.hold.rates is not None
+
+    def search(margin: float) -> Swept:
+        found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
+                          expected=expected, progress=progress)  # fmt: skip
+        return Swept(setting, *found)
+
+    return proved_for(setting, rho_final, search)
+
+
+def _expanded(setting: Setting, progress: Progress, margin: float) -> Swept:
+    """The sweep that expands the dynamics around what it finds; the setting has their field."""
+    assert setting.expansion is not None
+    steps, policy = setting.steps, setting.policy
+    found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
+                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
+    field = field_of(found.cubics, policy.t)
+    policy = replace(policy, vector_field=files.digest(field.document()))
+    proving = steps.like(field, policy)
+    proving.kappa = steps.kappa
+    return Swept(replace(setting, steps=proving, policy=policy), found.rho, found.ends)
+
+
+def proved_for(
+    setting: Setting,
+    rho_final: float,
+    search: Callable[[float], Swept],
+) -> Found:
+    """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
+    first = setting.margin(rho_final)
+    for factor in MARGINS:
+        setting, rho, ends = search(factor * first)
+        steps, policy = setting.steps, setting.policy
+        digest = files.digest(policy.document())
+        funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
+        refuse_unmonitorable(funnel)
+        proved = prove_pieces(steps, policy, funnel, ends)
+        if not proved.unproved:
+            return Found(setting, funnel, proved, factor * first)
+    raise Unproved(
+        f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
+        "knots hold: try more knots there",
+        float(policy.t[proved.unproved[-1].interval]),
+    )
