@@ -92,9 +92,9 @@ class Regularity:
 class Sequence:
     """Messages missing from a publisher's own count of what it sent.
 
-    A count that begins anew is a publisher that came back. One that goes back, or stays, again within
-    SOON messages is that of several publishers, of which the middleware does not say who sent what:
-    `mixed`, and from then on `missing` says nothing.
+    A count that begins anew is a publisher that came back. One that goes back, or stays, again
+    within SOON messages is that of several publishers, of which the middleware does not say who
+    sent what: `mixed`, and from then on `missing` says nothing.
     """
 
     missing: int = 0
