@@ -80,9 +80,12 @@ def measured(benchmark: Benchmark, data: Path | None, limit: float) -> dict[str,
     command = benchmark.command(data)
     started, date, load = time.monotonic(), datetime.now(UTC), os.getloadavg()[0]
     with subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, text=True,
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
         start_new_session=True,
-    ) as process:  # fmt: skip
+    ) as process:
         try:
             written, _ = process.communicate(timeout=limit)
         except BaseException:

@@ -100,8 +100,13 @@ def dubins(wind: float) -> Written:
 
     def rate(x: Any, u: Any, w: Any) -> Any:  # position in m, heading and path angle in rad
         level = 10 * np.cos(x[4])
-        return [level * np.cos(x[3]) + w[0], level * np.sin(x[3]) + w[1],
-                10 * np.sin(x[4]) + w[2], u[0], u[1]]  # fmt: skip
+        return [
+            level * np.cos(x[3]) + w[0],
+            level * np.sin(x[3]) + w[1],
+            10 * np.sin(x[4]) + w[2],
+            u[0],
+            u[1],
+        ]
 
     def still(x: Any, u: Any) -> Any:
         return rate(x, u, np.zeros(3))

@@ -185,9 +185,12 @@ def read(bags: Mapping[str, Path], workers: int, manifest: Path | None = None) -
     said, sent = hashlib.sha256(), 0
     with Manifest(manifest) as kept:
         for answer in ask(
-            ReadTrials(load_config(CONFIG)), bags, Workers(workers), kept,
+            ReadTrials(load_config(CONFIG)),
+            bags,
+            Workers(workers),
+            kept,
             progress=note,
-        ):  # fmt: skip
+        ):
             if answer.reason:
                 raise RuntimeError(f"{answer.name}: {answer.reason}")
             said.update(answer.content)

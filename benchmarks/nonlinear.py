@@ -197,18 +197,37 @@ def dart(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
 
 
 SETS = (
-    PublicSet("exchanger", "exchanger", exchanger, PERCENT, {
-        "thesis, 5th iterate, 2 lags": 13.7, "3 lags": 11.4, "4 lags": 9.7, "nlarx": 26.4,
-    }),
-    PublicSet("wh2009", "wh2009", wh2009, "mV", {
-        "SUBNET": 0.241, "block cascades": 0.28, "PNLSS": 0.42,
-    }, skipped=50, factor=1e3),
+    PublicSet(
+        "exchanger",
+        "exchanger",
+        exchanger,
+        PERCENT,
+        {
+            "thesis, 5th iterate, 2 lags": 13.7,
+            "3 lags": 11.4,
+            "4 lags": 9.7,
+            "nlarx": 26.4,
+        },
+    ),
+    PublicSet(
+        "wh2009",
+        "wh2009",
+        wh2009,
+        "mV",
+        {
+            "SUBNET": 0.241,
+            "block cascades": 0.28,
+            "PNLSS": 0.42,
+        },
+        skipped=50,
+        factor=1e3,
+    ),
     PublicSet("EMPS", "emps", emps, "mm", {"lowest read": 2.64}, integrated=True, factor=1e3),
     PublicSet("KUKA, joint 1", "kuka_kr300", kuka_first, "rad/s", {}),
     PublicSet("Schunk, joint 1", "schunk_arm", schunk_first, "rad/s", {}),
     PublicSet("F1TENTH speed", "f1tenth", f1tenth, PERCENT, {}),
     PublicSet("DART yaw rate", "dart", dart, "rad/s", {}),
-)  # fmt: skip
+)
 
 
 def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
@@ -269,9 +288,13 @@ class Budget:
 
 
 def best_of(
-    case: PublicSet, candidates: Sequence[tuple[Any, Method]], data: tuple[Dataset, ...],
-    budget: Budget, *, proved: bool,
-) -> Best | None:  # fmt: skip
+    case: PublicSet,
+    candidates: Sequence[tuple[Any, Method]],
+    data: tuple[Dataset, ...],
+    budget: Budget,
+    *,
+    proved: bool,
+) -> Best | None:
     """The candidate that is judged best, fitted again and tested."""
     train, validation, test = data
     both = Dataset((*train.trajectories, *validation.trajectories))
@@ -342,11 +365,12 @@ def crossed(
     parts = folds(data)
     faster = Dataset(
         tuple(
-            replace(trial, t=trial.t[: len(trial.t[::FASTER])], y=trial.y[::FASTER],
-                    u=trial.u[::FASTER])
+            replace(
+                trial, t=trial.t[: len(trial.t[::FASTER])], y=trial.y[::FASTER], u=trial.u[::FASTER]
+            )
             for trial in shortened(data)
         )
-    )  # fmt: skip
+    )
     outputs: list[FloatArray] = []
     beyond: list[list[FloatArray]] = []
     for k, judged in enumerate(parts):
@@ -383,9 +407,13 @@ def fitted(
 ) -> Fit[Any]:
     """A fit; NlsidError if there is none, or none with a proof where one is asked for."""
     return identify(
-        train, model_class, method=method, comparators=(), transient=case.skipped,
+        train,
+        model_class,
+        method=method,
+        comparators=(),
+        transient=case.skipped,
         allow_unproved=not proved,
-    )  # fmt: skip
+    )
 
 
 def shortened(data: Dataset) -> Dataset:

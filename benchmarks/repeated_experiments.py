@@ -45,10 +45,16 @@ METHODS = (
     "sem_least_squares",
 )
 PUBLISHED = {
-    "n1_T50000.proposed": 6.9, "n8_T50000.proposed": 5.0, "n15_T50000.proposed": 1.3,
-    "n22_T50000.proposed": 1.4, "n1_T5000.proposed": 7.3, "n8_T5000.proposed": 5.9,
-    "n15_T5000.proposed": 3.0, "n15_T50000.seconds": 4.0, "n22_T50000.seconds": 15.0,
-}  # fmt: skip
+    "n1_T50000.proposed": 6.9,
+    "n8_T50000.proposed": 5.0,
+    "n15_T50000.proposed": 1.3,
+    "n22_T50000.proposed": 1.4,
+    "n1_T5000.proposed": 7.3,
+    "n8_T5000.proposed": 5.9,
+    "n15_T5000.proposed": 3.0,
+    "n15_T50000.seconds": 4.0,
+    "n22_T50000.seconds": 15.0,
+}
 
 
 def system() -> MonotoneEquation:
@@ -173,10 +179,13 @@ def measure(trials: int, seconds_left: float = math.inf) -> dict[str, Any]:
         columns["seconds"] = seconds[n, T]
         found[f"n{n}_T{T}"] = {
             **{name: statistics.mean(values) for name, values in columns.items()},
-            **{f"{name}_spread": statistics.stdev(values)
-               for name, values in columns.items() if trials > 1},
+            **{
+                f"{name}_spread": statistics.stdev(values)
+                for name, values in columns.items()
+                if trials > 1
+            },
             "proved": all(proved[n, T]),
-        }  # fmt: skip
+        }
     return found
 
 

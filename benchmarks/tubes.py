@@ -117,11 +117,13 @@ def in_parts(
     """One recording cut into trials of so many samples."""
     return [
         Trajectory(
-            t=period * np.arange(samples), y=y[k : k + samples], u=u[k : k + samples],
+            t=period * np.arange(samples),
+            y=y[k : k + samples],
+            u=u[k : k + samples],
             name=f"{name} {k // samples}",
         )
         for k in range(0, len(y) - samples + 1, samples)
-    ]  # fmt: skip
+    ]
 
 
 def exchanger_case(data: Path) -> Case:
@@ -194,8 +196,10 @@ def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[st
         for data in (case.train, case.calibration)
     )
     u, other_u = ([t.u for t in data] for data in (case.train, case.calibration))
-    spent = [energy(innovations(model, fading.L[None], t, settling)[:, 0], fading)[:, None]
-             for t in case.train]  # fmt: skip
+    spent = [
+        energy(innovations(model, fading.L[None], t, settling)[:, 0], fading)[:, None]
+        for t in case.train
+    ]
     following = followed(spent, u, always=True)
     moving = followed([part**2 for part in errors], u, always=True)
     assert following is not None
@@ -265,9 +269,15 @@ def measure(case: Case) -> dict[str, float | int]:
         )
     keys |= {"update_us": 1e6 * busy, "outside_with_assumption_kept": outside}
     caught = what_it_catches(
-        monitor, model, fading.half_widths.tolist(), held_back=case.judged,
-        calibration=case.calibration, ranges=ranges, factor=FACTOR, remedy="",
-    )  # fmt: skip
+        monitor,
+        model,
+        fading.half_widths.tolist(),
+        held_back=case.judged,
+        calibration=case.calibration,
+        ranges=ranges,
+        factor=FACTOR,
+        remedy="",
+    )
     untouched, *faults = caught.rows
     after = [row.funnel.after for row in faults if np.isfinite(row.funnel.after)]
     keys |= {
@@ -303,8 +313,12 @@ def lasting(samples: int) -> dict[str, float]:
             tenths[tenth].append((time.process_time() - started) / len(trial))
             grown[tenth] = resident_mb(os.getpid())
     first, last = (1e6 * min(tenths[i]) for i in (0, 9))
-    return {"lasting_samples": k, "lasting_first_us": first, "lasting_last_us": last,
-            "lasting_grown_mb": grown[9] - grown[0]}  # fmt: skip
+    return {
+        "lasting_samples": k,
+        "lasting_first_us": first,
+        "lasting_last_us": last,
+        "lasting_grown_mb": grown[9] - grown[0],
+    }
 
 
 def main() -> None:

@@ -112,9 +112,11 @@ def tested(folder: Path, checker: Path) -> dict[str, Any]:
     generate = generator()
     subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", recorded.__name__, TESTS],
-        check=True, cwd=ROOT, env={**os.environ, recorded.FOLDER: str(folder)},
+        check=True,
+        cwd=ROOT,
+        env={**os.environ, recorded.FOLDER: str(folder)},
         stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
     both: Counter[str] = Counter()
     differ: Counter[str] = Counter()
     for case in sorted(folder.iterdir()):

@@ -41,9 +41,15 @@ IMPROVEMENT = 0.01
 ITERATES = 20
 ORDERS = (3, 5, 7)
 PUBLISHED = {
-    "n3.first": 99.9, "n5.first": 66.0, "n7.first": 31.0, "n3.final": 6.5, "n5.final": 4.9,
-    "n7.final": 5.0, "n5.rmse_v": 0.0119, "cascade_mv": 0.241,
-}  # fmt: skip
+    "n3.first": 99.9,
+    "n5.first": 66.0,
+    "n7.first": 31.0,
+    "n3.final": 6.5,
+    "n5.final": 4.9,
+    "n7.final": 5.0,
+    "n5.rmse_v": 0.0119,
+    "cascade_mv": 0.241,
+}
 CASCADE_TRAIN, CASCADE_TEST = slice(5000, 80_000), slice(105_200, 184_000)
 CASCADE = Network(FilterMapFilter(phases=(2, 3), intervals=(24, 48), begin="rest"), seed=1)
 SKIPPED = 50

@@ -98,11 +98,23 @@ def draw(path: Path) -> None:
         p = one.position[begin] + moved[rows] - moved[begin]
         bound = 1000 * width * (2.0 + (one.t[rows] - one.t[begin]) / SPAN)
         first = begin == LAGS
-        above.plot(one.t[rows], p, color="#1f6fb4", lw=1.2,
-                   label=f"simulated, {SPAN:g} s at a time" if first else None)  # fmt: skip
+        above.plot(
+            one.t[rows],
+            p,
+            color="#1f6fb4",
+            lw=1.2,
+            label=f"simulated, {SPAN:g} s at a time" if first else None,
+        )
         below.plot(one.t[rows], 1000 * (one.position[rows] - p), color="#1f6fb4", lw=1.2)
-        below.fill_between(one.t[rows], -bound, bound, color="#1f6fb4", alpha=0.2, lw=0,
-                           label="bound by the proved tube" if first else None)  # fmt: skip
+        below.fill_between(
+            one.t[rows],
+            -bound,
+            bound,
+            color="#1f6fb4",
+            alpha=0.2,
+            lw=0,
+            label="bound by the proved tube" if first else None,
+        )
     above.set_ylabel("position [m]")
     above.legend(loc="upper left", frameon=False)
     below.legend(loc="upper right", frameon=False, ncols=2)

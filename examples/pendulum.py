@@ -36,9 +36,13 @@ def problem() -> tuple[VectorField, Nominal]:
     """The pendulum at rest, upright."""
     most = ROUNDING_ROOM * GRAVITY / LENGTH * ANGLE**5 / 120
     field = VectorField.from_function(
-        taylor, 2, 1, uncertain=[[-most, most]], valid=[[0, -ANGLE, ANGLE], [2, -TORQUE, TORQUE]],
+        taylor,
+        2,
+        1,
+        uncertain=[[-most, most]],
+        valid=[[0, -ANGLE, ANGLE], [2, -TORQUE, TORQUE]],
         expansion="a cubic for the sine, whose remainder is bounded by its fifth-order term",
-    )  # fmt: skip
+    )
     t = np.linspace(0, FINAL_TIME, KNOTS)
     return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 

@@ -56,8 +56,9 @@ def attitude(s: Any, w: Any) -> Any:
     """σ̇ = ¼((1-|σ|²)ω + 2σ×ω + 2σ(σ'ω)); exact."""
     square = s[0] * s[0] + s[1] * s[1] + s[2] * s[2]
     inner = s[0] * w[0] + s[1] * w[1] + s[2] * w[2]
-    return np.array([((1 - square) * w[i] + 2 * cross(s, w)[i] + 2 * inner * s[i]) / 4
-                     for i in range(3)])  # fmt: skip
+    return np.array(
+        [((1 - square) * w[i] + 2 * cross(s, w)[i] + 2 * inner * s[i]) / 4 for i in range(3)]
+    )
 
 
 def spin(w: Any, torque: Any) -> Any:
@@ -107,10 +108,14 @@ def problem(knots: int) -> tuple[VectorField, Nominal, FloatArray]:
     hover = MASS * GRAVITY
     valid = [[6 + i, -TILT, TILT] for i in range(3)] + [[12, hover - THRUST, hover + THRUST]]
     field = VectorField.from_function(
-        taylor, 12, 4, uncertain=np.stack([-most, most], axis=1), valid=valid,
+        taylor,
+        12,
+        4,
+        uncertain=np.stack([-most, most], axis=1),
+        valid=valid,
         expansion="a cubic expansion of the rotation, with a remainder bounded by hand in "
         "examples/quadrotor.py",
-    )  # fmt: skip
+    )
     nominal = integrate_nominal(
         field, inputs, t=np.linspace(0, FINAL_TIME, knots), start=np.zeros(12)
     )

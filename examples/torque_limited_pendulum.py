@@ -43,9 +43,13 @@ def problem() -> tuple[VectorField, Nominal]:
     """The pendulum at rest, upright."""
     most = ROUNDING_ROOM * ANGLE**2 / 120
     field = VectorField.from_function(
-        bounded, 2, 1, uncertain=[[0, most]], valid=[[0, -ANGLE, ANGLE]],
+        bounded,
+        2,
+        1,
+        uncertain=[[0, most]],
+        valid=[[0, -ANGLE, ANGLE]],
         expansion="a cubic for the sine, whose remainder is bounded by its fifth-order term",
-    )  # fmt: skip
+    )
     t = np.linspace(0, FINAL_TIME, KNOTS)
     return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 

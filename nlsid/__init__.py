@@ -87,8 +87,13 @@ __all__ = [
 ]
 
 _FAMILIES: Final = (
-    "Polynomial", "Degrees", "Network", "FilterMapFilter", "CellRow", "Feedback",
-)  # fmt: skip
+    "Polynomial",
+    "Degrees",
+    "Network",
+    "FilterMapFilter",
+    "CellRow",
+    "Feedback",
+)
 _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
 _MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")

@@ -28,11 +28,22 @@ from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
 
 Noun: TypeAlias = (
-    ContinuousFunnel | SampledFunnel | TubeFunnel
-    | ContinuousPolicy | SampledPolicy | TubePolicy | VectorField
-    | BlockCascade | CellNetwork | DifferenceEquation | ImplicitModel | MonotoneEquation
-    | StateAffineModel | StateModel | TrapezoidalModel
-)  # fmt: skip
+    ContinuousFunnel
+    | SampledFunnel
+    | TubeFunnel
+    | ContinuousPolicy
+    | SampledPolicy
+    | TubePolicy
+    | VectorField
+    | BlockCascade
+    | CellNetwork
+    | DifferenceEquation
+    | ImplicitModel
+    | MonotoneEquation
+    | StateAffineModel
+    | StateModel
+    | TrapezoidalModel
+)
 
 # By format, and by kind where the format has kinds.
 READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType(

@@ -13,8 +13,10 @@ from typing import Literal
 BUILT = Path(__file__).resolve().parents[1] / "verified" / "build" / "nlsid-second"
 PATIENCE = 600.0  # s
 _VERDICTS: dict[int, Literal["accepted", "refused", "not covered"]] = {
-    0: "accepted", 1: "refused", 3: "not covered",
-}  # fmt: skip
+    0: "accepted",
+    1: "refused",
+    3: "not covered",
+}
 
 
 @dataclass(frozen=True)

@@ -266,12 +266,21 @@ class Excitation(ManagedNode):
     def _play(self, start_ns: int) -> None:
         self._next, self._start_ns, self._sent = 0, start_ns, time.monotonic()
         self._did = {
-            "kind": self._kind, "signal": str(self._command.path), "period": self._period,
-            "duration": self._duration, "repeat": self._repeat + 1, "repeats": self._repeats,
-            "pause": self._pause, "seed": self._seed, "lowest_hz": self._lowest_hz,
-            "highest_hz": self._highest_hz, "hold": self._hold, "limits": vars(self._shape),
-            "start_ns": self._start_ns, "repeat_group": self._group,
-        }  # fmt: skip
+            "kind": self._kind,
+            "signal": str(self._command.path),
+            "period": self._period,
+            "duration": self._duration,
+            "repeat": self._repeat + 1,
+            "repeats": self._repeats,
+            "pause": self._pause,
+            "seed": self._seed,
+            "lowest_hz": self._lowest_hz,
+            "highest_hz": self._highest_hz,
+            "hold": self._hold,
+            "limits": vars(self._shape),
+            "start_ns": self._start_ns,
+            "repeat_group": self._group,
+        }
         self._experiment.publish(String(data=json.dumps(self._did)))
         self._say(f"repeat {self._repeat + 1} of {self._repeats}")
 

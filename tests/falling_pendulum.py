@@ -17,9 +17,11 @@ def tracking(**options: Any) -> ContinuousTracking:
     """A swing of 0.3 rad in a second."""
     field = VectorField.from_function(turning, 2, 1, uncertain=[[-0.01, 0.01]])
     nominal = integrate_nominal(
-        field, lambda t: np.array([-9.0 * 0.3 * np.cos(2.0 * t)]), t=np.linspace(0, 1, 26),
+        field,
+        lambda t: np.array([-9.0 * 0.3 * np.cos(2.0 * t)]),
+        t=np.linspace(0, 1, 26),
         start=np.array([0.25, 0.0]),
-    )  # fmt: skip
+    )
     return ContinuousTracking(
         field, nominal, goal=np.diag([25.0, 4.0]), Q=np.diag([500.0, 40.0]), R=[[1.0]], **options
     )

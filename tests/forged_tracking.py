@@ -98,16 +98,19 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
     return replace(design, proof=proof)
 
 
+# What contradicts what was measured: true claims, under assumptions that nobody should make.
+CONTRADICTIONS = [
+    "assumption made smaller",
+    "safety factor below one",
+    "commissioning runs are the fitting bags",
+    "no commissioning runs",
+]
 FORGERIES = [
     "tube cut by 2 %",
     "one level of the tube cut by 2 %",
     "goal 2 % below what is reached",
     "inlet raised by 2 %",
     "levels and reaches cut by 2 %",
-    "assumption made smaller",
-    "safety factor below one",
-    "commissioning runs are the fitting bags",
-    "no commissioning runs",
     "another nominal",
     "gain 3 % smaller",
     "another model",

@@ -9,8 +9,11 @@ from nlsid_core.design import FunnelDesign
 
 Files = dict[str, Any]
 FIELD, POLICY, FUNNEL, PROOF = (
-    "vector_field.json", "policy.json", "funnel.json", "funnel.proof.json",
-)  # fmt: skip
+    "vector_field.json",
+    "policy.json",
+    "funnel.json",
+    "funnel.proof.json",
+)
 ROLES = {"vector_field": FIELD, "policy": POLICY, "funnel": FUNNEL}
 
 

@@ -22,12 +22,18 @@ FUNNEL: dict[str, Any] = {"funnel": {"safety_factor": 1.5}}
 # identification sections, of bags with one output and with two
 ONE: dict[str, dict[str, Any]] = {
     "linear": {"model": "linear", "lags": 3, "iterations": 3},
-    "block_cascade": {"model": "block_cascade", "orders": [2, 1], "phases": [1],
-                      "intervals": [8], "starts": 4, "transient": 60},
+    "block_cascade": {
+        "model": "block_cascade",
+        "orders": [2, 1],
+        "phases": [1],
+        "intervals": [8],
+        "starts": 4,
+        "transient": 60,
+    },
     "cells": {"model": "cells", "intervals": 4},
     "monotone": {"model": "monotone", "lags": 2, "method": "rie"},
     "implicit": {"model": "implicit", "lags": 2},
-}  # fmt: skip
+}
 TWO: dict[str, dict[str, Any]] = {
     "state_affine": {"model": "state_affine", "lags": 2, "iterations": 2, "leading_degree": 0},
     "linear_states": {"model": "linear_states"},

@@ -13,8 +13,11 @@ def quintic() -> ImplicitModel:
     return ImplicitModel.separable(
         e=Polynomials(np.array([[1], [5]]), np.array([[1.0], [0.2]])),
         f=Polynomials(np.array([[3, 0], [0, 1]]), np.array([[1.0 / 3.0], [1.0]])),
-        monotonicity=0.5, period=0.1, states=("v",), inputs=("force",),
-    )  # fmt: skip
+        monotonicity=0.5,
+        period=0.1,
+        states=("v",),
+        inputs=("force",),
+    )
 
 
 def coupled() -> ImplicitModel:
@@ -28,8 +31,11 @@ def coupled() -> ImplicitModel:
             np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [3, 0, 0]]),
             np.array([[0.4, -0.3], [0.3, 0.4], [1.0, 0.0], [0.0, 0.05]]),
         ),
-        monotonicity=0.9, period=0.1, states=("a", "b"), inputs=("u",),
-    )  # fmt: skip
+        monotonicity=0.9,
+        period=0.1,
+        states=("a", "b"),
+        inputs=("u",),
+    )
 
 
 def lagged(a1: float = 0.5, a2: float = -0.3) -> ImplicitModel:
@@ -40,8 +46,11 @@ def lagged(a1: float = 0.5, a2: float = -0.3) -> ImplicitModel:
             np.array([[3.0], [1.0], [-3.0 * a1], [-3.0 * a2], [-1.0]]),
         ),
         shift=Polynomials(np.array([[1, 0, 0]]), np.array([[1.0]])),
-        monotonicity=1.5, period=0.1, states=("y1", "y2"), inputs=("u",),
-    )  # fmt: skip
+        monotonicity=1.5,
+        period=0.1,
+        states=("y1", "y2"),
+        inputs=("u",),
+    )
 
 
 def cubic_spring() -> ImplicitModel:
@@ -52,8 +61,11 @@ def cubic_spring() -> ImplicitModel:
             np.array([[1.0], [1.0], [0.25], [-0.5], [-1.0]]),
         ),
         shift=Polynomials(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))),
-        monotonicity=0.5, period=0.1, states=("x",), inputs=("u",),
-    )  # fmt: skip
+        monotonicity=0.5,
+        period=0.1,
+        states=("x",),
+        inputs=("u",),
+    )
 
 
 def rotated(degrees: float = 120.0) -> ImplicitModel:
@@ -68,9 +80,12 @@ def rotated(degrees: float = 120.0) -> ImplicitModel:
             np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
             np.array([[0.3, 0.1], [-0.1, 0.3], [1.0, 0.5]]),
         ),
-        monotonicity=0.9, period=0.1, states=("a", "b"), inputs=("u",),
+        monotonicity=0.9,
+        period=0.1,
+        states=("a", "b"),
+        inputs=("u",),
         centre=Polynomials(basis[:2], R.T),
-    )  # fmt: skip
+    )
 
 
 def linear(A: FloatArray) -> ImplicitModel:
@@ -83,5 +98,8 @@ def linear(A: FloatArray) -> ImplicitModel:
     return ImplicitModel.separable(
         e=Polynomials(units[:2, :2], P),
         f=Polynomials(units, np.vstack([(P @ A).T, [[1.0, 0.0]]])),
-        monotonicity=0.5, period=0.1, states=("a", "b"), inputs=("u",),
-    )  # fmt: skip
+        monotonicity=0.5,
+        period=0.1,
+        states=("a", "b"),
+        inputs=("u",),
+    )

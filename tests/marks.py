@@ -11,8 +11,9 @@ def slow_among(cases: Iterable[Any], names: Collection[Any]) -> list[Any]:
 
     A case's name is the case itself; of a tuple it is the first entry, of a function its name.
     """
-    return [pytest.param(*_values(c), marks=pytest.mark.slow) if _name(c) in names else c
-            for c in cases]  # fmt: skip
+    return [
+        pytest.param(*_values(c), marks=pytest.mark.slow) if _name(c) in names else c for c in cases
+    ]
 
 
 def _values(case: Any) -> tuple[Any, ...]:

@@ -11,9 +11,14 @@ EXACT = 1e-10  # agreement of two floating-point routes to the same number
 
 
 def problem(
-    *, outputs: int = 1, trials: int = 2, samples: int = 24, noise: float = 0.05,
-    model_class: Polynomial | None = None, seed: int = 3,
-) -> StateAffineRows:  # fmt: skip
+    *,
+    outputs: int = 1,
+    trials: int = 2,
+    samples: int = 24,
+    noise: float = 0.05,
+    model_class: Polynomial | None = None,
+    seed: int = 3,
+) -> StateAffineRows:
     """Rows of a small nonlinear system with `outputs` coupled outputs."""
     rng = np.random.default_rng(seed)
     trajectories = []

@@ -29,8 +29,17 @@ def tanks(seed: int, samples: int = 1024, h: tuple[float, float] = (4.0, 5.0)) -
         lower += k2 * np.sqrt(upper) - k3 * np.sqrt(lower) + SHARE * over
         upper, lower = max(min(z, HEIGHT), 0.0), max(min(lower, HEIGHT), 0.0)
     measured = np.array(y) + NOISE * rng.standard_normal(samples)
-    return Dataset((
-        Trajectory(t=4.0 * np.arange(samples), y=measured[:, None], u=u[:, None],
-                   y_names=("level",), u_names=("pump",), y_units=("V",), u_units=("V",),
-                   name=f"synthetic tanks {seed}"),
-    ))  # fmt: skip
+    return Dataset(
+        (
+            Trajectory(
+                t=4.0 * np.arange(samples),
+                y=measured[:, None],
+                u=u[:, None],
+                y_names=("level",),
+                u_names=("pump",),
+                y_units=("V",),
+                u_units=("V",),
+                name=f"synthetic tanks {seed}",
+            ),
+        )
+    )

@@ -16,10 +16,16 @@ class WebSocket:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=60.0)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
-            f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket",
-            "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13",
-            *([f"Sec-WebSocket-Protocol: {protocol}"] if protocol else []), "", "",
-        ]  # fmt: skip
+            f"GET {path} HTTP/1.1",
+            f"Host: 127.0.0.1:{port}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            f"Sec-WebSocket-Key: {key}",
+            "Sec-WebSocket-Version: 13",
+            *([f"Sec-WebSocket-Protocol: {protocol}"] if protocol else []),
+            "",
+            "",
+        ]
         self._socket.sendall("\r\n".join(lines).encode())
         self._stream = self._socket.makefile("rb")
         self.accepted = self._stream.readline().startswith(b"HTTP/1.1 101")

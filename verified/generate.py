@@ -95,9 +95,11 @@ def compared(problem: Problem, text: str) -> dict[str, Any]:
     """The terms of the theorem, which print as the files that it was made of."""
     terms = printed.read(text)
     write = {
-        Funnel: printed.funnel, Increments: printed.near, Sampled: printed.sampled,
+        Funnel: printed.funnel,
+        Increments: printed.near,
+        Sampled: printed.sampled,
         Composition: printed.composed,
-    }[type(problem)]  # fmt: skip
+    }[type(problem)]
     printed.differences(write(terms, problem.files), problem.files)
     return terms
 

@@ -194,16 +194,22 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
         proof |= stated
     return {
         "vector_field": {
-            "states": states, "inputs": inputs, "uncertain": number(uncertain),
-            "breaks": number(breaks), "valid": rows, "pieces": pieces,
+            "states": states,
+            "inputs": inputs,
+            "uncertain": number(uncertain),
+            "breaks": number(breaks),
+            "valid": rows,
+            "pieces": pieces,
         },
         "policy": {
-            **around, "u": number(feeds), "K": number(feedback),
+            **around,
+            "u": number(feeds),
+            "K": number(feedback),
             "limits": [[i, *number(ends)] for i, ends in clips],
         },
         "funnel": {**around, "P": shapes, "rho": levels},
         "proof": {"claim": claim, "proof": proof},
-    }  # fmt: skip
+    }
 
 
 def composed(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
@@ -241,10 +247,13 @@ def _witness(term: Made, limited: int, states: int, order: list[Any]) -> dict[st
     if any(found.values()):
         raise Differs("pieces that the file does not have")
     return {
-        "margin": number(margin), **exponents, "sides": exponents["sides"] or None,
-        "kappa": kappa if pushed.name == "true" else None, "pieces": pieces,
+        "margin": number(margin),
+        **exponents,
+        "sides": exponents["sides"] or None,
+        "kappa": kappa if pushed.name == "true" else None,
+        "pieces": pieces,
         "goal_multiplier": number(least),
-    }  # fmt: skip
+    }
 
 
 def _held(
@@ -292,15 +301,20 @@ def _piece(interval: int, piece: Made, limited: int) -> dict[str, Any]:
         raise Differs(f"a mode {mode} of {limited} clipped inputs")
     digits = [mode // 3**i % 3 - 1 for i in reversed(range(limited))]
     return {
-        "interval": interval, "vertex": vertex, "level": depth, "index": index,
+        "interval": interval,
+        "vertex": vertex,
+        "level": depth,
+        "index": index,
         "mu": {
-            "shifts": [shift for shift, _ in rows], "start": [a for _, (a, _) in rows],
+            "shifts": [shift for shift, _ in rows],
+            "start": [a for _, (a, _) in rows],
             "end": [b for _, (_, b) in rows],
         },
         "mode": digits or None,
         "tau": [{"columns": c, "squares": _squares(s)} for c, s in tau] or None,
-        "columns": columns, "squares": _squares(squares),
-    }  # fmt: skip
+        "columns": columns,
+        "squares": _squares(squares),
+    }
 
 
 def _squares(term: Made) -> dict[str, Any]:
@@ -322,20 +336,30 @@ def sampled(terms: dict[str, Any], _files: dict[str, tuple[str, Any]]) -> dict[s
     variables = range(1, len(x_range) + 1)
     return {
         "model": {
-            "exponents": exponents, "coefficients": number(coefficients),
-            "x_range": number(x_range), "u_range": number(u_range),
+            "exponents": exponents,
+            "coefficients": number(coefficients),
+            "x_range": number(x_range),
+            "u_range": number(u_range),
         },
         "policy": dict(zip("uxK", map(number, terms["policy"].terms), strict=True)),
         "funnel": {
             "assumption": {"form": form.name.lower(), "bound": bound, "rate": rate, "gain": gain},
-            "tube": tube, "inlet": inlet, "half_widths": half_widths, "S": S, "A": A,
+            "tube": tube,
+            "inlet": inlet,
+            "half_widths": half_widths,
+            "S": S,
+            "A": A,
         },
-        "proof": {"proof": {
-            **{name: [[row.count(i) for i in variables] for row in rows]
-               for name, rows in zip(names, bases, strict=True)},
-            "steps": [_link(link) for link in links],
-        }},
-    }  # fmt: skip
+        "proof": {
+            "proof": {
+                **{
+                    name: [[row.count(i) for i in variables] for row in rows]
+                    for name, rows in zip(names, bases, strict=True)
+                },
+                "steps": [_link(link) for link in links],
+            }
+        },
+    }
 
 
 def _link(link: Made) -> dict[str, Any]:
@@ -348,19 +372,23 @@ def _link(link: Made) -> dict[str, Any]:
 def _chain(chain: Made) -> dict[str, Any]:
     reach, columns, squares, ball_columns, ball = chain.terms
     return {
-        "reach": number(reach), "columns": columns, "squares": _squares(squares),
+        "reach": number(reach),
+        "columns": columns,
+        "squares": _squares(squares),
         "ball": {"columns": ball_columns, "squares": _squares(ball)},
-    }  # fmt: skip
+    }
 
 
 def near(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
     """The files of a tube or of stability, and the proof."""
     documents: dict[str, Any] = {"model": _model(terms["data"], files["model"][1])}
     if "tubes" not in terms:
-        return documents | {"proof": {
-            "claim": {"rate": number(terms["rate"])},
-            "proof": {"P": number(terms["storage"]), "multipliers": _tree(terms["proof"], 1)},
-        }}  # fmt: skip
+        return documents | {
+            "proof": {
+                "claim": {"rate": number(terms["rate"])},
+                "proof": {"P": number(terms["storage"]), "multipliers": _tree(terms["proof"], 1)},
+            }
+        }
     names = ("rho", "L", "P", "R", "tau", "half_widths", "level", "inlet")
     tubes = [dict(zip(names, map(number, tube.terms), strict=True)) for tube in terms["tubes"]]
     documents["funnel"] = {"tubes": tubes}
@@ -411,10 +439,12 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
         if like["kind"] == "block_cascade":
             return _cascade(maps, known, like)
         rows = {
-            name: [row + [Fraction(c) for c in whole[len(row) :]]
-                   for row, whole in zip(stated, like[name], strict=True)]
+            name: [
+                row + [Fraction(c) for c in whole[len(row) :]]
+                for row, whole in zip(stated, like[name], strict=True)
+            ]
             for name, stated in zip(("into", "next", "output"), known, strict=True)
-        }  # fmt: skip
+        }
         tables = [number(f.terms[0]) for f in maps]
         points = [{"knots": [k for k, _ in f], "values": [v for _, v in f]} for f in tables]
         return {"maps": points, **rows}

@@ -156,10 +156,13 @@ def polynomials(
 def model(document: dict[str, Any]) -> Sizes:
     """A model of a kind that the theorems speak of."""
     kinds = {
-        "difference_equation": _difference, "state_affine": _affine,
-        "monotone_equation": _monotone, "cell_network": _cells, "implicit": _implicit,
+        "difference_equation": _difference,
+        "state_affine": _affine,
+        "monotone_equation": _monotone,
+        "cell_network": _cells,
+        "implicit": _implicit,
         "block_cascade": _cascade,
-    }  # fmt: skip
+    }
     head(document, "model", kinds)
     need(real(document.get("period"), "period") > 0, "the period should be > 0")
     return kinds[document["kind"]](document)

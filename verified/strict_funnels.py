@@ -93,8 +93,11 @@ def squares(entry: dict[str, Any], where: str, k: int) -> None:
 
 def vector_field(document: Any) -> tuple[int, int, int]:
     """n, m and the number of uncertain inputs."""
-    members(document, "vector_field",
-            "format version states inputs uncertain breaks valid expansion pieces")  # fmt: skip
+    members(
+        document,
+        "vector_field",
+        "format version states inputs uncertain breaks valid expansion pieces",
+    )
     word(document["format"], "format", ["nlsid/vector_field"])
     n = whole(document["states"], "states", 1, ENTRIES)
     m = whole(document["inputs"], "inputs", 0, ENTRIES)
@@ -165,9 +168,12 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
         errors = reals(claim["error"], "error", n)
         need(min(errors) >= 0, "error >= 0")
     affine = all(
-        e <= 1 for piece in field["pieces"] for equation in piece for row in equation["exponents"]
+        e <= 1
+        for piece in field["pieces"]
+        for equation in piece
+        for row in equation["exponents"]
         for e in row[1 + n : 1 + n + m]
-    )  # fmt: skip
+    )
     need(affine or not claim.keys() & {"hold", "error"}, "the equations are not affine in an input")
     required = "basis pieces margin multiplier" + " sides" * (limits > 0 or held)
     required += " goal_multiplier" * ("goal" in claim) + " rates rate_pieces" * held
@@ -227,8 +233,11 @@ def sampled(files: dict[str, tuple[str, Any]]) -> None:
     )
     n, p = _map(model)
     members(policy, "policy", "format version kind law model period L u x K")
-    members(funnel, "funnel", "format version kind set model policy assumption tube inlet "
-            "half_widths S A")  # fmt: skip
+    members(
+        funnel,
+        "funnel",
+        "format version kind set model policy assumption tube inlet half_widths S A",
+    )
     for name, file in (("policy", policy), ("funnel", funnel)):
         head(file, name, ("sampled",))
     need(real(policy["period"], "period") == real(model["period"], "period"), "another period")
@@ -264,8 +273,12 @@ def sampled(files: dict[str, tuple[str, Any]]) -> None:
 def _map(model: dict[str, Any]) -> tuple[int, int]:
     """The numbers of states and inputs of an explicit model."""
     head(model, "model", ("state_map",))
-    members(model, "model", "format version kind equation period x u exponents coefficients "
-            "x_range u_range noise disturbance bags")  # fmt: skip
+    members(
+        model,
+        "model",
+        "format version kind equation period x u exponents coefficients "
+        "x_range u_range noise disturbance bags",
+    )
     n, p = (len(signals(model[key], key, 1, ENTRIES)) for key in "xu")
     need(real(model["period"], "period") > 0, "the period should be > 0")
     rows = listed(model["exponents"], "exponents", 1, MONOMIALS)

@@ -175,10 +175,12 @@ class Writer:
         if kind == "state_affine":
             p, n = len(model["y"]), len(model["y"]) * (len(model["G"]) - 1)
             ranges = [
-                [(number(end) - number(model["u_offset"][i])) / number(model["u_scale"][i])
-                 for end in model["u_range"][i]]
+                [
+                    (number(end) - number(model["u_offset"][i])) / number(model["u_scale"][i])
+                    for end in model["u_range"][i]
+                ]
                 for i, _ in model["window"]
-            ]  # fmt: skip
+            ]
             return self.affine(p, n, model["y_scale"], ranges, beside(model["G"], p))
         if kind == "implicit":
             return self.implicit(model)
@@ -198,9 +200,13 @@ class Writer:
         raise NotCovered(f"models of kind {kind} are not covered")
 
     def affine(
-        self, p: int, n: int, scale: list[Any], ranges: list[list[Fraction]],
+        self,
+        p: int,
+        n: int,
+        scale: list[Any],
+        ranges: list[list[Fraction]],
         terms: list[tuple[list[int], list[list[Any]]]],
-    ) -> str:  # fmt: skip
+    ) -> str:
         """0 = (a matrix polynomial in w) [v; x] + what the inputs add, x+ = [v; x] cut off."""
         to = self.to
         rows = to.listed(to.pair(self.counts(e, 20), self.matrix(C)) for e, C in terms)
@@ -229,8 +235,13 @@ class Writer:
         if all(sum(e) == 1 for e, _ in known):
             if moved != shifted(n, p):
                 raise NotCovered("an implicit model that does more than shift its states")
-            E = [[sum((number(row[i]) for e, row in known if e[j]), Fraction(0))
-                  for j in range(p + n)] for i in range(p)]  # fmt: skip
+            E = [
+                [
+                    sum((number(row[i]) for e, row in known if e[j]), Fraction(0))
+                    for j in range(p + n)
+                ]
+                for i in range(p)
+            ]
             return self.affine(p, n, [1] * p, [], [([], E)])
         cubic, a = [Fraction(0)] * 4, [Fraction(0)] * n
         for e, row in known:
@@ -274,11 +285,16 @@ class Writer:
     def tube(self, tube: dict[str, Any]) -> str:
         """The numbers of one tube."""
         return self.to.made(
-            "Tube", self.num(tube["rho"]), self.matrix(tube["L"]),
-            self.symmetric(tube["P"], "P"), self.symmetric(tube["R"], "R"),
-            self.nums(tube["tau"]), self.nums(tube["half_widths"]), self.num(tube["level"]),
+            "Tube",
+            self.num(tube["rho"]),
+            self.matrix(tube["L"]),
+            self.symmetric(tube["P"], "P"),
+            self.symmetric(tube["R"], "R"),
+            self.nums(tube["tau"]),
+            self.nums(tube["half_widths"]),
+            self.num(tube["level"]),
             self.num(tube["inlet"]),
-        )  # fmt: skip
+        )
 
     def shifts(self, values: Iterable[Any]) -> str:
         """Powers of two."""
@@ -363,9 +379,10 @@ class Writer:
     def chain(self, chain: dict[str, Any]) -> str:
         """Those of a chain of radii."""
         sums = (
-            term for entry in (chain, chain["ball"])
+            term
+            for entry in (chain, chain["ball"])
             for term in (self.shifts(entry["columns"]), self.squares(entry["squares"]))
-        )  # fmt: skip
+        )
         return self.to.made("Chain", self.num(chain["reach"]), *sums)
 
     def curves(self, name: str, intervals: Iterable[Any], entry: Any) -> str:
@@ -460,6 +477,11 @@ class Writer:
         vertex = integer(piece["vertex"], 0, 1023)
         place = to.whole(level), to.whole(index), to.count(vertex), to.count(mode)
         return to.made(
-            "Piece", *place, self.nums(kappa), to.made("big_mu", lines),
-            self.shifts(piece["columns"]), self.squares(piece["squares"]), tau,
-        )  # fmt: skip
+            "Piece",
+            *place,
+            self.nums(kappa),
+            to.made("big_mu", lines),
+            self.shifts(piece["columns"]),
+            self.squares(piece["squares"]),
+            tau,
+        )

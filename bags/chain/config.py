@@ -48,11 +48,13 @@ class SignalsConfig(Section):
     @property
     def topics(self) -> tuple[str, ...]:
         """What the signals are read from, each topic once."""
-        return tuple(dict.fromkeys(
-            factor.path.topic
-            for signal in (*self.response, *self.excitation)
-            for factor in parse_factors(signal.path)
-        ))  # fmt: skip
+        return tuple(
+            dict.fromkeys(
+                factor.path.topic
+                for signal in (*self.response, *self.excitation)
+                for factor in parse_factors(signal.path)
+            )
+        )
 
 
 class GridConfig(Section):

@@ -151,9 +151,12 @@ def _read(section: object) -> IdentificationConfig:
     usual = next((one for one in methods if one.word == chosen), METHODS[chosen]())
     names = _names(usual)
     method = _made(
-        partial(_changed, usual), get_type_hints(type(usual)),
-        {key: left.pop(key) for key in names if key in left}, {}, wrong,
-    )  # fmt: skip
+        partial(_changed, usual),
+        get_type_hints(type(usual)),
+        {key: left.pop(key) for key in names if key in left},
+        {},
+        wrong,
+    )
     if method is not None and methods and method.name not in [one.name for one in methods]:
         what = f"should be {str(not method.certified).lower()} for this model class"
         wrong.append(_wrong(("certified",), method.certified, what))

@@ -25,8 +25,21 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
-MEMBERS = ("format", "version", "shape", "gain", "vector_field",
-           "nominal", "goal", "Q", "R", "limits", "hold", "error", "push")  # fmt: skip
+MEMBERS = (
+    "format",
+    "version",
+    "shape",
+    "gain",
+    "vector_field",
+    "nominal",
+    "goal",
+    "Q",
+    "R",
+    "limits",
+    "hold",
+    "error",
+    "push",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +111,9 @@ class FunnelProblem:
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
         usual = {
-            "shape": "rho", "gain": "constant",
-        }  # fmt: skip
+            "shape": "rho",
+            "gain": "constant",
+        }
         words = usual | document
         return cls(
             field,

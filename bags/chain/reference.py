@@ -49,8 +49,10 @@ IDENTIFICATION = """
 def page() -> str:
     """The whole page."""
     lines = [HEAD]
-    for title, kind in (("nlsid identify", Config),
-                        ("a measured state and its motion", TrackingConfig)):  # fmt: skip
+    for title, kind in (
+        ("nlsid identify", Config),
+        ("a measured state and its motion", TrackingConfig),
+    ):
         lines.append(f"## The file of `{title}`\n")
         for name, section in _sections("", kind):
             lines += [*_section(name, section), ""]

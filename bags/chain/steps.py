@@ -156,9 +156,14 @@ def write_identified(
     if report_available():
         written.append(out / documents.REPORT)
         write_report(
-            written[-1], fit, trials.train, trials.test,
-            validation=trials.validation, calibration=trials.calibration, robot=config.robot,
-        )  # fmt: skip
+            written[-1],
+            fit,
+            trials.train,
+            trials.test,
+            validation=trials.validation,
+            calibration=trials.calibration,
+            robot=config.robot,
+        )
     progress("done", 1.0)
     return Identified(fit, trials, tuple(written))
 

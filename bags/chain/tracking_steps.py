@@ -183,9 +183,15 @@ def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
 
     def used(run: Trajectory) -> float:
         sizes = disturbance_of(
-            made.model, made.policy, run, S=funnel.S, A=funnel.A, form=a.form, rate=a.rate,
+            made.model,
+            made.policy,
+            run,
+            S=funnel.S,
+            A=funnel.A,
+            form=a.form,
+            rate=a.rate,
             gain=a.gain,
-        )  # fmt: skip
+        )
         return float(np.max(sizes)) / a.bound
 
     return breaking(runs, used)

@@ -389,8 +389,9 @@ def import_command(
         out.print(
             f"units by the message types, not by the table: {units}; where a column is in another, "
             "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 def _say_notes(notes: "Sequence[str]") -> None:

@@ -90,7 +90,7 @@ def _prepare_streams() -> None:
 
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if isinstance(stream, io.TextIOWrapper):  # not where it is closed
+        if type(stream) is io.TextIOWrapper:  # neither closed nor captured by who called
             written = io.BufferedWriter(_Written(stream.fileno(), "wb", closefd=False))
             patient = io.TextIOWrapper(
                 written, stream.encoding, stream.errors, line_buffering=stream.line_buffering

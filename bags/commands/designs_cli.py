@@ -91,9 +91,14 @@ def funnel(
             from bags.recordings.folders import expand_bags
 
             given, broken = measured(
-                problem, expand_bags(bags), responses=response or (), excitations=excitation or (),
-                period=period or None, seconds=seconds or None, safety_factor=safety_factor,
-            )  # fmt: skip
+                problem,
+                expand_bags(bags),
+                responses=response or (),
+                excitations=excitation or (),
+                period=period or None,
+                seconds=seconds or None,
+                safety_factor=safety_factor,
+            )
             out.print(show.breaking_table(broken))
         _funnel_around_trajectory(given, folder, Workers(workers, scheduler))
         return

@@ -90,9 +90,13 @@ def check(
     named = named_bags(bags, patience=patience)
     with progress_bar("checking") as progress:
         found = check_fleet(
-            named, settings, workers=Workers(workers, scheduler),
-            manifest=manifest, folder=robot, progress=progress,
-        )  # fmt: skip
+            named,
+            settings,
+            workers=Workers(workers, scheduler),
+            manifest=manifest,
+            folder=robot,
+            progress=progress,
+        )
     if table is not None:
         write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
@@ -108,7 +112,7 @@ def check(
         console.print(
             "no command moves in any bag that can be used: there is little to identify from",
             soft_wrap=True,
-        )  # fmt: skip
+        )
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
     if counts[BAD] or counts[UNREAD]:
@@ -165,12 +169,16 @@ def monitor(
     named = named_bags(bags, patience=patience)
     with progress_bar("judging") as progress:
         found = monitor_fleet(
-            named, funnel, proved,
+            named,
+            funnel,
+            proved,
             centre=show.centre_of(settings),
             definitions=read_definitions(settings.definitions if settings else ()),
             workers=Workers(workers, scheduler),
-            manifest=manifest, folder=robot, progress=progress,
-        )  # fmt: skip
+            manifest=manifest,
+            folder=robot,
+            progress=progress,
+        )
     if table is not None:
         write_parquet(found.rows, table)
     _say_verdicts(found, manifest, table)
@@ -179,8 +187,10 @@ def monitor(
         centre = f" --config {config}" if config else ""
         console.print(
             f"look at the first: nlsid view {folder} {worst}{centre}",
-            soft_wrap=True, markup=False, highlight=False,
-        )  # fmt: skip
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows} - {COPY}
@@ -218,15 +228,17 @@ def _say_verdicts(found: FleetVerdict, manifest: Path | None, table: Path | None
     if found.ranks and found.unrecognised:
         console.print(
             "none of these is known to be a bag that the design was made with. Those count above "
-            "if they are here, read from elsewhere than for the design", soft_wrap=True,
-        )  # fmt: skip
+            "if they are here, read from elsewhere than for the design",
+            soft_wrap=True,
+        )
     drift = found.drift
     said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
     console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
     say_bags(
-        console, "outside, or what is assumed broken",
+        console,
+        "outside, or what is assumed broken",
         {r.bag: _since(r) for r in found.rows if r.verdict in BROKEN},
-    )  # fmt: skip
+    )
     say_bags(console, "not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
     say_bags(console, "clock", {r.bag: r.clock for r in found.rows if r.clock})
     alarms = {r.bag: r.alarm for r in found.rows if r.alarm and r.verdict not in BROKEN}
@@ -282,17 +294,24 @@ def _say_worst(worst: Sequence[Judged]) -> None:
     console.print(f"{count} spent the most, and when:")
     shown = _table(worst)
     for column, justify in (
-        ("spent", "right"), ("at", "right"), ("start (UTC)", "left"), ("verdict", "left"),
-        ("bad from", "right"), ("margin", "right"),
-    ):  # fmt: skip
+        ("spent", "right"),
+        ("at", "right"),
+        ("start (UTC)", "left"),
+        ("verdict", "left"),
+        ("bad from", "right"),
+        ("margin", "right"),
+    ):
         shown.add_column(column, justify=justify, min_width=10 if "UTC" in column else None)  # type: ignore[arg-type]
     for row in worst:
         shown.add_row(
-            _plain(row.bag), in_percent(row.spent or 0.0), f"{row.spent_at:.3f} s",
-            _when(row.start), _VERDICTS[row.verdict],
+            _plain(row.bag),
+            in_percent(row.spent or 0.0),
+            f"{row.spent_at:.3f} s",
+            _when(row.start),
+            _VERDICTS[row.verdict],
             f"{row.bad_at:.3f} s" if row.bad_from else "-",
             "-" if row.margin is None else f"{row.margin:.3f}",
-        )  # fmt: skip
+        )
     console.print(shown)
 
 
@@ -326,9 +345,11 @@ def _say_counts(
     console.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
     if manifest is not None:
         console.print(
-            f"{known} of them known from {manifest}, {count - known} asked of now", soft_wrap=True,
-            markup=False, highlight=False,
-        )  # fmt: skip
+            f"{known} of them known from {manifest}, {count - known} asked of now",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
 
 
 def identify(
@@ -361,9 +382,12 @@ def select(
     found = _read(out, bags, config, out_dir, reading)
     with progress_bar("selecting") as progress, reading.workers.sharing() as executor:
         result = select_trials(
-            found.trials, config, out_dir,
-            executor=executor, progress=progress,
-        )  # fmt: skip
+            found.trials,
+            config,
+            out_dir,
+            executor=executor,
+            progress=progress,
+        )
     show.say_selected(out, result)
 
 
@@ -386,9 +410,13 @@ def _read(
 
     with progress_bar("reading") as progress:
         found = read_fleet(
-            named_bags(bags, patience=reading.patience), config, out_dir,
-            workers=reading.workers, strict=reading.strict, progress=progress,
-        )  # fmt: skip
+            named_bags(bags, patience=reading.patience),
+            config,
+            out_dir,
+            workers=reading.workers,
+            strict=reading.strict,
+            progress=progress,
+        )
     _say_read(out, found, out_dir / MANIFEST)
     return found
 
@@ -399,8 +427,10 @@ def _say_read(out: Console, found: FleetTrials, manifest: Path) -> None:
         f"{_bags(count)}: {count - left_out} used, {len(found.unread)} not read, "
         f"{len(found.unusable)} not usable, {len(found.copies)} copies; "
         f"{sum(answer.kept for answer in found.answers)} of them known from {manifest}",
-        soft_wrap=True, markup=False, highlight=False,
-    )  # fmt: skip
+        soft_wrap=True,
+        markup=False,
+        highlight=False,
+    )
     for title, bags in (
         ("left out, not read", found.unread),
         ("left out, not usable as configured", found.unusable),

@@ -111,13 +111,16 @@ def run_init(
         console.print(
             "this was a look at the running robot: record trials of it (folder TRIALS), then run "
             "init on them for their split, lags and ranges, or go on with these",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
+            soft_wrap=True,
+            markup=False,
+        )
         said = ", ".join(topics)
         console.print(
-            f"  nlsid run record \"topics:=[{said}]\" bag:=TRIALS/trial_1",
-            soft_wrap=True, markup=False, highlight=False,
-        )  # fmt: skip
+            f'  nlsid run record "topics:=[{said}]" bag:=TRIALS/trial_1',
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
     folder = shlex.quote(str(target.parent))
     steps = [f"nlsid identify {folder} {given}"]
     if "funnel" in proposal.content:

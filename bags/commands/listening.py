@@ -27,8 +27,10 @@ def listen(bag: Path, seconds: float) -> Path:
     settings = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
     recorder = subprocess.Popen(
         [sys.executable, "-m", RECORDER, "--ros-args", *settings],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     try:
         began = time.monotonic()
         while not bag.is_dir() and recorder.poll() is None:

@@ -16,6 +16,7 @@ from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
 from bags.designs.displacement import displacement_half_width, washouts_of
+from bags.designs.provenance import of_funnel
 from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
@@ -214,6 +215,8 @@ def funnel_table(design: OutputTubeDesign) -> Table:
                 )
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
+    for line in of_funnel(model.document(), funnel.document()).said:
+        table.add_row("measured", escape(line))
     return table
 
 

@@ -126,8 +126,11 @@ class Bundle:
         Raises DocumentError or CertificateMismatch if they are not a design.
         """
         if not self._stages:
-            return _design({r: c for r, c in self.contents.items() if r != PROOF},
-                           self.contents.get(PROOF, b"{}"), wiring)  # fmt: skip
+            return _design(
+                {r: c for r, c in self.contents.items() if r != PROOF},
+                self.contents.get(PROOF, b"{}"),
+                wiring,
+            )
         stages = []
         for stage in self._stages:
             parts = {

@@ -175,8 +175,9 @@ class WiredDesign(Generic[M, P, F]):
         funnel: AnyFunnel | None = self.funnel
         if funnel is None:
             raise DocumentError("nothing is proved of this policy: no funnel to hold a robot to")
-        return Monitor(self.model, self.policy, funnel, centre=centre, period=period,
-                       held=self.held)  # fmt: skip
+        return Monitor(
+            self.model, self.policy, funnel, centre=centre, period=period, held=self.held
+        )
 
     def controller(self, limits: Limits, settling: float) -> Controller:
         """A controller for one run; `settling`: s to wait for a state where it may start."""

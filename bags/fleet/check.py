@@ -90,8 +90,10 @@ class CheckBag:
         definitions = read_definitions(self.config.definitions)
         with Bag(bag, definitions=definitions) as source:
             start_ns, custom, digest = (
-                source.start_ns, source.custom, bag_origin(source)["digest"],
-            )  # fmt: skip
+                source.start_ns,
+                source.custom,
+                bag_origin(source)["digest"],
+            )
         refused, samples, excited = "", "", False
         try:
             own = read_signals_of([bag], self.config, names=[name]).trajectories

@@ -254,9 +254,12 @@ class FleetVerdict:
         test = mannwhitneyu(newest, self.calibration, alternative="two-sided")
         pairs = len(newest) * len(self.calibration)
         return Drift(
-            month, len(newest), len(self.calibration), float(test.pvalue),
+            month,
+            len(newest),
+            len(self.calibration),
+            float(test.pvalue),
             float(test.statistic) / pairs,
-        )  # fmt: skip
+        )
 
 
 def trouble_in(rows: Sequence[Judged]) -> int:
@@ -294,9 +297,11 @@ def monitor_fleet(
             rows.append(replace(row, robot=robots[row.bag]))
     design: Any = proved.design
     return FleetVerdict(
-        tuple(counted_once(rows)), calibration_spent(funnel, design),
-        frozenset(design.made_with), known,
-    )  # fmt: skip
+        tuple(counted_once(rows)),
+        calibration_spent(funnel, design),
+        frozenset(design.made_with),
+        known,
+    )
 
 
 def counted_once(rows: Sequence[Judged]) -> list[Judged]:

@@ -468,8 +468,10 @@ def _row(
     others = {}
     for detector in detectors:
         times = [_alarm(detector, run) for run in runs]
-        times = [t if t is not None and t >= start else None
-                 for t, start in zip(times, starts, strict=True)]  # fmt: skip
+        times = [
+            t if t is not None and t >= start else None
+            for t, start in zip(times, starts, strict=True)
+        ]
         caught = sum(t is not None for t in times)
         others[detector.name] = Caught(violated=caught, after=_delay(times, starts))
     return Row(fault, funnel, others)

@@ -35,8 +35,9 @@ def catching(found: Catching) -> Figure:
 
 def _errors(axes: Axes, found: Catching, j: int) -> None:
     width = found.widths[j]
-    following = [(t, w[:, j]) for (t, _), w in zip(found.errors, found.half_widths, strict=True)
-                 if len(w)]  # fmt: skip
+    following = [
+        (t, w[:, j]) for (t, _), w in zip(found.errors, found.half_widths, strict=True) if len(w)
+    ]
     if not following:
         ends = -width.half_width, width.half_width
         axes.axhspan(*ends, color=BLUE, alpha=0.15, lw=0, label="tube")
@@ -44,11 +45,22 @@ def _errors(axes: Axes, found: Catching, j: int) -> None:
         label = None if number else "tube, as each trial's commands go"
         axes.fill_between(t, -half, half, color=BLUE, alpha=0.08, lw=0, label=label)
     for number, (t, error) in enumerate(found.errors):
-        axes.plot(t, error[:, j], color=INK, lw=0.7, alpha=0.8,
-                  label=None if number else "measured - simulated, untouched")  # fmt: skip
+        axes.plot(
+            t,
+            error[:, j],
+            color=INK,
+            lw=0.7,
+            alpha=0.8,
+            label=None if number else "measured - simulated, untouched",
+        )
     for sign in (-1, 1):
-        axes.axhline(sign * width.range / 2, color=ORANGE, lw=LINE, ls="--",
-                     label="half the range" if sign > 0 else None)  # fmt: skip
+        axes.axhline(
+            sign * width.range / 2,
+            color=ORANGE,
+            lw=LINE,
+            ls="--",
+            label="half the range" if sign > 0 else None,
+        )
     widest = width.half_width if width.most is None else width.most
     most = 1.15 * min(max(widest, width.range / 2), 2.0 * max(width.half_width, width.range / 2))
     axes.set_ylim(-most, most)

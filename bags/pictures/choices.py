@@ -55,11 +55,24 @@ def draw_selection(selection: Selection, options: Mapping[str, Sequence[object]]
         name = "validation" + (f", {label}" if label else "")
         axes.plot(x[finite], validation[finite], "o-", color=colour, lw=1.4, ms=4, label=name)
         if len(drawn) <= 2:
-            axes.plot(x[finite], train[finite], ":", color=colour, lw=1.2,
-                      label="training" + (f", {label}" if label else ""))  # fmt: skip
+            axes.plot(
+                x[finite],
+                train[finite],
+                ":",
+                color=colour,
+                lw=1.2,
+                label="training" + (f", {label}" if label else ""),
+            )
         for nowhere in x[~finite]:
-            axes.annotate("no model", (nowhere, 0.02), xycoords=("data", "axes fraction"),
-                          rotation=90, fontsize=7, color=colour, ha="center")  # fmt: skip
+            axes.annotate(
+                "no model",
+                (nowhere, 0.02),
+                xycoords=("data", "axes fraction"),
+                rotation=90,
+                fontsize=7,
+                color=colour,
+                ha="center",
+            )
     axes.plot(*best, "o", ms=11, mfc="none", mec=plots.INK, mew=1.5, label="chosen")
     axes.annotate(f"{best[1]:.2f} %", best, (9, 7), textcoords="offset points", fontsize=8)
     if numeric:
@@ -95,8 +108,14 @@ def draw_comparison(rows: Sequence[Scored]) -> bytes:
         proved = row.candidate.proof is not None
         axes.barh(place, min(error, SHOWN_ERROR), color=plots.BLUE if proved else plots.GREY)
         text = f"{error:.2f} %" if np.isfinite(error) else "diverges"
-        axes.annotate(text, (min(error, SHOWN_ERROR), place), (4, 0), textcoords="offset points",
-                      va="center", fontsize=8)  # fmt: skip
+        axes.annotate(
+            text,
+            (min(error, SHOWN_ERROR), place),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
     axes.set_yticks(
         range(len(ranked)),
         [f"{row.label}\n{row.candidate.method.title}" for row in ranked],
@@ -105,10 +124,16 @@ def draw_comparison(rows: Sequence[Scored]) -> bytes:
     axes.set_xlabel("simulation error on the test trials [%]", fontsize=9)
     axes.set_xlim(0.0, 1.15 * min(max(r.scores.simulation_percent for r in rows), SHOWN_ERROR))
     axes.legend(
-        handles=[Patch(color=plots.BLUE, label="proved stable"),
-                 Patch(color=plots.GREY, label="not proved")],
-        fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
-    )  # fmt: skip
+        handles=[
+            Patch(color=plots.BLUE, label="proved stable"),
+            Patch(color=plots.GREY, label="not proved"),
+        ],
+        fontsize=8,
+        frameon=False,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=2,
+    )
     axes.set_ylim(-0.6, len(ranked) - 0.4)
     plots.tidy([axes])
     axes.grid(axis="y", visible=False)

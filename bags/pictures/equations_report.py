@@ -101,9 +101,13 @@ def _bounds(field: VectorField, policy: ContinuousPolicy, held: Held) -> list[st
         f"inputs are clipped to: {', '.join(limits) or 'nothing (the proof needs no limits)'}",
         f"inputs of the motion itself, at its knots: {', '.join(plan)}",
         f"what may vary at every time: {', '.join(pushes) or 'nothing (no w)'}",
-        *([f"where the equations hold, which the funnel stays in: {', '.join(inside)}"]
-          if inside else []),
-        f"hold: an input is at most {held.hold:g} s old" if held.hold
+        *(
+            [f"where the equations hold, which the funnel stays in: {', '.join(inside)}"]
+            if inside
+            else []
+        ),
+        f"hold: an input is at most {held.hold:g} s old"
+        if held.hold
         else "hold: none; the policy is applied continuously",
         *([f"measured within: {', '.join(wrong)}"] if wrong else []),
-    ]  # fmt: skip
+    ]

@@ -91,8 +91,14 @@ def print_page(page: Path, out: Path) -> None:
         )
     with tempfile.TemporaryDirectory() as scratch:
         printed = Path(scratch) / "page.pdf"
-        options = ["--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer",
-                   f"--user-data-dir={scratch}/profile", f"--print-to-pdf={printed}"]  # fmt: skip
+        options = [
+            "--headless",
+            "--disable-gpu",
+            "--no-first-run",
+            "--no-pdf-header-footer",
+            f"--user-data-dir={scratch}/profile",
+            f"--print-to-pdf={printed}",
+        ]
         if os.geteuid() == 0:  # as root it does not start with one; the page may run nothing anyway
             options.append("--no-sandbox")
         command = [browser, *options, page.resolve().as_uri()]

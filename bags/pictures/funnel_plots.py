@@ -82,8 +82,14 @@ def _tube(axes: Axes, funnel: ContinuousFunnel, pair: tuple[int, int], goal: Goa
     axes.add_collection(PolyCollection(shadows, facecolors="#dbe8f4", edgecolors="none", zorder=1))
     for t in np.linspace(funnel.t0, funnel.tf, RINGS):
         ring = funnel.outline(float(t), pair)
-        axes.plot(*ring.T, color=BLUE, lw=0.7, alpha=0.8, zorder=2,
-                  label="tube" if t == funnel.t0 else None)  # fmt: skip
+        axes.plot(
+            *ring.T,
+            color=BLUE,
+            lw=0.7,
+            alpha=0.8,
+            zorder=2,
+            label="tube" if t == funnel.t0 else None,
+        )
     path = funnel.x(np.linspace(funnel.t0, funnel.tf, 400))[:, list(pair)]
     axes.plot(*path.T, color=INK, lw=LINE, label="nominal", zorder=4)
     axes.plot(*path[0], "o", color=INK, ms=5, mfc="white", label="start", zorder=5)

@@ -62,9 +62,13 @@ def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
     figure.supylabel(axis_name(test.trajectories[0], output), fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside upper left", ncols=min(len(labels), 3), fontsize=8,
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=min(len(labels), 3),
+        fontsize=8,
         frameon=False,
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -86,17 +90,24 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
         over_time.set_xlabel("time [s]", fontsize=8)
         lags = np.arange(1, scores.one_step.autocorrelation.shape[1] + 1)
         _correlations(
-            auto, lags, scores.one_step.autocorrelation[i], scores.simulation.autocorrelation[i],
-            scores.one_step.band, predicts=predicts,
-        )  # fmt: skip
+            auto,
+            lags,
+            scores.one_step.autocorrelation[i],
+            scores.simulation.autocorrelation[i],
+            scores.one_step.band,
+            predicts=predicts,
+        )
         auto.set_title("autocorrelation", fontsize=8, loc="left")
         both = np.arange(-len(lags), len(lags) + 1)
         for j, axes in enumerate(crossed):
             _correlations(
-                axes, both, scores.one_step.cross_correlation[i, j],
-                scores.simulation.cross_correlation[i, j], scores.one_step.cross_band[i, j],
+                axes,
+                both,
+                scores.one_step.cross_correlation[i, j],
+                scores.simulation.cross_correlation[i, j],
+                scores.one_step.cross_band[i, j],
                 predicts=predicts,
-            )  # fmt: skip
+            )
             axes.set_title(f"with {first.u_names[j]}", fontsize=8, loc="left")
         for axes in grid[i, 1:]:
             axes.set_xlabel("lag [samples]", fontsize=8)
@@ -147,8 +158,9 @@ def structure(chosen: Candidate[Model]) -> Figure | None:
         tidy([right])
     elif isinstance(model, CellNetwork):
         count = len(model.maps)
-        figure = Figure(figsize=(min(7.2, 2.4 * count), 2.2 * ((count + 2) // 3)),
-                        layout="constrained")  # fmt: skip
+        figure = Figure(
+            figsize=(min(7.2, 2.4 * count), 2.2 * ((count + 2) // 3)), layout="constrained"
+        )
         grid = figure.subplots((count + 2) // 3, min(count, 3), squeeze=False)
         for number, (axes, f) in enumerate(zip(grid.flat, model.maps, strict=False), 1):
             axes.plot(f.knots, f.values, ".-", color=BLUE, lw=LINE, ms=4)
@@ -161,8 +173,12 @@ def structure(chosen: Candidate[Model]) -> Figure | None:
         axes = figure.subplots()
         drive = np.linspace(-3.0, 3.0, 300) * float(model.e[0])
         e = tuple(model.e.tolist())
-        axes.plot(drive, [model.y_offset + solve_increasing(e, v, 0.0) for v in drive.tolist()],
-                  color=BLUE, lw=LINE)  # fmt: skip
+        axes.plot(
+            drive,
+            [model.y_offset + solve_increasing(e, v, 0.0) for v in drive.tolist()],
+            color=BLUE,
+            lw=LINE,
+        )
         axes.set_xlabel("past and inputs, combined", fontsize=8)
         axes.set_ylabel(f"{model.y.name} [{model.y.unit}]", fontsize=8)
         axes.set_title("static nonlinearity e⁻¹", fontsize=8, loc="left")

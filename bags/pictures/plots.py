@@ -75,9 +75,13 @@ def margins(replays: Sequence[Replay]) -> Figure:
         handles += found[0]
         labels += found[1]
     figure.legend(
-        handles, labels, loc="outside upper left", ncols=min(len(labels), 2 * columns),
-        fontsize=8, frameon=False,
-    )  # fmt: skip
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=min(len(labels), 2 * columns),
+        fontsize=8,
+        frameon=False,
+    )
     return figure
 
 
@@ -94,9 +98,14 @@ def _tube(axes: Axes, replay: Replay) -> None:
     label = "forecast from its present estimate"
     for fan in replay.fans:
         axes.fill_between(
-            [f.t for f in fan], [f.low[0] for f in fan], [f.high[0] for f in fan],
-            color=ORANGE, alpha=0.35, lw=0, label=label,
-        )  # fmt: skip
+            [f.t for f in fan],
+            [f.low[0] for f in fan],
+            [f.high[0] for f in fan],
+            color=ORANGE,
+            alpha=0.35,
+            lw=0,
+            label=label,
+        )
         label = ""
     everything = replay.readings
     measured = [_output(r.measured) for r in everything]

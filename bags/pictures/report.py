@@ -95,8 +95,10 @@ def write_catching(folder: Path, catching: Catching) -> list[Path]:
 def _catching(catching: Catching, drawn: str) -> str:
     """The section of the report."""
     detectors = list(catching.rows[0].others)
-    head = "".join(f"<th>{escape(name)}</th>" for name in ("outside", "assumption violated",
-                   "alarm", "unknown", "after", *detectors))  # fmt: skip
+    head = "".join(
+        f"<th>{escape(name)}</th>"
+        for name in ("outside", "assumption violated", "alarm", "unknown", "after", *detectors)
+    )
     rows = "".join(_catching_row(row, detectors) for row in catching.rows)
     widths = "; ".join(
         f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
@@ -155,8 +157,12 @@ def page(
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
-    recordings = [(train, "training"), (validation, "validation"), (calibration, "calibration"),
-                  (test, "test")]  # fmt: skip
+    recordings = [
+        (train, "training"),
+        (validation, "validation"),
+        (calibration, "calibration"),
+        (test, "test"),
+    ]
     kept = [(data, use) for data, use in recordings if data is not None]
     listed = "".join(_recordings(data, use) for data, use in kept)
     counts = ", ".join(f"{len(data)} {use}" for data, use in kept)

@@ -127,17 +127,23 @@ def draw_funnel(
 def draw_tube(design: AnyDesign) -> Figure:
     """Each state's tube around the motion, over time; of a composition, stage after stage."""
     model = design.model
-    names = [f"x{i}" for i in range(model.n)] if isinstance(model, VectorField) else [
-        _name(signal) for signal in design.signals[0]
-    ]  # fmt: skip
+    names = (
+        [f"x{i}" for i in range(model.n)]
+        if isinstance(model, VectorField)
+        else [_name(signal) for signal in design.signals[0]]
+    )
     figure, panels = _grid(len(names))
     for number, stage in enumerate(design.stages, 1):
         t, x, widths = _band(stage)
         for i, axes in enumerate(panels):
             axes.fill_between(
-                t, x[:, i] - widths[:, i], x[:, i] + widths[:, i], color=TUBE, lw=0,
+                t,
+                x[:, i] - widths[:, i],
+                x[:, i] + widths[:, i],
+                color=TUBE,
+                lw=0,
                 label="tube" if number == 1 else None,
-            )  # fmt: skip
+            )
             axes.plot(t, x[:, i], color=INK, lw=LINE, label="motion" if number == 1 else None)
             if number > 1:
                 axes.axvline(t[0], color=GREY, lw=LINE, ls=":")
@@ -294,5 +300,6 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
     found = [axes.get_legend_handles_labels() for axes in panels]
     handles = [handle for part, _ in found for handle in part]
     labels = [label for _, part in found for label in part]
-    figure.legend(handles, labels, loc="outside lower left", ncols=len(labels), fontsize=8,
-                  frameon=False)  # fmt: skip
+    figure.legend(
+        handles, labels, loc="outside lower left", ncols=len(labels), fontsize=8, frameon=False
+    )

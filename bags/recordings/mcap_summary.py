@@ -167,9 +167,16 @@ def _listed(chunk: ChunkIndex, limit: int) -> ListedBlock:
         raise BagError(f"the message indexes of the chunk at byte {record} are not behind it")
     index = {c: (at, after - at) for (c, at), after in zip(places, edges[1:], strict=True)}
     return ListedBlock(
-        offset, chunk.compressed_size, chunk.compression, chunk.uncompressed_size, 0,
-        chunk.message_start_time, index, record, end,
-    )  # fmt: skip
+        offset,
+        chunk.compressed_size,
+        chunk.compression,
+        chunk.uncompressed_size,
+        0,
+        chunk.message_start_time,
+        index,
+        record,
+        end,
+    )
 
 
 class Prepared:

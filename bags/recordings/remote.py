@@ -441,10 +441,13 @@ def _by_obstore(bucket: str, endpoint: str, patience: float) -> _ByObstore | Non
     options: Any = {"allow_http": endpoint.startswith("http://"), "timeout": f"{patience:g}s"}
     no_retries: Any = {"max_retries": 0}  # RemotePath repeats, and counts what it loses
     return _ByObstore(
-        bucket, S3Store(bucket, client_options=options, retry_config=no_retries),
-        get_ranges, head,
-        (NotFoundError, FileNotFoundError), (PermissionDeniedError, UnauthenticatedError),
-    )  # fmt: skip
+        bucket,
+        S3Store(bucket, client_options=options, retry_config=no_retries),
+        get_ranges,
+        head,
+        (NotFoundError, FileNotFoundError),
+        (PermissionDeniedError, UnauthenticatedError),
+    )
 
 
 def _entry(described: dict[str, Any]) -> Entry:

@@ -232,11 +232,17 @@ def _of_bag(
                     series[signal] = stamps, numbers[finite]
                     found.append(
                         Candidate(
-                            signal, msgtype, unit, command, why, stamped,
-                            float(numbers[finite].min()), float(numbers[finite].max()),
+                            signal,
+                            msgtype,
+                            unit,
+                            command,
+                            why,
+                            stamped,
+                            float(numbers[finite].min()),
+                            float(numbers[finite].max()),
                             _rate(stamps),
                         )
-                    )  # fmt: skip
+                    )
     return found[:MOST_CANDIDATES], series
 
 
@@ -337,8 +343,11 @@ def _pairs(
         for y in answering:
             if u.command < y.command or (_field(u.text) == _field(y.text) and u.topic == y.topic):
                 continue
-            found = [_delay(read[u.text], read[y.text]) for read in series
-                     if u.text in read and y.text in read]  # fmt: skip
+            found = [
+                _delay(read[u.text], read[y.text])
+                for read in series
+                if u.text in read and y.text in read
+            ]
             known = [one for one in found if one is not None]
             if not known:
                 continue
@@ -350,10 +359,13 @@ def _pairs(
             liked *= OTHER_JOINT_LIKED if _other_joint(u.text, y.text) else 1.0
             pairs.append(
                 Pair(
-                    u, y, float(np.median([one.seconds for one in known])), correlation,
+                    u,
+                    y,
+                    float(np.median([one.seconds for one in known])),
+                    correlation,
                     abs(correlation) * roles * liked,
                 )
-            )  # fmt: skip
+            )
     return sorted(pairs, key=lambda pair: -pair.score)
 
 

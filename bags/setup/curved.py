@@ -106,9 +106,14 @@ def _error(section: Section, fitted: Dataset, held_back: Dataset) -> float:
     is_proved = section.get("certified", True)
     with suppress(NlsidError):
         fit = identify(
-            fitted, options.model_class, method=method, comparators=(), test=held_back,
-            transient=START, allow_unproved=not is_proved,
-        )  # fmt: skip
+            fitted,
+            options.model_class,
+            method=method,
+            comparators=(),
+            test=held_back,
+            transient=START,
+            allow_unproved=not is_proved,
+        )
         error = float(fit.errors["test"][method.name])
         if math.isfinite(error):
             return error

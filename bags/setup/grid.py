@@ -65,9 +65,13 @@ def read_paces(
     repeated = 0
     for path in bags:
         read = read_signals(
-            path, [*y_paths, *u_paths], clock=HEADER_STAMP if clock == "header" else LOG_TIME,
-            sort=True, gaps_in=y_paths, definitions=types,
-        )  # fmt: skip
+            path,
+            [*y_paths, *u_paths],
+            clock=HEADER_STAMP if clock == "header" else LOG_TIME,
+            sort=True,
+            gaps_in=y_paths,
+            definitions=types,
+        )
         for name in y_paths:
             diffs = np.diff(read[name].stamp_ns) / 1e9
             repeated += int((diffs <= 0).sum())
@@ -206,13 +210,15 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
     if not regular:
         grid["resample"] = "last" if factor > 1 and steady else "linear"
         why["resample"] = (
-            "fewer samples than are recorded" if factor > 1
-            else "responses come from several topics" if read.topics > 1
+            "fewer samples than are recorded"
+            if factor > 1
+            else "responses come from several topics"
+            if read.topics > 1
             else f"only {100 * read.on_grid:.0f} % of steps are near the period"
             if read.on_grid < ON_GRID
             else f"stamps of a run stray by {read.off_grid:.2g} periods from one grid, and "
             f"a monitor takes {TOLERANCE:g}"
-        )  # fmt: skip
+        )
     most = FEW_GAPS * read.period
     grid["max_gap"] = _up(max(min(1.2 * read.longest_gap, most), 2.0 * grid["period"]))
     why["max_gap"] = f"the longest step of a response is {read.longest_gap:.3g} s"

@@ -34,9 +34,12 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     for lags in LAGS:
         try:
             fit = identify(
-                fitted, Polynomial(lags), method=Rse(iterations=TRIED_ITERATIONS),
-                comparators=(), test=train.select(held_back),
-            )  # fmt: skip
+                fitted,
+                Polynomial(lags),
+                method=Rse(iterations=TRIED_ITERATIONS),
+                comparators=(),
+                test=train.select(held_back),
+            )
         except NlsidError:  # too few samples for so many, or no proof
             continue
         errors[lags] = float(fit.errors["test"]["rse"])
@@ -91,9 +94,13 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
                 continue
             with suppress(NlsidError):
                 fit = identify(
-                    fitted, tried, method=LeastSquares(), comparators=(),
-                    test=train.select(held_back), allow_unproved=True,
-                )  # fmt: skip
+                    fitted,
+                    tried,
+                    method=LeastSquares(),
+                    comparators=(),
+                    test=train.select(held_back),
+                    allow_unproved=True,
+                )
                 error = float(fit.errors["test"]["least_squares"])
                 if math.isfinite(error):
                     known[tried] = error
@@ -101,8 +108,10 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
         return
     best = proposal.error = min(known.values())
     proposal.varies = _varies(train.select(held_back))
-    good = min((c for c, error in known.items() if error * LAGS_BETTER <= best),
-               key=lambda c: c.lags + _terms(c))  # fmt: skip
+    good = min(
+        (c for c, error in known.items() if error * LAGS_BETTER <= best),
+        key=lambda c: c.lags + _terms(c),
+    )
     section |= {"lags": good.lags, "right_degree": good.degrees.inputs}
     if good.delays is not None:
         section["delays"] = list(good.delays)

@@ -150,10 +150,15 @@ def propose(
         say_lags(proposal, trials.train)
         if _may_add_up(proposal, found):
             moved = propose(
-                bags, found, responses=[f"{responses[0]}|washout({WASHOUT:g} s)"],
-                excitations=excitations, robot=robot, definitions=definitions, types=types,
+                bags,
+                found,
+                responses=[f"{responses[0]}|washout({WASHOUT:g} s)"],
+                excitations=excitations,
+                robot=robot,
+                definitions=definitions,
+                types=types,
                 named=named,
-            )  # fmt: skip
+            )
             if moved.error <= proposal.error / 2.0:
                 _say_washed_out(moved, proposal.error)
                 moved.walls += _beside(moved, found) if alone else []
@@ -164,9 +169,15 @@ def propose(
     others = [pair.command.text for pair in followed(proposal, found)]
     if widen and proposal.error > POOR and others:
         wider = propose(
-            bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
-            definitions=definitions, types=types, named=named,
-        )  # fmt: skip
+            bags,
+            found,
+            responses=responses,
+            excitations=[*excitations, *others],
+            robot=robot,
+            definitions=definitions,
+            types=types,
+            named=named,
+        )
         wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
             without = f"; without it models are off by {proposal.error:.3g} %"
@@ -341,8 +352,11 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
         for signal in signals:
             proposal.why[signal.path] = signal.why
     for y in chosen["response"]:
-        pairs = [p for p in found.best_for(y.path)
-                 if p.command.text in {u.path for u in chosen["excitation"]}]  # fmt: skip
+        pairs = [
+            p
+            for p in found.best_for(y.path)
+            if p.command.text in {u.path for u in chosen["excitation"]}
+        ]
         if pairs:
             best = pairs[0]
             before = f"{y.why}; " if y.why else ""

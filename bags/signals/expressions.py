@@ -40,8 +40,17 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
 OPERATIONS: Final = (
-    "unit", "to", "unwrap", "derivative", "washout", "clock", "hold", "linear", "delay", "lag",
-)  # fmt: skip
+    "unit",
+    "to",
+    "unwrap",
+    "derivative",
+    "washout",
+    "clock",
+    "hold",
+    "linear",
+    "delay",
+    "lag",
+)
 TIMED: Final = ("derivative", "washout", "hold", "linear", "delay", "lag")  # these take a time
 SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
 DRIVING: Final = ("delay", "lag")  # of what drives only

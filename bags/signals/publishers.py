@@ -37,8 +37,9 @@ def counted_in_turn(sequence: IntArray) -> str:
 
 def two_curves(stamp_ns: IntArray, values: FloatArray) -> str:
     """Say that measured values (N,), stamped in ns (N,), are on two curves; else empty."""
-    if len(values) < WINDOW:
-        return ""
+    back = np.count_nonzero(np.diff(stamp_ns) < 0)
+    if len(values) < WINDOW or 0 < back < BACK:
+        return ""  # too few to tell; or a clock was set, which is told elsewhere
     order = np.argsort(stamp_ns, kind="stable")
     step = max(WINDOW // 2, (len(values) - WINDOW) // LOOKS)
     starts = range(0, len(values) - WINDOW + 1, step)

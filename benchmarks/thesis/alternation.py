@@ -177,15 +177,19 @@ def largest_level(constant: FloatArray, slope: FloatArray, basis: IntArray) -> f
     Raises Infeasible or SolverError if there is none.
     """
     gram, size = gram_columns(basis)
-    A = sp.vstack([
-        sp.hstack([sp.csc_matrix(-slope[:, None]), gram]),
-        sp.hstack([sp.csc_matrix((size, 1)), -sp.eye(size)]),
-    ], format="csc")  # fmt: skip
+    A = sp.vstack(
+        [
+            sp.hstack([sp.csc_matrix(-slope[:, None]), gram]),
+            sp.hstack([sp.csc_matrix((size, 1)), -sp.eye(size)]),
+        ],
+        format="csc",
+    )
     q = np.zeros(1 + size)
     q[0] = -1.0
     cones = (Cone("zero", len(constant)), Cone("psd", len(basis)))
-    program = ConeProgram(sp.csc_matrix((1 + size, 1 + size)), q, A,
-                          np.concatenate([constant, np.zeros(size)]), cones)  # fmt: skip
+    program = ConeProgram(
+        sp.csc_matrix((1 + size, 1 + size)), q, A, np.concatenate([constant, np.zeros(size)]), cones
+    )
     return float(conic.solve(program).x[0])
 
 

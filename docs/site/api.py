@@ -9,9 +9,21 @@ from pathlib import Path
 from types import ModuleType
 
 ROOMS = (
-    "identification", "design", "models", "policies", "funnels", "running", "dynamics", "data",
-    "polynomial", "sos", "kernel", "designs", "proofs", "documents",
-)  # fmt: skip
+    "identification",
+    "design",
+    "models",
+    "policies",
+    "funnels",
+    "running",
+    "dynamics",
+    "data",
+    "polynomial",
+    "sos",
+    "kernel",
+    "designs",
+    "proofs",
+    "documents",
+)
 
 ARRAY = re.compile(
     r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[[\w.\[\]]*?\]+\]"

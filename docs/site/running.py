@@ -111,9 +111,16 @@ def _shell(code: str, folder: Path, root: Path) -> str:
     command = ["bash", "-euo", "pipefail", "-c", code]
     try:
         done = subprocess.run(
-            command, cwd=folder, env=_environment(root), stdin=subprocess.DEVNULL, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT, check=False,
-        )  # fmt: skip
+            command,
+            cwd=folder,
+            env=_environment(root),
+            stdin=subprocess.DEVNULL,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=LIMIT,
+            check=False,
+        )
     except subprocess.TimeoutExpired as error:
         raise BlockError(f"after {LIMIT:g} s still running:\n{code}") from error
     if done.returncode:
@@ -139,9 +146,13 @@ class _Python:
     def run(self, code: str) -> str:
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _WORKER], cwd=self._folder, env=_environment(self._root),
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            )  # fmt: skip
+                [sys.executable, "-c", _WORKER],
+                cwd=self._folder,
+                env=_environment(self._root),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(code) + "\n")

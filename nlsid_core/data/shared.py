@@ -72,9 +72,12 @@ def shared_stretch(
         if samples >= LEAST:
             own, at = own - before, at - before
             return SharedStretch(
-                every[one].name, float(every[one].t[own]),
-                every[two].name, float(every[two].t[at]), samples,
-            )  # fmt: skip
+                every[one].name,
+                float(every[one].t[own]),
+                every[two].name,
+                float(every[two].t[at]),
+                samples,
+            )
     return None
 
 

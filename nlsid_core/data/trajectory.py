@@ -87,10 +87,12 @@ class Trajectory:
         """These samples of it, called so (None: as it is)."""
         return replace(
             self,
-            t=self.t[part], y=self.y[part], u=self.u[part],
+            t=self.t[part],
+            y=self.y[part],
+            u=self.u[part],
             x=None if self.x is None else self.x[part],
             name=self.name if name is None else name,
-        )  # fmt: skip
+        )
 
     @property
     def _label(self) -> str:

@@ -83,10 +83,19 @@ class Form:
         if K is not None and K.any() and inputs is not None:
             modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
         return cls(
-            F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
-            H[:, m:] - H[:, :m] @ G, form.E.ray, proof.rate, inputs,
+            F,
+            H,
+            modes,
+            proof.multipliers,
+            leaves,
+            mean,
+            F[:, m:] - F[:, :m] @ G,
+            H[:, m:] - H[:, :m] @ G,
+            form.E.ray,
+            proof.rate,
+            inputs,
             np.linalg.inv(proof.P),
-        )  # fmt: skip
+        )
 
     @property
     def corners(self) -> list[FloatArray]:
@@ -120,5 +129,8 @@ def _parts(tree: Json | None, box: Box) -> list[tuple[Box, Node | None]]:
     low, high = box[i]
     middle = (low + high) / 2
     halved = ([*box[:i], half, *box[i + 1 :]] for half in ((low, middle), (middle, high)))
-    return [leaf for part, half in zip(tree["parts"], halved, strict=True)
-            for leaf in _parts(part, half)]  # fmt: skip
+    return [
+        leaf
+        for part, half in zip(tree["parts"], halved, strict=True)
+        for leaf in _parts(part, half)
+    ]

@@ -80,21 +80,36 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
 
     def tube_of(design: Found, samples: int | None) -> Tube:
         return Tube(
-            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
-            half_widths=1.0 / np.sqrt(0.99 * design.tau), level=1.0, measured=0.0,
-            safety_factor=safety_factor, designed_on=trials.designed_on,
-            measured_on=trials.measured_on, samples=samples,
+            rho=design.rho,
+            L=design.L,
+            P=design.P,
+            R=design.R,
+            tau=design.tau,
+            half_widths=1.0 / np.sqrt(0.99 * design.tau),
+            level=1.0,
+            measured=0.0,
+            safety_factor=safety_factor,
+            designed_on=trials.designed_on,
+            measured_on=trials.measured_on,
+            samples=samples,
             inlet=inlet**2 / float(np.linalg.inv(design.P)[0, 0]) if inlet else 0.0,
-        )  # fmt: skip
+        )
 
     def proved(
-        tubes: Sequence[Tube], found: Sequence[Found],
-        response: Response | None = None, alarm: Cusum | None = None,
-    ) -> OutputTubeDesign:  # fmt: skip
+        tubes: Sequence[Tube],
+        found: Sequence[Found],
+        response: Response | None = None,
+        alarm: Cusum | None = None,
+    ) -> OutputTubeDesign:
         funnel = TubeFunnel(
-            tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
-            y_box=y_box, u_box=u_box, response=response, cusum=alarm,
-        )  # fmt: skip
+            tubes=tuple(tubes),
+            settling=settling,
+            model=files.digest(model.document()),
+            y_box=y_box,
+            u_box=u_box,
+            response=response,
+            cusum=alarm,
+        )
         policy = None
         if profile is not None and K is not None:
             assert isinstance(model, DifferenceEquation)
@@ -150,18 +165,26 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
         return proved([replace(tube, peak=None) for tube in tubes], found)
     errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
     response = Response(
-        np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
-        None if level == "constant"
+        np.ones(len(amplitudes)),
+        0.0,
+        safety_factor,
+        trials.designed_on,
+        trials.measured_on,
+        None
+        if level == "constant"
         else followed([part**2 for part in errors], u, always=level == "commands"),
-    )  # fmt: skip
+    )
     calibrated = [
         innovations(model, np.stack([np.zeros_like(found[0].L), found[0].L]), t, settling)
         for t in trials.calibration
     ]
     response = _scaled_response(
-        response, errors, u,
-        [part[:, 0] for part in calibrated], [t.u for t in trials.calibration],
-    )  # fmt: skip
+        response,
+        errors,
+        u,
+        [part[:, 0] for part in calibrated],
+        [t.u for t in trials.calibration],
+    )
     own = np.concatenate([part[:, found[0].at] for part in e])
     deviation = np.maximum(own.std(axis=0), np.finfo(float).tiny)
     threshold = max(
@@ -210,9 +233,12 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
     peak = Peak(_above(tube.safety_factor**2 * largest), largest)
     widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
     return replace(
-        tube, measured=measured, level=level, peak=peak if tube.samples is None else None,
+        tube,
+        measured=measured,
+        level=level,
+        peak=peak if tube.samples is None else None,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
-    )  # fmt: skip
+    )
 
 
 def _scaled_response(

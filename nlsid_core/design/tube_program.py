@@ -136,10 +136,13 @@ def _balanced(
     outside = np.linalg.inv(block_diag(S, np.diag(sizes))).T
     found = [[_shaped(outside @ N @ D * unit, form.ray) for N in leaf] for leaf in Ns]
     return Found(
-        L, rho, (P + P.T) * (unit / 2.0), np.eye(1) if p == 1 else (R + R.T) / 2.0,
+        L,
+        rho,
+        (P + P.T) * (unit / 2.0),
+        np.eye(1) if p == 1 else (R + R.T) / 2.0,
         unit * (1.0 - TAU_ROOM) * tau / sizes**2,
         None if form.tree is None else _with_multipliers(form.tree, found),
-    )  # fmt: skip
+    )
 
 
 def _shaped(N: FloatArray, ray: bool) -> FloatArray:

@@ -59,10 +59,12 @@ def identified_field(
             p = p + Polynomial(units[[n + m + j]], np.ones(1), names)
         pieces.append(p)
     return VectorField(
-        (tuple(pieces),), n, m,
+        (tuple(pieces),),
+        n,
+        m,
         uncertain=np.column_stack([-push[pushed], push[pushed]]),
         valid=np.column_stack([np.arange(len(ranges)), ranges]),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)

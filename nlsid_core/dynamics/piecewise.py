@@ -66,8 +66,12 @@ class PiecewisePolynomial:
         flat = np.atleast_1d(t).ravel()
         k = self.piece(flat)
         s = (flat - self.t[k]) / (self.t[k + 1] - self.t[k])
-        powers = np.array([comb(self.degree, i) * s**i * (1 - s) ** (self.degree - i)
-                           for i in range(self.degree + 1)])  # fmt: skip
+        powers = np.array(
+            [
+                comb(self.degree, i) * s**i * (1 - s) ** (self.degree - i)
+                for i in range(self.degree + 1)
+            ]
+        )
         values = np.einsum("in,ni...->n...", powers, self.control[k])
         return np.asarray(values.reshape(t.shape + self.control.shape[2:]))
 

@@ -62,9 +62,14 @@ class Rates:
 
     @classmethod
     def of(
-        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None, *,
+        cls,
+        function: Callable[..., Any],
+        n: int,
+        m: int,
+        uncertain: ArrayLike | None = None,
+        *,
         affine: bool = False,
-    ) -> "Rates":  # fmt: skip
+    ) -> "Rates":
         """Look at the function once, with symbols."""
         box = box_of(uncertain)
         given = arguments(function)
@@ -120,12 +125,19 @@ class Rates:
         n, m = self.n, self.m
         held = np.empty(len(z), dtype=object)
         held[:] = list(z)
-        parts = {"t": z[0], "x": held[1 : 1 + n], "u": held[1 + n : 1 + n + m],
-                 "w": held[1 + n + m :]}  # fmt: skip
+        parts = {
+            "t": z[0],
+            "x": held[1 : 1 + n],
+            "u": held[1 + n : 1 + n + m],
+            "w": held[1 + n + m :],
+        }
         try:
             rows = self.function(**{name: parts[name] for name in arguments(self.function)})
-            rows = list(np.asarray(rows, dtype=object).reshape(-1)) if isinstance(
-                rows, np.ndarray) else list(rows)  # fmt: skip
+            rows = (
+                list(np.asarray(rows, dtype=object).reshape(-1))
+                if isinstance(rows, np.ndarray)
+                else list(rows)
+            )
         except NlsidError:
             raise
         except IndexError as error:
@@ -186,8 +198,10 @@ class Rates:
         bottom = np.concatenate([[times[0]], low, self.uncertain[:, 0]])
         top = np.concatenate([[times[1]], high, self.uncertain[:, 1]])
         centre, radius = _centred(bottom, top)
-        z = [TaylorModel.variable(j, c, r) for j, (c, r) in
-             enumerate(zip(centre.tolist(), radius.tolist(), strict=True))]  # fmt: skip
+        z = [
+            TaylorModel.variable(j, c, r)
+            for j, (c, r) in enumerate(zip(centre.tolist(), radius.tolist(), strict=True))
+        ]
         rows = self.called(z) if self.inexact else []
         chosen = {i: _Row.of(rows[i], self) for i in self.inexact}
         return Cubic(self, centre, radius, chosen)
@@ -512,5 +526,6 @@ class _Symbol:
 
 
 for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"):
-    setattr(_Symbol, f"__{_name}__",
-            lambda self, other, _name=f"__{_name}__": self._with(other, _name))  # fmt: skip
+    setattr(
+        _Symbol, f"__{_name}__", lambda self, other, _name=f"__{_name}__": self._with(other, _name)
+    )

@@ -337,8 +337,9 @@ def _alone(a: bytes) -> tuple[IntArray, IntArray, IntArray]:
     """Where squares d_j² are, where d_j is (0: nowhere), and where what is neither is."""
     keys = np.frombuffer(a, dtype=np.int64)
     digits = _digits(keys)
-    squares = np.flatnonzero((digits[:, 0] == 0) & (digits[:, 1] > 0)
-                             & (digits[:, 1] == digits[:, 2]))  # fmt: skip
+    squares = np.flatnonzero(
+        (digits[:, 0] == 0) & (digits[:, 1] > 0) & (digits[:, 1] == digits[:, 2])
+    )
     places = {key: k for k, key in enumerate(keys.tolist())}
     lines = np.array([places.get(j, 0) for j in digits[squares, 2].tolist()], dtype=np.int64)
     others = np.setdiff1d(np.arange(1, len(keys)), np.concatenate([squares, lines]))

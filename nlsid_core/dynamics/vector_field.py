@@ -438,10 +438,11 @@ def read_equation(document: Any, names: Sequence[str], *, source: str) -> Polyno
     rows = files.member(document, "exponents", list, source=source)
     values = files.member(document, "coefficients", list, source=source)
     sound = all(
-        isinstance(row, list) and len(row) == len(names)
+        isinstance(row, list)
+        and len(row) == len(names)
         and all(type(e) is int and e >= 0 for e in row)
         for row in rows
-    )  # fmt: skip
+    )
     if not sound or len(values) != len(rows):
         raise DocumentError(
             f"{source}: 'exponents' should hold a row of {len(names)} whole numbers of 0 or more "

@@ -162,8 +162,14 @@ class ContinuousFunnel:
             unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         elif len(chosen) == 3:
             tilt = np.linspace(0, np.pi, points)[:, None]
-            unit = np.stack([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle),
-                             np.cos(tilt) + 0 * angle], axis=-1)  # fmt: skip
+            unit = np.stack(
+                [
+                    np.sin(tilt) * np.cos(angle),
+                    np.sin(tilt) * np.sin(angle),
+                    np.cos(tilt) + 0 * angle,
+                ],
+                axis=-1,
+            )
         else:
             raise ShapeError(f"an outline is drawn in 2 or 3 axes, not {len(chosen)}")
         return np.asarray(self.nominal(t)[chosen] + unit @ np.linalg.cholesky(shadow).T)
@@ -228,8 +234,11 @@ def ellipsoid_inside(
     """
     A, B = np.asarray(inner, dtype=np.float64), np.asarray(outer, dtype=np.float64)
     d = np.asarray(inner_centre, dtype=np.float64) - np.asarray(outer_centre, dtype=np.float64)
-    lower = float(np.linalg.eigvalsh(np.linalg.solve(np.linalg.cholesky(A), np.linalg.solve(
-        np.linalg.cholesky(A), B).T))[-1])  # fmt: skip
+    lower = float(
+        np.linalg.eigvalsh(
+            np.linalg.solve(np.linalg.cholesky(A), np.linalg.solve(np.linalg.cholesky(A), B).T)
+        )[-1]
+    )
     upper = 1.0 - float(d @ B @ d)
     if upper < lower:
         return None

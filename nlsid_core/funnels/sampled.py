@@ -72,10 +72,17 @@ class SampledFunnel:
         length, n, _ = self.S.shape
         if length < 2:
             raise ShapeError(f"funnel: S has {length} samples; two are the least")
-        freeze(self, "funnel", {
-            "S": (length, n, n), "A": (length - 1, n, n), "tube": (length,), "inlet": (length,),
-            "half_widths": (length, n),
-        })  # fmt: skip
+        freeze(
+            self,
+            "funnel",
+            {
+                "S": (length, n, n),
+                "A": (length - 1, n, n),
+                "tube": (length,),
+                "inlet": (length,),
+                "half_widths": (length, n),
+            },
+        )
         if (np.tril(self.S, -1) != 0).any() or (np.diagonal(self.S, axis1=1, axis2=2) == 0).any():
             raise DataError("funnel: S should be upper triangular with a nonzero diagonal")
         if self.roots is not None:

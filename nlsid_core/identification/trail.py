@@ -120,8 +120,12 @@ class Trail(Generic[T]):
         if iterations * STEPS_A_BOUND > affordable:
             steps = FEW_STEPS
             iterations = min(iterations, max(FEWEST_BOUNDS, affordable // steps))
-            log.info("a large problem: %d bounds from each start, %d Newton steps towards the "
-                     "minimum of each", iterations, steps)  # fmt: skip
+            log.info(
+                "a large problem: %d bounds from each start, %d Newton steps towards the "
+                "minimum of each",
+                iterations,
+                steps,
+            )
         error = SimulationError(rows)
         started, best, failure = time.process_time(), None, SolverError("no iterate")
         for start, theta in begun:

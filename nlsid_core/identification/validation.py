@@ -196,13 +196,19 @@ def residual_tests(
     if not all((np.abs(part) < DIVERGED).all() for part in residuals):
         nowhere = np.full((n_y, n_u), np.inf)
         return Residual(
-            np.full((n_y, lags), np.nan), NORMAL_99 / float(np.sqrt(N)),
-            np.full((n_y, n_u, 2 * lags + 1), np.nan), nowhere, False, False,
-        )  # fmt: skip
+            np.full((n_y, lags), np.nan),
+            NORMAL_99 / float(np.sqrt(N)),
+            np.full((n_y, n_u, 2 * lags + 1), np.nan),
+            nowhere,
+            False,
+            False,
+        )
     autocorrelation = np.stack(
-        [_correlation(_columns(residuals, i), _columns(residuals, i), lags)[lags + 1 :]
-         for i in range(n_y)]
-    )  # fmt: skip
+        [
+            _correlation(_columns(residuals, i), _columns(residuals, i), lags)[lags + 1 :]
+            for i in range(n_y)
+        ]
+    )
     cross, deviation = _cross(residuals, inputs, lags)
     largest = np.max(np.abs(cross[:, :, lags:]), axis=2) / deviation
     chance = (1.0 - CONFIDENCE) / (lags + 1)

@@ -28,9 +28,14 @@ class ClosedLoop:
     """
 
     def __init__(
-        self, ring: Ring, policy: Policy, funnel: Funnel, part: Part, mode: Mode,
+        self,
+        ring: Ring,
+        policy: Policy,
+        funnel: Funnel,
+        part: Part,
+        mode: Mode,
         off: Sequence[Fraction],
-    ) -> None:  # fmt: skip
+    ) -> None:
         (k, level, index), x = part, ring.variables
         self.ring, self.policy, self.funnel, self.part, self.mode = ring, policy, funnel, part, mode
         self.k, self.h, self.off = k, funnel.t[k + 1] - funnel.t[k], off

@@ -109,9 +109,14 @@ def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[Decision, Funne
 
 
 def inside(
-    a: Sequence[Fraction], A: Sequence[Sequence[Fraction]], rho: Fraction,
-    b: Sequence[Fraction], B: Sequence[Sequence[Fraction]], multiplier: Fraction, what: str,
-) -> None:  # fmt: skip
+    a: Sequence[Fraction],
+    A: Sequence[Sequence[Fraction]],
+    rho: Fraction,
+    b: Sequence[Fraction],
+    B: Sequence[Sequence[Fraction]],
+    multiplier: Fraction,
+    what: str,
+) -> None:
     """Raise Rejected unless {|x-a|²_A <= rho} lies in {|x-b|²_B <= 1}, by the S-lemma."""
     at_most(0, multiplier, what)
     d = [p - q for p, q in zip(a, b, strict=True)]

@@ -219,9 +219,14 @@ class Node:
         return Node(self.value["kind"], f"{self.where} kind").text()
 
     def document(
-        self, form: str, names: str, kinds: str = "", *, optional: str = "",
+        self,
+        form: str,
+        names: str,
+        kinds: str = "",
+        *,
+        optional: str = "",
         made_for: Mapping[str, str] | None = None,
-    ) -> dict[str, "Node"]:  # fmt: skip
+    ) -> dict[str, "Node"]:
         """The members of a document nlsid/`form`, of one of `kinds` if there are any.
 
         made_for: the digests, by role, that it has to name; Mismatch if it names another.

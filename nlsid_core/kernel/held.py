@@ -99,9 +99,13 @@ def read_hold(
 
 
 def decide_rates(
-    field: Field, policy: Policy, funnel: Funnel, spans: list[int], stated: dict[str, Node],
+    field: Field,
+    policy: Policy,
+    funnel: Funnel,
+    spans: list[int],
+    stated: dict[str, Node],
     hold: Hold,
-) -> int:  # fmt: skip
+) -> int:
     """Prove |dũ_i/dt| < R_i in the funnel, for every input where it is not at a limit.
 
     What entries of (δ, w) do that only push is taken off R; the others are at vertices.

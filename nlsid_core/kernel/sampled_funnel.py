@@ -148,9 +148,14 @@ def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) 
 
 
 def _implicit_addition(
-    link: Link, stated: dict[str, Node], funnel: Funnel, radius: Fraction, reach: Fraction,
-    k: int, what: str,
-) -> tuple[Fraction, Fraction]:  # fmt: skip
+    link: Link,
+    stated: dict[str, Node],
+    funnel: Funnel,
+    radius: Fraction,
+    reach: Fraction,
+    k: int,
+    what: str,
+) -> tuple[Fraction, Fraction]:
     """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
     b = link.bounds
     far = b["kappa_next"] * funnel.roots[k + 1]

@@ -83,8 +83,11 @@ class CellNetwork:
         m, n = len(self.maps), np.size(self.start)
         width = m + n + len(self.u) + 1
         shapes = {
-            "into": (m, width), "next": (n, width), "output": (len(self.y), width), "start": (n,),
-        }  # fmt: skip
+            "into": (m, width),
+            "next": (n, width),
+            "output": (len(self.y), width),
+            "start": (n,),
+        }
         freeze(self, "model", shapes)
         if not 1 <= m <= MAX_MAPS or not n or not self.y:
             raise DataError(f"{m} maps, {n} states, {len(self.y)} outputs; 1 to {MAX_MAPS} maps")

@@ -75,9 +75,16 @@ class ImplicitModel:
 
     @classmethod
     def separable(
-        cls, e: Polynomials, f: Polynomials, *, monotonicity: float, period: float,
-        states: tuple[str, ...], inputs: tuple[str, ...], centre: Polynomials | None = None,
-    ) -> "ImplicitModel":  # fmt: skip
+        cls,
+        e: Polynomials,
+        f: Polynomials,
+        *,
+        monotonicity: float,
+        period: float,
+        states: tuple[str, ...],
+        inputs: tuple[str, ...],
+        centre: Polynomials | None = None,
+    ) -> "ImplicitModel":
         """e(x⁺) = f(x, w): e in n variables, f in n + m, both with (n,) coefficients."""
         n, m = len(states), len(inputs)
         for name, part, variables in (("e", e, n), ("f", f, n + m)):
@@ -138,9 +145,11 @@ class ImplicitModel:
     def step(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """x⁺ (B, n) of states x (B, n) and inputs w (B, m), all trajectories at once."""
         now, given = np.asarray(x, dtype=np.float64), np.asarray(w, dtype=np.float64)
-        if now.ndim != 2 or now.shape[1] != len(self) or given.shape != (
-            len(now), len(self.inputs)
-        ):  # fmt: skip
+        if (
+            now.ndim != 2
+            or now.shape[1] != len(self)
+            or given.shape != (len(now), len(self.inputs))
+        ):
             raise ShapeError(f"x should be (B, {len(self)}), w (B, {len(self.inputs)})")
         known = np.concatenate([now, given], axis=1)
         v = self.solve(known, start=now[:, : self.unknowns])
@@ -183,12 +192,16 @@ class ImplicitModel:
         if self.centre is None:
             return ellipsoid(
                 lambda v: self.h(_with(v, known)[None])[0],
-                start=start, monotonicity=self.monotonicity, size=size,
-            )  # fmt: skip
+                start=start,
+                monotonicity=self.monotonicity,
+                size=size,
+            )
         z = ellipsoid(
             lambda z: self.h(_with(self._uncentred(z, start), known)[None])[0],
-            start=self.centre(start[None])[0], monotonicity=CENTRED, size=size,
-        )  # fmt: skip
+            start=self.centre(start[None])[0],
+            monotonicity=CENTRED,
+            size=size,
+        )
         return self._uncentred(z, start)
 
     def _uncentred(self, z: FloatArray, start: FloatArray) -> FloatArray:
@@ -206,8 +219,10 @@ class ImplicitModel:
             return np.asarray(v[0])
         return ellipsoid(
             lambda v: centre(v[None])[0] - z,
-            start=start, monotonicity=self.monotonicity, size=float(size[0]),
-        )  # fmt: skip
+            start=start,
+            monotonicity=self.monotonicity,
+            size=float(size[0]),
+        )
 
     def simulate(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """States (B, N+1, n) from x (B, n) with inputs w (B, N, m)."""

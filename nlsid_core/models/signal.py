@@ -59,9 +59,14 @@ def head(model: Any, kind: str, equation: str = "") -> Json:
     )
     stated = {"equation": equation} if equation else {}
     return {
-        "format": FORMAT, "version": files.VERSION, "kind": kind, **stated,
-        "period": model.period, "y": y, "u": u,
-    }  # fmt: skip
+        "format": FORMAT,
+        "version": files.VERSION,
+        "kind": kind,
+        **stated,
+        "period": model.period,
+        "y": y,
+        "u": u,
+    }
 
 
 def tail(model: Any) -> Json:

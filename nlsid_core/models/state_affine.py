@@ -62,10 +62,17 @@ class StateAffineModel:
         if self.on_out_of_range not in get_args(OutOfRange):
             raise DataError(f"on_out_of_range is '{self.on_out_of_range}'; known: clip, refuse")
         n_y, n_u = len(self.y), len(self.u)
-        freeze(self, "model", {
-            "y_offset": (n_y,), "y_scale": (n_y,), "u_offset": (n_u,), "u_scale": (n_u,),
-            "u_range": (n_u, 2),
-        })  # fmt: skip
+        freeze(
+            self,
+            "model",
+            {
+                "y_offset": (n_y,),
+                "y_scale": (n_y,),
+                "u_offset": (n_u,),
+                "u_scale": (n_u,),
+                "u_range": (n_u, 2),
+            },
+        )
         if (self.y_scale <= 0).any() or (self.u_scale <= 0).any() or not self.period > 0:
             raise DataError("scales and the period should be positive")
         if (self.u_range[:, 0] >= self.u_range[:, 1]).any():

@@ -302,8 +302,11 @@ class TubeRun:
             hidden = self._hides(simulated)
             sizes = (np.abs(deviation) + hidden) / widths
             spent = (self._spent / level).tolist()
-            peaks = (used / self._peak if g is self._unmoved else
-                     used / (self._peak * np.maximum(g, 1.0))).tolist()  # fmt: skip
+            peaks = (
+                used / self._peak
+                if g is self._unmoved
+                else used / (self._peak * np.maximum(g, 1.0))
+            ).tolist()
         self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         nominal = tuple(simulated.tolist())
@@ -314,9 +317,15 @@ class TubeRun:
             self._begin(reason)
             if np.isfinite(simulated).all() and (sizes > 1.0).any():
                 away = Reading(
-                    t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),
-                    level=Level.NONE, reason=f"outside the tube; {reason}",
-                )  # fmt: skip
+                    t,
+                    Status.OUTSIDE,
+                    -math.inf,
+                    math.inf,
+                    0.0,
+                    measured=tuple(y.tolist()),
+                    level=Level.NONE,
+                    reason=f"outside the tube; {reason}",
+                )
                 return [away] * len(self._funnels)
             return self._unknown(t, y, reason)
         if not (hidden <= MOST_ROUNDING * widths).all():
@@ -344,8 +353,7 @@ class TubeRun:
         """By what levels are multiplied (tubes,), and half-widths (tubes, p), where g is this."""
         if not g:
             return self._unmoved, self._widths
-        room = np.array([max(g[j][0], TINY) if j in g else 1.0
-                         for j in range(len(self._tubes))])  # fmt: skip
+        room = np.array([max(g[j][0], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
         return room, self._widths * np.sqrt(room)[:, None]
 
     def _response(self, i: int, away: list[float]) -> tuple[float, str]:
@@ -393,9 +401,12 @@ class TubeRun:
         if not lasting:
             covered = self._samples[self._rows[i][0]]
             return Reading(
-                t, Status.UNKNOWN, measured=measured, alarm=alarm,
+                t,
+                Status.UNKNOWN,
+                measured=measured,
+                alarm=alarm,
                 reason=f"the proof covers {covered} samples; they are over",
-            )  # fmt: skip
+            )
         row = max((sizes[j] for j in lasting), key=max)
         size = max(row)
         margin = 1.0 - size
@@ -425,12 +436,21 @@ class TubeRun:
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
         used = max(spent[most], peaks[sharpest], response)
         return Reading(
-            t, status, margin, used, self._exit(i, t, margin),
-            self._names[row.index(size)], nominal, measured,
-            Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i],
-            away + innovation, alarm,
+            t,
+            status,
+            margin,
+            used,
+            self._exit(i, t, margin),
+            self._names[row.index(size)],
+            nominal,
+            measured,
+            Level.TUBE if size <= 1.0 else Level.NONE,
+            reason,
+            self._assuming[i],
+            away + innovation,
+            alarm,
             self._narrowest(widths, lasting) if self._follow else (),
-        )  # fmt: skip
+        )
 
     def _narrowest(self, widths: FloatArray, lasting: list[int]) -> tuple[float, ...]:
         """(p,) the least half-widths of these tubes."""

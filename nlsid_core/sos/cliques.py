@@ -227,8 +227,10 @@ class CliqueProgram:
     def _solved(self, P: FloatArray, g: FloatArray, tolerance: float) -> CliqueSolution:
         """A primal-dual interior point with predictor and corrector, in the HKM direction."""
         blocks, size = self.blocks, float(np.abs(g).max()) or 1.0
-        B = [changes.matrix(len(block.i), P)
-             for changes, block in zip(self._changes, blocks, strict=True)]  # fmt: skip
+        B = [
+            changes.matrix(len(block.i), P)
+            for changes, block in zip(self._changes, blocks, strict=True)
+        ]
         X, ones = self._means(P), self._ones(P)
         shares = g / size / self._counts
         Z = [b.matrix(shares[of]) for b, of in zip(blocks, self._of_pairs, strict=True)]
@@ -264,8 +266,9 @@ class CliqueProgram:
             dZ, dm = schur.direction(
                 [part.T @ block.inner(s) for part, block, s in zip(B, blocks, second, strict=True)]
             )
-            dX = [s - x - _symmetric(x @ dz @ w)
-                  for x, dz, w, s in zip(X, dZ, W, second, strict=True)]  # fmt: skip
+            dX = [
+                s - x - _symmetric(x @ dz @ w) for x, dz, w, s in zip(X, dZ, W, second, strict=True)
+            ]
             a, b = _longest(dX, Lx), _longest(dZ, Lz)
             X = [x + a * dx for x, dx in zip(X, dX, strict=True)]
             Z = [z + b * dz for z, dz in zip(Z, dZ, strict=True)]

@@ -118,11 +118,20 @@ class SphereProgram:
             raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
         centre = _sphere_means(factor, V)
         object.__setattr__(self, "chosen", chosen)
-        keep(self, {
-            "basis": basis, "weight": weight, "points": points, "_V": V, "_whiten": whiten,
-            "_unit": moments, "_unit_root": np.linalg.inv(np.linalg.cholesky(moments)),
-            "_centre": centre, "_normal": np.asfortranarray(factor),
-        })  # fmt: skip
+        keep(
+            self,
+            {
+                "basis": basis,
+                "weight": weight,
+                "points": points,
+                "_V": V,
+                "_whiten": whiten,
+                "_unit": moments,
+                "_unit_root": np.linalg.inv(np.linalg.cholesky(moments)),
+                "_centre": centre,
+                "_normal": np.asfortranarray(factor),
+            },
+        )
 
     def solve(
         self,

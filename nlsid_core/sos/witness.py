@@ -104,10 +104,12 @@ def witness(
         )
     room = ROOM * least
     try:
-        roots = np.array([
-            cholesky(part - delta * np.eye(len(part))) * scale.small
-            for part, delta in zip(S, room, strict=True)
-        ])  # fmt: skip
+        roots = np.array(
+            [
+                cholesky(part - delta * np.eye(len(part))) * scale.small
+                for part, delta in zip(S, room, strict=True)
+            ]
+        )
     except LinAlgError as error:
         raise Infeasible("a Gram matrix is positive definite to rounding only") from error
     allowed = ROUNDING * room[:, None] * scale.small**2

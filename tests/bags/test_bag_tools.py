@@ -352,8 +352,12 @@ def read_table(path: Path) -> Any:
     if path.suffix == ".csv":
         with path.open() as stream:
             rows = list(csv.DictReader(stream))
-        return {name: [float(row[name]) for row in rows] if "ns" not in name else
-                [int(row[name]) for row in rows] for name in rows[0]}  # fmt: skip
+        return {
+            name: [float(row[name]) for row in rows]
+            if "ns" not in name
+            else [int(row[name]) for row in rows]
+            for name in rows[0]
+        }
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             return dict(arrays)
@@ -464,11 +468,25 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
     table = rng.standard_normal((50, 2))
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="cmd,speed", comments="")
     said = run(
-        "import", tmp_path / "log.csv", "--out", tmp_path / "bag", "--period", "0.02",
-        "-s", f"{CMD}:twist.linear.x=cmd", "-s", f"{ODOM}:twist.twist.linear.x=speed",
-        "--type", f"{CMD}=geometry_msgs/msg/TwistStamped", "--type", f"{ODOM}={ODOM_TYPE}",
-        "--start", "1000", "--custom", "robot=car",
-    )  # fmt: skip
+        "import",
+        tmp_path / "log.csv",
+        "--out",
+        tmp_path / "bag",
+        "--period",
+        "0.02",
+        "-s",
+        f"{CMD}:twist.linear.x=cmd",
+        "-s",
+        f"{ODOM}:twist.twist.linear.x=speed",
+        "--type",
+        f"{CMD}=geometry_msgs/msg/TwistStamped",
+        "--type",
+        f"{ODOM}={ODOM_TYPE}",
+        "--start",
+        "1000",
+        "--custom",
+        "robot=car",
+    )
     assert f"by the message types, not by the table: {COMMAND} m/s, {SPEED} m/s; where" in said
     read = read_signals(tmp_path / "bag", [COMMAND, SPEED])
     written = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)

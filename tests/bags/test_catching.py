@@ -183,7 +183,7 @@ def wide(found: Catching, share: float, error: float, shares: tuple[float, ...])
 def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert wide(found, 0.5, 0.1, (0.4,)).warnings() == []
     poor = wide(found, 0.5625, 0.375, (0.44, 0.05, 0.04)).warnings()
-    assert "is 0.563 of its range, 1 m/s; more than 0.5 says little" in poor[0]
+    assert "is 0.5625 of its range, 1 m/s; more than 0.5 says little" in poor[0]
     assert "trial 0 sets the level: it uses 8.8 times as much" in poor[1]
     assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor[1]
     assert "off by up to 0.375 m/s" in poor[2]
@@ -216,17 +216,32 @@ def test_a_tube_beside_which_trials_hardly_move_is_warned_of(
 def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     found: Catching,
 ) -> None:
-    worse = Row("made up", Caught(outside=1, violated=2, unjudged=3, after=0.25, alarmed=4),
-                {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(),
-                 "box": Caught()})  # fmt: skip
+    worse = Row(
+        "made up",
+        Caught(outside=1, violated=2, unjudged=3, after=0.25, alarmed=4),
+        {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(), "box": Caught()},
+    )
     refused = Row("refused", Caught(), {}, "no such input")
     table = show.catching_table(replace(found, rows=(*found.rows, worse, refused)))
     console = Console(width=80, record=True, file=None, force_terminal=False)
     with console.capture() as said:
         console.print(table)
     line = next(line for line in said.get().splitlines() if "made up" in line)
-    assert line.split() == ["made", "up", "1", "2", "4", "3", "0.25", "9", "0.50", "0", "-",
-                            "0", "-"]  # fmt: skip
+    assert line.split() == [
+        "made",
+        "up",
+        "1",
+        "2",
+        "4",
+        "3",
+        "0.25",
+        "9",
+        "0.50",
+        "0",
+        "-",
+        "0",
+        "-",
+    ]
     assert table.rows[-2].style == "dark_orange3"
     assert table.rows[0].style == ""
     assert (
@@ -255,9 +270,15 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
     monitor = Monitor(model, None, made.funnel)
     found = what_it_catches(
-        monitor, model, made.funnel.half_widths.tolist(), held_back=held_back,
-        calibration=calibration, ranges=ranges, factor=FACTOR, remedy="",
-    )  # fmt: skip
+        monitor,
+        model,
+        made.funnel.half_widths.tolist(),
+        held_back=held_back,
+        calibration=calibration,
+        ranges=ranges,
+        factor=FACTOR,
+        remedy="",
+    )
     level, settling = made.funnel.tubes[0].follows, made.funnel.settling
     assert level is not None
     g = np.concatenate([level.along(trial.u)[settling:, 0] for trial in calibration])
@@ -282,9 +303,15 @@ def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() ->
     ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
     monitor = Monitor(made.model, None, made.funnel)
     found = what_it_catches(
-        monitor, made.model, made.funnel.half_widths.tolist(), held_back=held_back,
-        calibration=calibration, ranges=ranges, factor=FACTOR, remedy="",
-    )  # fmt: skip
+        monitor,
+        made.model,
+        made.funnel.half_widths.tolist(),
+        held_back=held_back,
+        calibration=calibration,
+        ranges=ranges,
+        factor=FACTOR,
+        remedy="",
+    )
     counts = []
     for output in range(2):
         caught = 0

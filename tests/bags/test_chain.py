@@ -119,7 +119,9 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     made = CliRunner().invoke(app, ["funnel", str(again), "--config", str(CONFIG)])
     said = " ".join(made.output.replace("│", " ").split())
     tube = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.tubes[0]
-    level, measured = re.search(r"E <= (\S+) .*? taken whole, (\S+), safety", said).groups()  # type: ignore[union-attr]
+    found = re.search(r"E <= (\S+) .*? largest of 16 distinct trials (\S+), safety", said)
+    assert found
+    level, measured = found.groups()
     assert 0.999 * tube.level < float(level) <= tube.level
     assert tube.measured <= float(measured) < 1.001 * tube.measured
     assert "probability at most 1/17" in said
@@ -601,7 +603,7 @@ def test_a_configuration_that_is_no_mapping_is_refused(tmp_path: Path, text: str
         (["01", "05", "06"], {"split__test": ["trial_05", "trial_6"]}, "no bag is called so"),
         (["01", "05"], {"grid__period": 0.05}, "period"),
         (["06", "07", "05"], {}, "constant"),
-        (["01", "02", "05"], {"identification__lags": 40}, "rows for 82 parameters"),
+        (["01", "02", "05"], {"identification__lags": 40}, "equations for 82 parameters"),
     ],
 )
 def test_bad_input_ends_in_one_message_and_leaves_nothing_behind(

@@ -30,7 +30,7 @@ from tests.bag_messages import (
     START_NS,
     command,
     odometry,
-)  # fmt: skip
+)
 from tests.conftest import PERIOD, simulate_truth
 
 SET_AT, BACK = 40, 20  # samples; from the first on, log times are those of so many before

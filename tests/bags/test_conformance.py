@@ -78,17 +78,27 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
                 for a in wanted.get("Attachment", [])
             ]
             messages = [
-                (str(c), str(batch.sequence[i]), str(batch.log_ns[i]), str(batch.publish_ns[i]),
-                 batch.data(i))
+                (
+                    str(c),
+                    str(batch.sequence[i]),
+                    str(batch.log_ns[i]),
+                    str(batch.publish_ns[i]),
+                    batch.data(i),
+                )
                 for _, batches in file.runs(list(found.channels))
                 for c, batch in batches
                 for i in range(len(batch))
-            ]  # fmt: skip
+            ]
             assert messages == [
-                (m["channel_id"], m["sequence"], m["log_time"], m["publish_time"],
-                 data_of(m["data"]))
+                (
+                    m["channel_id"],
+                    m["sequence"],
+                    m["log_time"],
+                    m["publish_time"],
+                    data_of(m["data"]),
+                )
                 for m in wanted.get("Message", [])
-            ]  # fmt: skip
+            ]
             assert sum(found.counts.values()) == len(messages)
 
 

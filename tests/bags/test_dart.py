@@ -38,8 +38,11 @@ def test_the_shipped_bags_are_what_the_published_tables_convert_to(tmp_path: Pat
     name = "tape_20240909_155823"
     assert convert_dart.convert(found[name], tmp_path / name)
     shipped = next(bag for bag in dart("tape") if bag.name == name)
-    signals = [f"/{topic}:twist.{part}" for topic in ("command", "motion")
-               for part in ("linear.x", "angular.z")]  # fmt: skip
+    signals = [
+        f"/{topic}:twist.{part}"
+        for topic in ("command", "motion")
+        for part in ("linear.x", "angular.z")
+    ]
     before, after = (read_signals(bag, signals) for bag in (shipped, tmp_path / name))
     for signal in signals:
         assert before[signal].values.tolist() == after[signal].values.tolist()

@@ -59,9 +59,17 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     page = Page((design / documents.DESIGN_REPORT).read_text())
     for proof in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
         assert str(kernel.check(design / proof)).split("\n")[0] in page.text
-    for chapter in ("What is proved", "How well it simulates", "what it can catch",
-                    "Recordings held against the funnel", bag.name, "car <1>",
-                    "Recordings and their losses", "/odom", "lost"):  # fmt: skip
+    for chapter in (
+        "What is proved",
+        "How well it simulates",
+        "what it can catch",
+        "Recordings held against the funnel",
+        bag.name,
+        "car <1>",
+        "Recordings and their losses",
+        "/odom",
+        "lost",
+    ):
         assert chapter in page.text
     assert page.tags.count("svg") > 3
     assert "script" not in page.tags

@@ -51,7 +51,7 @@ def test_where_no_room_can_be_kept_the_bag_is_unfinished_and_can_be_repaired(
         text=True,
         cwd=ROOT,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("recording stopped: [Errno 27] File too large")
     assert "the bag is unfinished and will be repaired" in done.stdout

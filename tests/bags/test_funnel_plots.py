@@ -22,9 +22,15 @@ def satellite() -> FunnelDesign:
 
 @pytest.mark.parametrize(
     ("n", "pairs"),
-    [(1, []), (2, [(0, 1)]), (3, [(0, 1), (1, 2)]), (5, [(0, 1), (2, 3), (3, 4)]),
-     (6, [(0, 1), (2, 3), (4, 5)]), (12, [(0, 1), (2, 3), (4, 5)])],
-)  # fmt: skip
+    [
+        (1, []),
+        (2, [(0, 1)]),
+        (3, [(0, 1), (1, 2)]),
+        (5, [(0, 1), (2, 3), (3, 4)]),
+        (6, [(0, 1), (2, 3), (4, 5)]),
+        (12, [(0, 1), (2, 3), (4, 5)]),
+    ],
+)
 def test_states_are_drawn_in_pairs(n: int, pairs: list[tuple[int, int]]) -> None:
     assert state_pairs(n) == pairs
 

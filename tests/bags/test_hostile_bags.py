@@ -182,9 +182,13 @@ def seeds(folder: Path) -> list[bytes]:
     types = {
         "/cmd": (CMD_TYPE, standard_types().generate_msgdef(CMD_TYPE, ros_version=2)[0]),
         "/odom": (ODOM_TYPE, standard_types().generate_msgdef(ODOM_TYPE, ros_version=2)[0]),
-        "/x": ("pkg/msg/X", "string[] names\nfloat64[] data\npkg/Y[2] y\n" + "=" * 80
-               + "\nMSG: pkg/Y\nint16 a\nstring<=8 b"),
-    }  # fmt: skip
+        "/x": (
+            "pkg/msg/X",
+            "string[] names\nfloat64[] data\npkg/Y[2] y\n"
+            + "=" * 80
+            + "\nMSG: pkg/Y\nint16 a\nstring<=8 b",
+        ),
+    }
     for k, option in enumerate(options):
         file = folder / f"seed_{k}.mcap"
         with file.open("wb") as stream:

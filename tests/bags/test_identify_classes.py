@@ -99,9 +99,11 @@ def test_a_comparator_that_fails_is_left_out_and_logged(
 ) -> None:
     renamed = [replace(t, group="same") for t in train]
     fit = identify(
-        Dataset(tuple(renamed)), Polynomial(2, set="3.8"), method=LeastSquares(),
+        Dataset(tuple(renamed)),
+        Polynomial(2, set="3.8"),
+        method=LeastSquares(),
         allow_unproved=True,
-    )  # fmt: skip
+    )
     assert fit.methods == ("least_squares",)
     assert "are not repeats" in caplog.text
 
@@ -168,8 +170,11 @@ def test_an_input_beyond_its_range_is_clipped_or_refused_as_declared(
     u[20:23] = 1.7
     wild, at_the_edge = replace(trial, u=u), replace(trial, u=np.minimum(u, 1.5))
     reason = r"input command is 1.7 at sample 20, outside \[-0.5, 1.5\] .* \(3 here\)"
-    for use in (lambda: simulate_trial(refusing, wild), lambda: predict(refusing, wild, 3),
-                lambda: validate(refusing, Dataset((wild,)))):  # fmt: skip
+    for use in (
+        lambda: simulate_trial(refusing, wild),
+        lambda: predict(refusing, wild, 3),
+        lambda: validate(refusing, Dataset((wild,))),
+    ):
         with pytest.raises(DataError, match=reason):
             use()
     np.testing.assert_array_equal(

@@ -25,20 +25,37 @@ from tests.identified_bags import write_config
     ("section", "expected"),
     [
         ({"lags": 4}, Polynomial(4)),
-        ({"model": "state_affine", "lags": 2, "input_range": [-1, 1.5], "delays": [1, 2]},
-         Polynomial(2, (1, 2), input_range=((-1.0, 1.5),))),
-        ({"model": "state_affine", "lags": 2, "input_range": [[0, 1], [2, 3]],
-          "on_out_of_range": "refuse"},
-         Polynomial(2, input_range=((0.0, 1.0), (2.0, 3.0)), on_out_of_range='refuse')),
-        ({"model": "block_cascade", "orders": [2, 0], "intervals": [8]},
-         Network(FilterMapFilter((2, 0), intervals=(8,)))),
+        (
+            {"model": "state_affine", "lags": 2, "input_range": [-1, 1.5], "delays": [1, 2]},
+            Polynomial(2, (1, 2), input_range=((-1.0, 1.5),)),
+        ),
+        (
+            {
+                "model": "state_affine",
+                "lags": 2,
+                "input_range": [[0, 1], [2, 3]],
+                "on_out_of_range": "refuse",
+            },
+            Polynomial(2, input_range=((0.0, 1.0), (2.0, 3.0)), on_out_of_range="refuse"),
+        ),
+        (
+            {"model": "block_cascade", "orders": [2, 0], "intervals": [8]},
+            Network(FilterMapFilter((2, 0), intervals=(8,))),
+        ),
         ({"model": "monotone", "lags": 3, "degree": 1}, Polynomial(3, set="3.8")),
-        ({"model": "implicit", "set": "2.13", "delays": [1], "output_range": [-1, 1],
-          "input_range": [0, 2]},
-         Polynomial(1, (1,), Degrees(left=3), ((0.0, 2.0),), ((-1.0, 1.0),), set="2.13")),
+        (
+            {
+                "model": "implicit",
+                "set": "2.13",
+                "delays": [1],
+                "output_range": [-1, 1],
+                "input_range": [0, 2],
+            },
+            Polynomial(1, (1,), Degrees(left=3), ((0.0, 2.0),), ((-1.0, 1.0),), set="2.13"),
+        ),
         ({"model": "linear_states"}, Polynomial(1, (1,), set="2.19")),
     ],
-)  # fmt: skip
+)
 def test_each_section_says_a_model_class(
     tmp_path: Path, section: dict[str, Any], expected: object
 ) -> None:
@@ -53,16 +70,25 @@ def test_each_section_says_a_model_class(
         ({"lags": 4}, Rse()),
         ({"lags": 4, "method": "least_squares"}, LeastSquares()),
         ({"lags": 4, "iterations": 7}, Rse(iterations=7)),
-        ({"model": "state_affine", "lags": 2, "method": "sem", "certified": True,
-          "iterations": 7},
-         Sem(iterations=7, certified=True)),
-        ({"model": "monotone", "lags": 2, "accept_untested_repeats": True},
-         Rie(accept_untested_repeats=True)),
+        (
+            {
+                "model": "state_affine",
+                "lags": 2,
+                "method": "sem",
+                "certified": True,
+                "iterations": 7,
+            },
+            Sem(iterations=7, certified=True),
+        ),
+        (
+            {"model": "monotone", "lags": 2, "accept_untested_repeats": True},
+            Rie(accept_untested_repeats=True),
+        ),
         ({"model": "monotone", "lags": 2, "method": "sem"}, Sem()),
         ({"model": "cells", "method": "sem", "iterations": 3}, Sem(3, certified=True)),
         ({"model": "feedback", "method": "sem", "certified": False}, Sem()),
     ],
-)  # fmt: skip
+)
 def test_each_section_says_a_method_with_its_options(
     tmp_path: Path, section: dict[str, Any], expected: object
 ) -> None:
@@ -81,19 +107,31 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
 @pytest.mark.parametrize(
     ("section", "reason"),
     [
-        ({"model": "wiener", "lags": 2},
-         "identification: there is no such model; there are: linear, state_affine, monotone"),
-        ({"lags": 2, "orders": [1, 2]},
-         r"identification.orders: there is no such key; there are: model, .*\(found \[1, 2\]"),
-        ({"lags": 2, "method": "magic"},
-         r"identification.method: should be 'rse', .* or 'sem' \(found 'magic'\)"),
-        ({"model": "monotone", "lags": 2, "method": "rse"},
-         r"identification.method: is not for this model class: 'rie', .* \(found 'rse'\)"),
-        ({"lags": 2, "iterations": 0},
-         r"identification.iterations: should be a whole number from 1 to 1000 \(found 0\)"),
+        (
+            {"model": "wiener", "lags": 2},
+            "identification: there is no such model; there are: linear, state_affine, monotone",
+        ),
+        (
+            {"lags": 2, "orders": [1, 2]},
+            r"identification.orders: there is no such key; there are: model, .*\(found \[1, 2\]",
+        ),
+        (
+            {"lags": 2, "method": "magic"},
+            r"identification.method: should be 'rse', .* or 'sem' \(found 'magic'\)",
+        ),
+        (
+            {"model": "monotone", "lags": 2, "method": "rse"},
+            r"identification.method: is not for this model class: 'rie', .* \(found 'rse'\)",
+        ),
+        (
+            {"lags": 2, "iterations": 0},
+            r"identification.iterations: should be a whole number from 1 to 1000 \(found 0\)",
+        ),
         ({"lags": 2, "iterations": 2.5}, r"iterations: Input should be a valid integer"),
-        ({"lags": 2, "iterations": 4, "method": "least_squares"},
-         r"identification.iterations: there is no such key; there are: model, lags, method"),
+        (
+            {"lags": 2, "iterations": 4, "method": "least_squares"},
+            r"identification.iterations: there is no such key; there are: model, lags, method",
+        ),
         ({"lags": 2, "transient": -1}, r"identification.transient: Input should be greater than"),
         ({"lags": 2, "allow_unproved": "yes"}, r"allow_unproved: Input should be a valid boolean"),
         ({"model": "block_cascade", "orders": [1, 2.5]}, r"orders.1: Input should be a valid int"),
@@ -101,25 +139,33 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
         ([4], "identification: should be keys and values"),
         ({"model": ["linear"]}, "identification: there is no such model"),
         ({"lags": 2, "seed": 1}, "identification.seed: there is no such key"),
-        ({"model": "state_affine", "lags": 2, "lagged_degree": 2, "certified": True},
-         r"identification.certified: should be false for this model class \(found True\)"),
+        (
+            {"model": "state_affine", "lags": 2, "lagged_degree": 2, "certified": True},
+            r"identification.certified: should be false for this model class \(found True\)",
+        ),
         ({"model": "cells", "certified": False}, "certified: should be true for this model class"),
-        ({"model": "state_affine", "lags": 2, "delays": [3]},
-         r"identification.delays: should be one or more whole numbers from 0 to 2 \(found \[3\]"),
-        ({"model": "state_affine", "lags": 2, "on_out_of_range": "warn"},
-         r"on_out_of_range: Input should be 'clip' or 'refuse' \(found 'warn'\)"),
+        (
+            {"model": "state_affine", "lags": 2, "delays": [3]},
+            r"identification.delays: should be one or more whole numbers from 0 to 2 \(found \[3\]",
+        ),
+        (
+            {"model": "state_affine", "lags": 2, "on_out_of_range": "warn"},
+            r"on_out_of_range: Input should be 'clip' or 'refuse' \(found 'warn'\)",
+        ),
         ({"model": "state_affine", "lags": 2, "input_range": [0, 1, 2]}, "at most 2 items"),
         ({"model": "block_cascade", "orders": [0, 0]}, "not both zero"),
         ({"model": "block_cascade", "phases": [9]}, "phases: should be between 1 and 4 each"),
-        ({"model": "monotone", "lags": 2, "degree": 2},
-         r"degree: should be one of 1, 3, 5, 7, 9 \(found 2\)"),
+        (
+            {"model": "monotone", "lags": 2, "degree": 2},
+            r"degree: should be one of 1, 3, 5, 7, 9 \(found 2\)",
+        ),
         ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.10', .* \(found 2.13\)"),
         ({"model": "implicit", "set": "2.13", "lags": 2}, "set 2.13 is for 1 lag"),
         ({"model": "implicit", "right_degree": 3}, "needs ranges in set 2.11"),
         ({"model": "implicit", "lagged_degree": 1}, "stable in ranges only"),
         ({"model": "linear_states", "lags": 1}, "identification.lags: there is no such key"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_identification_names_key_value_and_what_is_allowed(
     tmp_path: Path, section: Any, reason: str
 ) -> None:
@@ -167,13 +213,26 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
         ({"funnel": {"horizon": 0.001, "policy": "none"}}, r"funnel\.horizon: .* not one sample"),
         ({"split": {"test": ["a"], "validation": ["a"]}}, "'a' is named for test and for"),
         ({"inputs": 2}, "identification.model: linear has one response and one excitation"),
-        ({"identification": {"model": "monotone", "lags": 2},
-          "funnel": {"horizon": 1.0, "profile": [[0, 0], [1, 1]]}}, "a plan is tracked by"),
-        ({"identification": {"model": "state_affine", "lags": 2, "input_range": [[0, 1], [0, 2]]}},
-         "input_range: 2 pairs .* needs 1"),
+        (
+            {
+                "identification": {"model": "monotone", "lags": 2},
+                "funnel": {"horizon": 1.0, "profile": [[0, 0], [1, 1]]},
+            },
+            "a plan is tracked by",
+        ),
+        (
+            {
+                "identification": {
+                    "model": "state_affine",
+                    "lags": 2,
+                    "input_range": [[0, 1], [0, 2]],
+                }
+            },
+            "input_range: 2 pairs .* needs 1",
+        ),
         ({"select": {"lags": [1, 0]}}, r"select\.lags: .*\(found 0\)"),
     ],
-)  # fmt: skip
+)
 def test_what_no_later_step_could_use_is_refused_when_the_file_is_read(
     tmp_path: Path, sections: dict[str, Any], reason: str
 ) -> None:

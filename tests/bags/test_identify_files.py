@@ -41,14 +41,24 @@ from tests.marks import slow_among
 
 HOWTO = Path(__file__).resolve().parents[2] / "docs" / "howto-offline.md"
 CASCADE = {
-    "model": "block_cascade", "orders": [2, 1], "phases": [1], "intervals": [8], "starts": 4,
+    "model": "block_cascade",
+    "orders": [2, 1],
+    "phases": [1],
+    "intervals": [8],
+    "starts": 4,
     "transient": 60,
-}  # fmt: skip
+}
 CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
     "linear": ({"lags": 3}, DifferenceEquation),
     "state_affine": (
-        {"model": "state_affine", "lags": 2, "method": "rse", "certified": True, "iterations": 3,
-         "right_degree": 2},
+        {
+            "model": "state_affine",
+            "lags": 2,
+            "method": "rse",
+            "certified": True,
+            "iterations": 3,
+            "right_degree": 2,
+        },
         StateAffineModel,
     ),
     "block_cascade": (CASCADE, BlockCascade),
@@ -57,12 +67,17 @@ CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
     "linear_states": ({"model": "linear_states"}, ImplicitModel),
     "cells": ({"model": "cells", "cells": 2, "intervals": 4}, CellNetwork),
     "feedback": ({"model": "feedback", "lags": 2, "stages": 1, "imitated": 20}, CellNetwork),
-}  # fmt: skip
+}
 COEFFICIENTS = {
-    "linear": "a", "state_affine": "coefficients", "block_cascade": "a1", "monotone": "a",
-    "implicit": "coefficients", "linear_states": "coefficients", "cells": "next",
+    "linear": "a",
+    "state_affine": "coefficients",
+    "block_cascade": "a1",
+    "monotone": "a",
+    "implicit": "coefficients",
+    "linear_states": "coefficients",
+    "cells": "next",
     "feedback": "next",
-}  # fmt: skip
+}
 LONG = {"cells", "feedback", "block_cascade", "state_affine", "monotone"}
 STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
 REASONS = {"rate": "the decrease of V", "delta": "inequality stable: not positive"}
@@ -338,8 +353,10 @@ def test_stretches_of_one_bag_are_not_repeats_of_each_other(tmp_path: Path) -> N
 
 
 def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
-    trials = [Trajectory(t=np.arange(4.0), y=np.ones(4), u=np.ones(4), name=n)
-              for n in ("a.1", "a.2", "b", "c")]  # fmt: skip
+    trials = [
+        Trajectory(t=np.arange(4.0), y=np.ones(4), u=np.ones(4), name=n)
+        for n in ("a.1", "a.2", "b", "c")
+    ]
     found = split(Dataset(tuple(trials)), test=["a"], validation=["b"])
     assert isinstance(found, Trials)
     assert (found.test.names, found.train.names) == (("a.1", "a.2"), ("c",))

@@ -418,13 +418,24 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
             made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         )
         values = {
-            "header": header, "ns": "n", "id": 1, "type": 0, "action": 0, "pose": pose,
-            "scale": vector(1.0, 3.0, 1.0), "color": made["std_msgs/msg/ColorRGBA"](1.0, 0, 0, 1.0),
-            "lifetime": made["builtin_interfaces/msg/Duration"](0, 0), "frame_locked": False,
-            "points": [], "colors": [], "texture_resource": "",
-            "uv_coordinates": [], "text": "", "mesh_resource": "",
+            "header": header,
+            "ns": "n",
+            "id": 1,
+            "type": 0,
+            "action": 0,
+            "pose": pose,
+            "scale": vector(1.0, 3.0, 1.0),
+            "color": made["std_msgs/msg/ColorRGBA"](1.0, 0, 0, 1.0),
+            "lifetime": made["builtin_interfaces/msg/Duration"](0, 0),
+            "frame_locked": False,
+            "points": [],
+            "colors": [],
+            "texture_resource": "",
+            "uv_coordinates": [],
+            "text": "",
+            "mesh_resource": "",
             "mesh_use_embedded_materials": False,
-        }  # fmt: skip
+        }
         marker: Any = made["visualization_msgs/msg/Marker"]
         known = marker.__dataclass_fields__
         if "texture" in known:
@@ -499,11 +510,15 @@ def test_a_chunk_of_ros_1_that_a_kill_left_open_is_read_to_its_last_message(tmp_
     [
         ("std_msgs/Float32", "float32 data", struct.pack("<fB", 0.5, 0), "data"),
         ("std_msgs/Float32", "", struct.pack("<f", 0.5), "data"),
-        ("geometry_msgs/Twist", "Vector3 linear\nVector3 angular",
-         struct.pack("<6d", 0.5, *[0] * 5), "linear.x"),
+        (
+            "geometry_msgs/Twist",
+            "Vector3 linear\nVector3 angular",
+            struct.pack("<6d", 0.5, *[0] * 5),
+            "linear.x",
+        ),
         ("p/Stamped", "Header header\nfloat64 a", struct.pack("<IIIId", 1, 2, 3, 0, 0.5), "a"),
     ],
-)  # fmt: skip
+)
 def test_definitions_and_padding_of_ros_1_are_read_as_they_come(
     tmp_path: Path, kind: str, text: str, data: bytes, field: str
 ) -> None:
@@ -604,14 +619,20 @@ def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) 
     run("export", bag, "--out", tmp_path / "out")
     columns = table(tmp_path / "out", "x")
     assert {name: values[0] for name, values in columns.items() if "time" not in name} == {
-        "i.u": str(2**64 - 1), "i.s": "-3", "n[0]": str(2**53 + 1), "n[1]": str(-(2**53) - 1),
-        "on[0]": "True", "on[1]": "False",
-    }  # fmt: skip
+        "i.u": str(2**64 - 1),
+        "i.s": "-3",
+        "n[0]": str(2**53 + 1),
+        "n[1]": str(-(2**53) - 1),
+        "on[0]": "True",
+        "on[1]": "False",
+    }
     run("export", bag, "--out", tmp_path / "npz", "-f", "npz")
     with np.load(tmp_path / "npz" / "x.npz") as arrays:
         assert {str(arrays[name].dtype) for name in ("i.u", "i.s", "on[0]")} == {
-            "uint64", "int8", "bool",
-        }  # fmt: skip
+            "uint64",
+            "int8",
+            "bool",
+        }
 
 
 def test_two_topics_whose_files_would_have_one_name_do_not_share_it(tmp_path: Path) -> None:

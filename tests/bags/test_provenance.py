@@ -86,10 +86,13 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
         ("peak", {"peak": {"level": 0.01, "measured": 0.007}}, "its peak is below"),
         ("assumption", {"safety_factor": 0.5}, "the safety factor is below 1"),
         ("assumption", {"measured_on": []}, "measured on no trial"),
-        ("assumption", {"designed_on": [trial("a")], "measured_on": [trial("a", "[0:5]")]},
-         "a trial that chose it cannot measure it"),
+        (
+            "assumption",
+            {"designed_on": [trial("a")], "measured_on": [trial("a", "[0:5]")]},
+            "a trial that chose it cannot measure it",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_contradicts_itself_is_said(
     documents: tuple[Json, Json], place: str, change: Any, says: str
 ) -> None:

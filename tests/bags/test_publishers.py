@@ -31,7 +31,7 @@ from tests.bag_messages import (
     START_NS,
     command,
     odometry,
-)  # fmt: skip
+)
 from tests.conftest import PERIOD, simulate_truth
 
 SAMPLES = 400
@@ -112,9 +112,13 @@ def test_a_signal_of_two_publishers_is_unknown_bad_and_refused(
 
     with pytest.raises(BagError, match="several publishers"):
         read_dataset(
-            [bag], responses=[SPEED], excitations=[COMMAND], period=PERIOD, max_gap=0.3,
+            [bag],
+            responses=[SPEED],
+            excitations=[COMMAND],
+            period=PERIOD,
+            max_gap=0.3,
             resample="linear",
-        )  # fmt: skip
+        )
 
 
 @pytest.mark.parametrize("senders", ONE.values(), ids=ONE)

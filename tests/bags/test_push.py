@@ -20,8 +20,14 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.proofs import check
 
 PERIOD, PUSH, FACTOR = 0.02, 0.06, 1.2  # s, m/s², of the box over the largest
-SIGNALS = ["-y", "/joint_states:position[0]", "-y", "/joint_states:velocity[0]",
-           "-u", "/joint_commands:effort[0]"]  # fmt: skip
+SIGNALS = [
+    "-y",
+    "/joint_states:position[0]",
+    "-y",
+    "/joint_states:velocity[0]",
+    "-u",
+    "/joint_commands:effort[0]",
+]
 FIELD = VectorField.from_function(lambda x, u: [x[1], u[0]], 2, 1)
 
 
@@ -54,8 +60,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def told(folder: Path, *options: str) -> tuple[int, str]:
-    given = ["funnel", str(folder / "design"), str(folder / "bags"),
-             "--problem", str(folder / "problem.json"), *SIGNALS, *options]  # fmt: skip
+    given = [
+        "funnel",
+        str(folder / "design"),
+        str(folder / "bags"),
+        "--problem",
+        str(folder / "problem.json"),
+        *SIGNALS,
+        *options,
+    ]
     ended = CliRunner().invoke(app, given)
     return ended.exit_code, ended.output + str(ended.exception or "")
 

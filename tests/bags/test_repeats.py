@@ -22,8 +22,11 @@ def test_repeats_pass_and_what_is_not_a_repeat_is_named() -> None:
     other = pair(1500, 2)[1]
     late = replace(second, y=np.roll(second.y, 1))
     stronger = replace(second, y=1.15 * second.y)
-    for stranger, reason in ((other, "excitations differ"), (late, "correlates"),
-                             (stronger, "correlates")):  # fmt: skip
+    for stranger, reason in (
+        (other, "excitations differ"),
+        (late, "correlates"),
+        (stronger, "correlates"),
+    ):
         test = compare_repeats(first, stranger)
         assert not test.passed
         assert reason in str(test)

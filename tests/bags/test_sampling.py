@@ -288,8 +288,10 @@ def test_products_of_delayed_and_lagged_signals_are_what_the_words_say(seed: int
     events = interleaved(rng, columns)
     again = [(k, stamp, value) for k, stamp, value in events if k == 2]
     given = fed(sampler, sorted([*events, *((3, *e[1:]) for e in again)], key=lambda e: e[1]))
-    options = ({"delay_ns": 25 * MS, "lag_ns": 100.0 * MS, "limit_ns": 30 * MS},
-               {"delay_ns": 0, "lag_ns": 0.0, "limit_ns": 20 * MS})  # fmt: skip
+    options = (
+        {"delay_ns": 25 * MS, "lag_ns": 100.0 * MS, "limit_ns": 30 * MS},
+        {"delay_ns": 0, "lag_ns": 0.0, "limit_ns": 20 * MS},
+    )
     truth: list[list[float]] = []
     for at, y in columns[0]:
         u, z = (driven(c, at, **o) for c, o in zip(columns[1:], options, strict=True))  # type: ignore[arg-type]

@@ -351,8 +351,11 @@ def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_
     assert {s.signal("half_width", 0) for s in samples} == {width}
     said = shown.verdict()
     assert (said.word, said.level) == ("recording over", STALE)
-    first = next(e.reading for e in readings if e.reading.status is Status.OUTSIDE
-                 or e.reading.status is Status.ASSUMPTION_VIOLATED)  # fmt: skip
+    first = next(
+        e.reading
+        for e in readings
+        if e.reading.status is Status.OUTSIDE or e.reading.status is Status.ASSUMPTION_VIOLATED
+    )
     assert said.text.startswith(f"verdict: {first.status.value}.")
     assert shown.names == ("speed [m/s]",)
 

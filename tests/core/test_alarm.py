@@ -24,8 +24,11 @@ def states(alarm: Alarm, margins: list[float]) -> list[State]:
 def test_without_options_an_alert_is_the_reading() -> None:
     alarm = Alarm()
     assert states(alarm, [0.9, 0.1, -0.1, 0.1]) == [
-        State.INSIDE, State.INSIDE, State.OUTSIDE, State.INSIDE,
-    ]  # fmt: skip
+        State.INSIDE,
+        State.INSIDE,
+        State.OUTSIDE,
+        State.INSIDE,
+    ]
     assert alarm.update(reading(4, 0.5, violated=True)) is State.ASSUMPTION_VIOLATED
     assert alarm.update(Reading(0.5, Status.UNKNOWN)) is State.UNKNOWN
 
@@ -33,16 +36,26 @@ def test_without_options_an_alert_is_the_reading() -> None:
 def test_a_low_margin_warns_and_hysteresis_keeps_the_warning() -> None:
     alarm = Alarm(AlarmOptions(warning_margin=0.3, hysteresis=0.1))
     assert states(alarm, [0.5, 0.29, 0.35, 0.41]) == [
-        State.INSIDE, State.WARNING, State.WARNING, State.INSIDE,
-    ]  # fmt: skip
+        State.INSIDE,
+        State.WARNING,
+        State.WARNING,
+        State.INSIDE,
+    ]
 
 
 def test_better_must_last_and_worse_is_said_at_once() -> None:
     alarm = Alarm(AlarmOptions(clear_after=0.25))
     assert states(alarm, [0.5, -0.1, 0.2, 0.2, -0.1, 0.2, 0.2, 0.2, 0.2]) == [
-        State.INSIDE, State.OUTSIDE, State.OUTSIDE, State.OUTSIDE, State.OUTSIDE,
-        State.OUTSIDE, State.OUTSIDE, State.OUTSIDE, State.INSIDE,
-    ]  # fmt: skip
+        State.INSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.OUTSIDE,
+        State.INSIDE,
+    ]
 
 
 def test_an_exit_that_is_predicted_soon_is_a_warning() -> None:

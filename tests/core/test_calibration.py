@@ -71,8 +71,11 @@ def test_one_recording_is_cut_into_windows(train: Dataset) -> None:
 def test_windows_of_two_pieces_of_one_recording_do_not_share_samples(train: Dataset) -> None:
     pieces = [replace(t, digest="sha256:0") for t in train.trajectories[:2]]
     assert [w.digest for w in windows(pieces, 40)] == [
-        "sha256:0[0:40]", "sha256:0[40:80]", "sha256:0[80:120]", "sha256:0[120:160]"
-    ]  # fmt: skip
+        "sha256:0[0:40]",
+        "sha256:0[40:80]",
+        "sha256:0[80:120]",
+        "sha256:0[120:160]",
+    ]
 
 
 def test_the_level_is_the_largest_energy_of_the_calibration_trials(

@@ -78,12 +78,17 @@ def cascade(limit: str) -> tuple[Cascade, Trial]:
     top = np.array([0.6, 0.4, 0.9]) if limit == "top" else np.full(cells, np.inf)
     half = np.array([np.nan, np.nan, 1.0 if limit == "friction" else np.nan])
     made = Cascade(
-        knots=np.tile(np.linspace(-1.0, 1.0, K + 1), (cells, 1)), level=rng.normal(0, 0.1, cells),
-        phi=rng.uniform(0.2, 0.9, (cells, K)), g=rng.uniform(0.1, 0.6, (cells, K)),
-        gamma=rng.uniform(0.2, 0.8, cells), top=top, half=half, rest=np.array([0.0, 0.0, 0.1]),
+        knots=np.tile(np.linspace(-1.0, 1.0, K + 1), (cells, 1)),
+        level=rng.normal(0, 0.1, cells),
+        phi=rng.uniform(0.2, 0.9, (cells, K)),
+        g=rng.uniform(0.1, 0.6, (cells, K)),
+        gamma=rng.uniform(0.2, 0.8, cells),
+        top=top,
+        half=half,
+        rest=np.array([0.0, 0.0, 0.1]),
         b=rng.normal(0, 0.4, (cells, 2)),
         x0=rng.normal(0, 0.5, (2, cells)),
-    )  # fmt: skip
+    )
     return made, Trial(rng.normal(size=(60, 2)), np.zeros(60), 0)
 
 
@@ -137,9 +142,13 @@ def test_a_parallel_connection_of_filters_around_nonlinearities_is_a_network_and
     after[2, [4, 6]] = -0.5, 1.0
     after[3, [5, 1]] = 0.3, 1.0
     made = replace(
-        network(), maps=(f, g), into=into, next=after, start=np.zeros(4),
+        network(),
+        maps=(f, g),
+        into=into,
+        next=after,
+        start=np.zeros(4),
         output=np.array([[0, 0, 0, 1.0, 0, 1.0, 0, 0]]),
-    )  # fmt: skip
+    )
     proof = prove_stability(made)
     assert proof is not None
     assert 0.9 < proof.rate < 0.95
@@ -149,10 +158,13 @@ def test_feedback_through_a_map_is_proved_only_where_the_loop_contracts() -> Non
     for slope, proved in ((0.4, True), (1.2, False)):
         f = PiecewiseLinear(np.array([-1.0, 0.0, 1.0]), np.array([0.0, 0.0, slope]))
         made = replace(
-            network(), maps=(f,), into=np.array([[0, 0, 1.0, 0, 0]]), start=np.zeros(2),
+            network(),
+            maps=(f,),
+            into=np.array([[0, 0, 1.0, 0, 0]]),
+            start=np.zeros(2),
             next=np.array([[-1.0, 0.5, 0, 1.0, 0], [0, 1.0, 0, 0, 0]]),
             output=np.array([[0, 1.0, 0, 0, 0]]),
-        )  # fmt: skip
+        )
         assert (prove_stability(made) is not None) is proved
 
 

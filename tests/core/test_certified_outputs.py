@@ -28,11 +28,14 @@ MARKED = [CASES[0], *(pytest.param(case, marks=pytest.mark.slow) for case in CAS
 
 def rows(outputs: int, leading: int, lagged: int, most: float) -> StateAffineRows:
     return problem(
-        outputs=outputs, trials=1, samples=200, noise=0.2,
+        outputs=outputs,
+        trials=1,
+        samples=200,
+        noise=0.2,
         model_class=Polynomial(
             2, (0, 1), Degrees(leading=leading, lagged=lagged), ((-most, most),)
         ),
-    )  # fmt: skip
+    )
 
 
 def left(model: StateAffineModel) -> np.ndarray:

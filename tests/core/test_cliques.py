@@ -163,8 +163,9 @@ def test_a_design_of_small_matrices_is_proved(
         found = designed()
     assert check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(0)
-    run = simulate_boundary(found.model, found.policy, found.funnel, starts=500, rng=rng,
-                            substeps=10)  # fmt: skip
+    run = simulate_boundary(
+        found.model, found.policy, found.funnel, starts=500, rng=rng, substeps=10
+    )
     assert run.violations == 0
     monkeypatch.setattr(cliques, "LARGE", 9)
     whole = designed().funnel.widths(0.0)

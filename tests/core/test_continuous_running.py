@@ -85,8 +85,9 @@ def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
     for k, (t, used) in enumerate([(0.0, 0.0), (HELD, 0.8), (2.24 * HELD, 0.992)]):
         reading = monitor.update(t, [t], policy(t, np.array([t])))
         assert (reading.status, reading.assuming) == (
-            Status.INSIDE, "each input is at most 0.025 s old"
-        ), k  # fmt: skip
+            Status.INSIDE,
+            "each input is at most 0.025 s old",
+        ), k
         assert reading.assumption == pytest.approx(used)
     monitor = Monitor(field, policy, funnel, period=HELD, held=held)
     for t in (0.0, 0.8 * HELD, 2.2 * HELD):  # on the grid, and the last 0.028 s apart

@@ -106,9 +106,11 @@ def test_stopping_is_no_faster_than_allowed_and_arrives() -> None:
 
 def test_each_input_has_limits_and_a_rest_of_its_own() -> None:
     limits = Limits(
-        lowest=np.array([0.0, -2.0]), highest=np.array([1.0, 2.0]),
-        stop_rate=np.array([1.0, 4.0]), stop_at=np.array([0.5, 0.0]),
-    )  # fmt: skip
+        lowest=np.array([0.0, -2.0]),
+        highest=np.array([1.0, 2.0]),
+        stop_rate=np.array([1.0, 4.0]),
+        stop_at=np.array([0.5, 0.0]),
+    )
     np.testing.assert_array_equal(limits.clip(np.array([-1.0, 3.0])), [0.0, 2.0])
     np.testing.assert_allclose(limits.towards_stop(np.array([1.0, -2.0]), 0.1), [0.9, -1.6])
     np.testing.assert_array_equal(limits.towards_stop(np.array([0.55, 0.1]), 0.1), [0.5, 0.0])
@@ -119,10 +121,14 @@ def test_each_input_has_limits_and_a_rest_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("lowest", "highest", "rate"),
     [
-        (1, 0, 1), (1, 2, 1), (-1, 1, 0), (np.array([-1.0, 1.0]), 2, 1),
-        (np.array([-1.0, -1.0]), np.array([1.0, 1.0, 1.0]), 1), (-1, 1, np.array([1.0, 0.0])),
+        (1, 0, 1),
+        (1, 2, 1),
+        (-1, 1, 0),
+        (np.array([-1.0, 1.0]), 2, 1),
+        (np.array([-1.0, -1.0]), np.array([1.0, 1.0, 1.0]), 1),
+        (-1, 1, np.array([1.0, 0.0])),
     ],
-)  # fmt: skip
+)
 def test_limits_that_make_no_sense_are_refused(lowest: float, highest: float, rate: float) -> None:
     with pytest.raises(DataError, match="limits"):
         Limits(lowest=lowest, highest=highest, stop_rate=rate)

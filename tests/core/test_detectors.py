@@ -54,8 +54,10 @@ def test_each_detector_looks_at_its_own_part() -> None:
 @pytest.mark.parametrize("alarms", [0, 1, 3, 5, 9])
 def test_a_threshold_is_raised_until_no_more_than_so_many_alarm(alarms: int) -> None:
     calm = residuals(0)
-    loud = [Residuals(f * r.innovation, f * r.error)
-            for f, r in ((4.0 + i, residuals(i)) for i in range(5))]  # fmt: skip
+    loud = [
+        Residuals(f * r.innovation, f * r.error)
+        for f, r in ((4.0 + i, residuals(i)) for i in range(5))
+    ]
     for name in DETECTORS:
         before = Detector.calibrated(name, [calm], 1.0)
         assert all(before.alarm(run) is not None for run in loud)

@@ -76,9 +76,13 @@ def fitted(name: str, method: Method) -> Fit[Any]:
     if isinstance(method, Rse | Sem):
         method = replace(method, iterations=STEPS)
     return identify(
-        recordings(name), FAMILIES[name], method=method, comparators=(), transient=START,
+        recordings(name),
+        FAMILIES[name],
+        method=method,
+        comparators=(),
+        transient=START,
         allow_unproved=True,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(("name", "method"), GRID)

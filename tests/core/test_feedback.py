@@ -49,8 +49,10 @@ def fit() -> Fit[CellNetwork]:
 def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None:
     """The loop to its noise, unproved; unrolled and proved, 5 % where linear models have 20 %."""
     fresh, louder = trials([0.12, 0.22], seed=1), trials([0.28], seed=2)
-    loop, proved = (next(c for c in fit.candidates if c.method.name == name)
-                    for name in ("sem", "sem_certified"))  # fmt: skip
+    loop, proved = (
+        next(c for c in fit.candidates if c.method.name == name)
+        for name in ("sem", "sem_certified")
+    )
     assert loop.proof is None
     assert loop.error_percent(fresh) < 150 * NOISE
     assert proved.proof is not None
@@ -90,11 +92,14 @@ def example() -> tuple[Basis, list[Stage], Trial]:
     rng, basis = np.random.default_rng(1), Basis(-2.0, 2.0, 4)
     made = [
         Stage(
-            np.array([1.2, -0.5]), 0.1 * rng.normal(size=(3, 2)), 0.05,
-            np.array([0.0 if k == 0 else 0.1, -0.2, 0.1]), rng.normal(size=7),
+            np.array([1.2, -0.5]),
+            0.1 * rng.normal(size=(3, 2)),
+            0.05,
+            np.array([0.0 if k == 0 else 0.1, -0.2, 0.1]),
+            rng.normal(size=7),
         )
         for k in range(3)
-    ]  # fmt: skip
+    ]
     trial = Trial(rng.normal(size=(60, 2)), np.zeros(60), rng.normal(size=2), 0)
     return basis, made, trial
 

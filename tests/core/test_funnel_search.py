@@ -70,8 +70,13 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     assert proved.unproved
     # What was proved of it, written as if it were all there is to prove.
     basis = proved.pieces.basis.tolist()
-    proof = {"margin": 1.0, "basis": basis, "multiplier": basis, "pieces": [],
-             "goal_multiplier": 0.995}  # fmt: skip
+    proof = {
+        "margin": 1.0,
+        "basis": basis,
+        "multiplier": basis,
+        "pieces": [],
+        "goal_multiplier": 0.995,
+    }
     claimed = Verdict("continuous_funnel", "all of it", Fraction(1))
     goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
     claim = {"kind": "continuous_funnel", "goal": goal}
@@ -182,8 +187,15 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     forms = KnotForms(setting.steps, setting.policy, funnel, ends, margin=0.0)
     largest = {}
     for trust in (0.05, 0.2):
-        D = improve(forms.samples, forms.pairs, 8, proof_basis(setting.steps.program),
-                    weights=np.ones(8), margins=forms.margins, trust=trust)  # fmt: skip
+        D = improve(
+            forms.samples,
+            forms.pairs,
+            8,
+            proof_basis(setting.steps.program),
+            weights=np.ones(8),
+            margins=forms.margins,
+            trust=trust,
+        )
         largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()
         assert largest[trust] <= trust + 1e-4
     assert largest[0.05] == pytest.approx(0.05, rel=0.01)
@@ -194,9 +206,11 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
 def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     """Three pushes, each bounded with κ."""
     field = VectorField.from_function(
-        lambda x, w: np.array([x[1] + w[0], -x[0] - x[1] + w[1] + x[0] ** 3 / 9 + w[2]]), 2, 0,
+        lambda x, w: np.array([x[1] + w[0], -x[0] - x[1] + w[1] + x[0] ** 3 / 9 + w[2]]),
+        2,
+        0,
         uncertain=[[-0.01, 0.01]] * 3,
-    )  # fmt: skip
+    )
     t = np.linspace(0, 2, 9)
     nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
     rho, design = (

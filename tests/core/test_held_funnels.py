@@ -213,8 +213,13 @@ def test_a_hold_of_inputs_that_are_not_affine_is_proved_of_a_function() -> None:
     assert found.claim["hold"] == 0.01
     assert not found.model.squares_inputs
     ran = simulate_held(
-        field, found.policy, found.funnel, hold=0.01, error=np.zeros(1), starts=200,
+        field,
+        found.policy,
+        found.funnel,
+        hold=0.01,
+        error=np.zeros(1),
+        starts=200,
         rng=np.random.default_rng(0),
-    )  # fmt: skip
+    )
     assert ran.violations == 0
     assert ran.max_v > 0.9

@@ -65,17 +65,27 @@ def test_observer_form_simulates_the_difference_equation(
 
 def test_an_unstable_model_gets_no_proof() -> None:
     model = DifferenceEquation(
-        a=np.array([1.01]), b=np.array([0.0, 1.0]), c=0.0, period=0.1,
-        y=Signal("y"), u=Signal("u"), u_range=(0.0, 1.0),
-    )  # fmt: skip
+        a=np.array([1.01]),
+        b=np.array([0.0, 1.0]),
+        c=0.0,
+        period=0.1,
+        y=Signal("y"),
+        u=Signal("u"),
+        u_range=(0.0, 1.0),
+    )
     assert prove_stability(model) is None
 
 
 def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
     model = DifferenceEquation(
-        a=np.array([1.9985, -0.99850045]), b=np.zeros(3), c=0.0, period=0.1,
-        y=Signal("y"), u=Signal("u"), u_range=(0.0, 1.0),
-    )  # fmt: skip
+        a=np.array([1.9985, -0.99850045]),
+        b=np.zeros(3),
+        c=0.0,
+        period=0.1,
+        y=Signal("y"),
+        u=Signal("u"),
+        u_range=(0.0, 1.0),
+    )
     proof = prove_stability(model)
     assert proof is not None
     assert float(np.abs(model.poles).max()) < proof.rate < 1.0

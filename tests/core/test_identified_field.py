@@ -138,10 +138,14 @@ def test_a_mechanism_becomes_the_field_of_its_accelerations() -> None:
     model = TrapezoidalModel(
         exponents=np.array([[1, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 1]]),
         coefficients=np.array([[-9.0], [1.5], [-0.2], [2.0]]),
-        period=0.01, x=(Signal("q"), Signal("v")), u=(Signal("u"),),
-        x_range=np.array([[-1, 1], [-2, 2]]), u_range=np.array([[-3, 3]]),
-        noise=np.zeros(2), disturbance=np.zeros(2),
-    )  # fmt: skip
+        period=0.01,
+        x=(Signal("q"), Signal("v")),
+        u=(Signal("u"),),
+        x_range=np.array([[-1, 1], [-2, 2]]),
+        u_range=np.array([[-3, 3]]),
+        noise=np.zeros(2),
+        disturbance=np.zeros(2),
+    )
     field = identified_field(model)
     x, u = np.array([[0.3, -0.8]]), np.array([[1.1]])
     np.testing.assert_allclose(

@@ -32,9 +32,15 @@ from nlsid_core.proofs import check
 from tests.conftest import TRUE_A, synthetic_dataset
 
 STATE_AFFINE = {
-    "lags": 2, "model": "state_affine", "method": "rse", "certified": True, "iterations": 5,
-    "leading_degree": 1, "right_degree": 1, "input_range": [0.0, 0.5],
-}  # fmt: skip
+    "lags": 2,
+    "model": "state_affine",
+    "method": "rse",
+    "certified": True,
+    "iterations": 5,
+    "leading_degree": 1,
+    "right_degree": 1,
+    "input_range": [0.0, 0.5],
+}
 BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "03", "05", "13", "23", "35"}]
 
 
@@ -125,9 +131,7 @@ def test_selection_takes_the_class_with_the_least_validation_error(train: Datase
     assert chosen.best == Polynomial(2)
     assert chosen.errors[0] > chosen.errors[1]
     assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
-    assert seen == [
-        *map(describe, classes), "fitting to training and validation trials", "done"
-    ]  # fmt: skip
+    assert seen == [*map(describe, classes), "fitting to training and validation trials", "done"]
     assert "polynomial, lags 2" in str(chosen)
     with pytest.raises(Infeasible, match="no class has a proved model"):
         select(train, validation, [Polynomial(60)])

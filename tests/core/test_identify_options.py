@@ -55,9 +55,13 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (Sem, "iterations"): ((1, 1000), (0, 1001)),
 }
 FREE = {  # true or false, or options of their own
-    (Rie, "accept_untested_repeats"), (Polynomial, "continuous"), (Polynomial, "degrees"),
-    (Network, "structure"), (Rse, "certified"), (Sem, "certified"),
-}  # fmt: skip
+    (Rie, "accept_untested_repeats"),
+    (Polynomial, "continuous"),
+    (Polynomial, "degrees"),
+    (Network, "structure"),
+    (Rse, "certified"),
+    (Sem, "certified"),
+}
 OTHER_COMBINATIONS: tuple[tuple[Degrees, dict[str, Any], str], ...] = (
     (Degrees(left=3, past=2), {}, "needs ranges in set 2.11"),
     (Degrees(left=3, past=3), {"set": "2.10", "lags": 2}, "needs the degree left 5, or"),

@@ -9,8 +9,13 @@ from nlsid_core.models import ImplicitModel, monotone
 from nlsid_core.models.polynomials import Polynomials
 from tests.implicit_models import coupled, cubic_spring, lagged, quintic, rotated
 
-EVERY = {"quintic": quintic, "coupled": coupled, "lagged": lagged, "rotated": rotated,
-         "mixed": cubic_spring}  # fmt: skip
+EVERY = {
+    "quintic": quintic,
+    "coupled": coupled,
+    "lagged": lagged,
+    "rotated": rotated,
+    "mixed": cubic_spring,
+}
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -57,8 +62,11 @@ def test_an_equation_without_a_root_is_said_to_have_none() -> None:
     model = ImplicitModel(
         Polynomials(np.array([[2, 0], [0, 0]]), np.array([[1.0], [1.0]])),
         Polynomials(np.zeros((0, 1), dtype=np.int64), np.zeros((0, 0))),
-        0.5, 0.1, ("v",), (),
-    )  # fmt: skip
+        0.5,
+        0.1,
+        ("v",),
+        (),
+    )
     with pytest.raises(SolverError, match="monotone"):
         model.step(np.zeros((1, 1)), np.zeros((1, 0)))
 
@@ -115,9 +123,13 @@ def test_wrong_sizes_and_documents_are_refused() -> None:
     model = coupled()
     with pytest.raises(ShapeError, match="e should have 1 polynomials"):
         ImplicitModel.separable(
-            Polynomials(np.array([[1, 0]]), np.ones((1, 2))), model.shift,
-            monotonicity=0.5, period=0.1, states=("a",), inputs=("u",),
-        )  # fmt: skip
+            Polynomials(np.array([[1, 0]]), np.ones((1, 2))),
+            model.shift,
+            monotonicity=0.5,
+            period=0.1,
+            states=("a",),
+            inputs=("u",),
+        )
     with pytest.raises(ShapeError, match="h should have 1 to 1 polynomials, has 2"):
         ImplicitModel(model.h, model.shift, 0.5, 0.1, ("a",), ("u",))
     with pytest.raises(DataError, match="should be positive"):

@@ -59,9 +59,9 @@ CLASSES = [
 ]
 
 
-def spring(samples: int, seed: int, *, noise: float, gain: float = 1.0, mean: float = 0.0) -> (
-    Trajectory
-):  # fmt: skip
+def spring(
+    samples: int, seed: int, *, noise: float, gain: float = 1.0, mean: float = 0.0
+) -> Trajectory:
     """v + v³/2 = 0.6 x + u, measured in other units."""
     rng = np.random.default_rng(seed)
     u, x = rng.uniform(-2.0, 2.0, samples), np.zeros(samples)
@@ -169,10 +169,11 @@ def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> Non
     plain, large, small = (
         identify(
             Dataset((spring(200, 0, noise=0.01, gain=g, mean=m),)),
-            replace(SPRING, set=name), comparators=(),
+            replace(SPRING, set=name),
+            comparators=(),
         ).errors["train"]["rie"]
         for g, m in ((1.0, 0.0), (1e3, 4e3), (1e-3, -5e-3))
-    )  # fmt: skip
+    )
     assert large == pytest.approx(plain, abs=1e-3)
     assert small == pytest.approx(plain, abs=1e-3)
 
@@ -193,7 +194,7 @@ def test_several_states_of_different_units_are_identified_together() -> None:
 
 def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_squares_not_proved() -> (
     None
-):  # fmt: skip
+):
     fit = identify(decay(1.02, 100, 0.0), SPRING, comparators=[LeastSquares()])
     assert fit["least_squares"].proof is None
     assert fit.errors["train"]["least_squares"] < 0.1 < fit.errors["train"]["rie"]
@@ -249,8 +250,11 @@ def test_the_document_keeps_signals_and_validates_against_the_published_schema()
     assert (again.y, again.u, again.window) == (model.y, model.u, ((0, 0), (0, 1)))
     assert again.document() == document
     damages: tuple[dict[str, Any], ...] = (
-        {"window": [[0, -1], [0, 1]]}, {"window": [[3, 0], [0, 1]]}, {"window": []}, {"u": ["u"]},
-    )  # fmt: skip
+        {"window": [[0, -1], [0, 1]]},
+        {"window": [[3, 0], [0, 1]]},
+        {"window": []},
+        {"u": ["u"]},
+    )
     for damage in damages:
         with pytest.raises(DataError):
             ImplicitModel.from_document(document | damage)

@@ -147,9 +147,16 @@ def _stranger(_: Json, proof: Json) -> None:
 
 
 CHANGES: list[Change] = [
-    _larger_right_side, _not_so_monotone, _greedy, _negative_delta, _too_large_squares,
-    _other_set, _unknown_set, _missing_inequality, _stranger,
-]  # fmt: skip
+    _larger_right_side,
+    _not_so_monotone,
+    _greedy,
+    _negative_delta,
+    _too_large_squares,
+    _other_set,
+    _unknown_set,
+    _missing_inequality,
+    _stranger,
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -262,9 +269,7 @@ def test_on_a_box_a_metric_that_changes_is_refused(
 def test_a_centre_makes_a_model_well_posed_that_is_not_monotone(tmp_path: Path) -> None:
     """Proposition 2.7: e = R c(x) turned by 120° has no monotonicity; its centre R does it."""
     model = rotated()
-    uncentred = ImplicitModel(
-        model.h, model.shift, 1e-6, model.period, model.states, model.inputs
-    )  # fmt: skip
+    uncentred = ImplicitModel(model.h, model.shift, 1e-6, model.period, model.states, model.inputs)
     assert prove_well_posed(uncentred) is None
     proof = prove_well_posed(model)
     assert proof is not None
@@ -302,8 +307,12 @@ def test_a_nonlinear_centre_has_to_be_monotone_itself(tmp_path: Path) -> None:
     model = ImplicitModel.separable(
         Polynomials(np.array([[1], [3]]), np.array([[1.25], [0.5]])),
         Polynomials(np.array([[1, 0], [0, 1]]), np.array([[0.5], [1.0]])),
-        monotonicity=0.5, period=0.1, states=("x",), inputs=("u",), centre=cubic,
-    )  # fmt: skip
+        monotonicity=0.5,
+        period=0.1,
+        states=("x",),
+        inputs=("u",),
+        centre=cubic,
+    )
     proof = prove_well_posed(model)
     assert proof is not None
     document = proof.document(model, "model.json")
@@ -325,8 +334,11 @@ def test_a_box_of_inputs_can_be_what_makes_a_model_well_posed(tmp_path: Path) ->
             np.array([[1.0], [1.0], [1.0], [-0.5]]),
         ),
         shift=Polynomials(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))),
-        monotonicity=0.25, period=0.1, states=("x",), inputs=("u",),
-    )  # fmt: skip
+        monotonicity=0.25,
+        period=0.1,
+        states=("x",),
+        inputs=("u",),
+    )
     assert prove_well_posed(model) is None
     proof = prove_well_posed(model, ends=((-1.0, 1.0), (-0.5, 1.0)))
     assert proof is not None

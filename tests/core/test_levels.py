@@ -155,9 +155,11 @@ def test_a_shift_that_breaks_no_assumption_raises_the_alarm_and_only_that() -> N
     lasting = replace(made.funnel, tubes=made.funnel.tubes[:1], response=None)
     clean, alarmed = (
         [monitor.update(t, y, u) for t, y, u in zip(r.t.tolist(), r.y, r.u, strict=True)]
-        for monitor, r in ((Monitor(made.model, None, lasting), recorded),
-                           (Monitor(made.model, None, lasting), biased))
-    )  # fmt: skip
+        for monitor, r in (
+            (Monitor(made.model, None, lasting), recorded),
+            (Monitor(made.model, None, lasting), biased),
+        )
+    )
     assert not any(r.alarm for r in clean)
     first = next(r for r in alarmed if r.alarm)
     assert first.alarm.startswith("cusum alarm: ")

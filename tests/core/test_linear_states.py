@@ -78,8 +78,9 @@ def test_data_of_an_unstable_system_give_a_stable_model_with_a_proof(
     path = stored(fit, tmp_path)
     assert check(path).margin > 0.0
     other = fit.model.document()
-    other["h"]["coefficients"] = [[1.1 * v for v in row] if k > 1 else row
-                                  for k, row in enumerate(other["h"]["coefficients"])]  # fmt: skip
+    other["h"]["coefficients"] = [
+        [1.1 * v for v in row] if k > 1 else row for k, row in enumerate(other["h"]["coefficients"])
+    ]
     files.write_document(tmp_path / "model.json", other)
     with pytest.raises(CertificateRejected):
         check(path)

@@ -80,9 +80,14 @@ def literal_margin(design: FunnelDesign, piece: int, degree: int) -> tuple[float
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "piece"),
-    [("one_dimensional", 0), ("one_dimensional", 17), ("one_dimensional", 38),
-     ("hanging", 3), ("hanging", 12)],
-)  # fmt: skip
+    [
+        ("one_dimensional", 0),
+        ("one_dimensional", 17),
+        ("one_dimensional", 38),
+        ("hanging", 3),
+        ("hanging", 12),
+    ],
+)
 def test_the_literal_formulation_lies_between_what_is_proved_and_what_is_true(
     problem: str, piece: int
 ) -> None:

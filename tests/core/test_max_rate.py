@@ -104,9 +104,13 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
     exact = replace(trial, y=lfilter([0.0, 1.0], [1.0, -0.97], trial.u[:, 0]))
     data = Dataset((exact,))
     fit = identify(
-        data, Polynomial(1), method=LeastSquares(), comparators=(), max_rate=0.9,
+        data,
+        Polynomial(1),
+        method=LeastSquares(),
+        comparators=(),
+        max_rate=0.9,
         allow_unproved=True,
-    )  # fmt: skip
+    )
     assert fit.chosen.proof is None
     assert fit.chosen.remark == (
         "proved only at 0.9715 (3.5 s) a sample, slower than the max_rate of 0.9000 (0.95 s)"

@@ -56,9 +56,13 @@ def test_a_friction_that_equations_leave_out_is_measured_and_the_funnel_holds_wi
     found = design(problem)
     np.testing.assert_array_equal(found.model.uncertain[:2], push.box)
     simulated = simulate_boundary(
-        TrueDynamics(true_rate), found.policy, found.funnel, starts=200,
-        rng=np.random.default_rng(1), substeps=5,
-    )  # fmt: skip
+        TrueDynamics(true_rate),
+        found.policy,
+        found.funnel,
+        starts=200,
+        rng=np.random.default_rng(1),
+        substeps=5,
+    )
     assert simulated.violations == 0
 
 

@@ -63,10 +63,13 @@ def test_a_bank_of_a_robot_in_motion_begins_when_the_slowest_start_has_faded(
     alone = [Monitor(d.model, d.policy, d.funnel, centre=Centre.MOTION) for d in designs]
     samples = list(zip(trial.t, trial.y[:, 0], trial.u[:, 0], strict=True))
     begun = [
-        next(k for k, sample in enumerate(samples)
-             if monitor.update(*sample).status is not Status.UNKNOWN)
+        next(
+            k
+            for k, sample in enumerate(samples)
+            if monitor.update(*sample).status is not Status.UNKNOWN
+        )
         for monitor in alone
-    ]  # fmt: skip
+    ]
     assert min(begun) < max(begun)
     for k, sample in enumerate(samples):
         unknown = {reading.status is Status.UNKNOWN for reading in bank.readings(*sample)}

@@ -45,8 +45,13 @@ def test_a_function_that_is_not_increasing_is_refused() -> None:
 
 
 def test_simulation_solves_the_equation_and_documents_round_trip() -> None:
-    model = replace(truth(), y_offset=0.3, u_offset=np.array([0.1]), window=((0, 0), (0, 3)),
-                    b=np.array([1.0, -0.4]))  # fmt: skip
+    model = replace(
+        truth(),
+        y_offset=0.3,
+        u_offset=np.array([0.1]),
+        window=((0, 0), (0, 3)),
+        b=np.array([1.0, -0.4]),
+    )
     u = np.random.default_rng(0).standard_normal(200)
     y = model.simulate(u, np.array([0.2, -0.1, 0.4])) - 0.3
     left = ((1.0 * y + 0.6) * y + 3.0) * y
@@ -68,7 +73,6 @@ def test_the_banded_simulation_is_the_models_own() -> None:
 def test_the_truth_is_found_and_proved(fit: MomentFit) -> None:
     assert percent(fit.model) < 2.0
     assert 0.0 < fit.proof.rate < 1.0
-    assert "proved stable" in str(fit)
 
 
 def test_the_proof_holds_on_pairs_of_solutions(fit: MomentFit) -> None:
@@ -92,9 +96,11 @@ def test_a_lightly_damped_linear_equation_is_proved_as_the_linear_model_it_equal
 
 def test_every_method_of_the_class_is_offered_to_the_prover() -> None:
     fit = identify(
-        Dataset((run(np.random.default_rng(1).uniform(-2.0, 2.0, 2000), 0.0, 1),)), CLASS,
-        method=Sem(), comparators=(LeastSquares(), Rie()),
-    )  # fmt: skip
+        Dataset((run(np.random.default_rng(1).uniform(-2.0, 2.0, 2000), 0.0, 1),)),
+        CLASS,
+        method=Sem(),
+        comparators=(LeastSquares(), Rie()),
+    )
     assert fit.methods == ("least_squares", "rie", "sem")
     for name in fit.methods:
         proof = fit[name].proof

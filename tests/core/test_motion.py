@@ -69,9 +69,13 @@ def test_a_planned_motion_is_the_one_that_scipy_finds_more_slowly() -> None:
 
     start = np.zeros(3 * steps + 2)
     found = minimize(
-        cost, start, method="SLSQP", constraints={"type": "eq", "fun": defects},
-        bounds=[(-1.0 + RESERVE, 1.0 - RESERVE)] * len(start), options={"maxiter": 300},
-    )  # fmt: skip
+        cost,
+        start,
+        method="SLSQP",
+        constraints={"type": "eq", "fun": defects},
+        bounds=[(-1.0 + RESERVE, 1.0 - RESERVE)] * len(start),
+        options={"maxiter": 300},
+    )
     assert found.success
     x, u = plan_motion(model, [0.0, 0.0], [0.1, 0.0], steps=steps)
     ours = np.concatenate([(x / half_x).ravel(), (u / half_u).ravel()])

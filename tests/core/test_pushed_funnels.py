@@ -86,9 +86,13 @@ def test_an_airplane_in_half_a_metre_per_second_of_wind_is_proved_at_the_first_t
     rate, problem = dubins(0.5)
     found = design(problem)
     run = simulate_boundary(
-        Truth(rate, found, 3), found.policy, found.funnel, starts=1000,
-        rng=np.random.default_rng(0), substeps=10,
-    )  # fmt: skip
+        Truth(rate, found, 3),
+        found.policy,
+        found.funnel,
+        starts=1000,
+        rng=np.random.default_rng(0),
+        substeps=10,
+    )
     assert run.violations == 0
     assert found.funnel.widths(0.0)[0] > 0.1
 
@@ -100,9 +104,13 @@ def test_factors_are_as_near_as_the_scale_that_they_are_written_in_needs() -> No
 
     limits = [[-1, 1]]
     motion = plan_motion(
-        lambda x, u: double(x, u, np.zeros(1)), start=[0, 0], end=[1, 0], seconds=4, m=1,
+        lambda x, u: double(x, u, np.zeros(1)),
+        start=[0, 0],
+        end=[1, 0],
+        seconds=4,
+        m=1,
         limits=limits,
-    )  # fmt: skip
+    )
     problem = ContinuousTracking(
         double, motion, goal=[0.1, 0.1], limits=limits, uncertain=[[-0.05, 0.05]]
     )

@@ -80,10 +80,13 @@ def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
     slope, curvature = barrier.derivatives(point)
     np.testing.assert_allclose(slope, [np.trace(weights @ d) for d in moved], rtol=1e-7, atol=1e-9)
     second = [
-        [2.0 * np.trace(weights @ U.T @ inverse @ S @ inverse @ T @ inverse @ U)
-         - np.trace(weights @ d @ weights @ c) for T, c in zip(slopes, moved, strict=True)]
+        [
+            2.0 * np.trace(weights @ U.T @ inverse @ S @ inverse @ T @ inverse @ U)
+            - np.trace(weights @ d @ weights @ c)
+            for T, c in zip(slopes, moved, strict=True)
+        ]
         for S, d in zip(slopes, moved, strict=True)
-    ]  # fmt: skip
+    ]
     np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-8 * np.abs(second).max())
 
 
@@ -137,9 +140,12 @@ def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
     """min t with [K, ε; ε', t] ⪰ 0, also where the minimiser is on the boundary of K ⪰ 0."""
     for seed, noise in ((3, 0.05), (5, 1.0)):
         stacked = problem(
-            trials=1, samples=26, noise=noise, seed=seed,
+            trials=1,
+            samples=26,
+            noise=noise,
+            seed=seed,
             model_class=Polynomial(2, degrees=Degrees(leading=1, lagged=lagged_degree)),
-        )  # fmt: skip
+        )
         rows = stacked.rows
         found = minimise(Bound(rows, None), rows.identity)
         assert pytest.approx(matrix_inequality(rows), rel=SOLVER) == found.point.J
@@ -156,9 +162,12 @@ def test_robust_simulation_error_is_at_most_the_robust_identification_error() ->
     """Proposition 4.4 with P = I."""
     for seed in range(4):
         stacked = problem(
-            trials=1, samples=80, seed=seed, noise=0.2,
+            trials=1,
+            samples=80,
+            seed=seed,
+            noise=0.2,
             model_class=Polynomial(2, degrees=Degrees(leading=1)),
-        )  # fmt: skip
+        )
         rows = stacked.rows
         _, J_identification = robust_identification_error(stacked)
         assert J_identification >= minimise(Bound(rows, None), rows.identity).point.J
@@ -217,9 +226,12 @@ def test_the_identification_error_is_the_worst_case_over_states_and_above_both_b
 ) -> None:
     """(2.28) maximised row by row, from the polynomials of the model, for the P that was found."""
     stacked = problem(
-        trials=1, samples=120, outputs=outputs, noise=0.1,
+        trials=1,
+        samples=120,
+        outputs=outputs,
+        noise=0.1,
         model_class=Polynomial(2, degrees=Degrees(leading=1, lagged=lagged_degree)),
-    )  # fmt: skip
+    )
     bound = IdentificationErrorBound(stacked)
     found = minimise(bound, bound.start(), inequalities=(bound.storage(),)).point
     n_g, m = len(stacked.rows.identity), outputs
@@ -246,10 +258,12 @@ def test_the_identification_error_is_the_worst_case_over_states_and_above_both_b
         zero, ones = integrand(np.zeros(3 * m)), [integrand(e) for e in unit]
         minus = [integrand(-e) for e in unit]
         slope = 0.5 * (np.array(ones) - np.array(minus))
-        square = np.array([
-            [0.5 * (integrand(a + b) - integrand(a) - integrand(b) + zero) for a in unit]
-            for b in unit
-        ])  # fmt: skip
+        square = np.array(
+            [
+                [0.5 * (integrand(a + b) - integrand(a) - integrand(b) + zero) for a in unit]
+                for b in unit
+            ]
+        )
         worst = -0.5 * np.linalg.solve(square, slope)
         assert np.linalg.eigvalsh(square)[-1] < 0.0
         total += integrand(worst)

@@ -194,8 +194,11 @@ def test_a_disturbance_above_its_bound_by_less_than_rounding_is_not_kept() -> No
     model, policy, funnel = overflowing()
     rng = np.random.default_rng(0)
     S = 0.1
-    y = next(y for y in rng.uniform(0.9, 1.1, 100).tolist()
-             if Fraction(S) * Fraction(y) > Fraction(S * y))  # fmt: skip
+    y = next(
+        y
+        for y in rng.uniform(0.9, 1.1, 100).tolist()
+        if Fraction(S) * Fraction(y) > Fraction(S * y)
+    )
     assumed = DisturbanceAssumption("peak", S * y, 0.0, 1.5, ())
     for bound, status in ((S * y, Status.ASSUMPTION_VIOLATED), (S * y * 1.0001, Status.INSIDE)):
         narrow = replace(funnel, S=np.full((4, 1, 1), S), assumption=replace(assumed, bound=bound))

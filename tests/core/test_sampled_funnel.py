@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bags.designs.provenance import of_proof
 from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import SampledTracking
@@ -14,7 +15,7 @@ from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import plan_motion
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.proofs import check
-from tests.forged_tracking import FORGERIES, forged
+from tests.forged_tracking import CONTRADICTIONS, FORGERIES, forged
 from tests.marks import slow_among
 from tests.tracked import (
     STEPS,
@@ -143,6 +144,16 @@ def test_a_forged_funnel_is_refused_though_every_digest_fits(what: str, tmp_path
     with pytest.raises(CertificateRejected) as refusal:
         check(proof)
     assert not isinstance(refusal.value, CertificateMismatch)  # refused for what it says
+
+
+@pytest.mark.parametrize("what", CONTRADICTIONS)
+def test_an_assumption_that_contradicts_what_was_measured_is_named(
+    what: str, tmp_path: Path
+) -> None:
+    proof = write(forged(designed(), what), tmp_path)
+    assert check(proof)
+    assert not of_proof(write(designed(), tmp_path / "true")).wrong
+    assert of_proof(proof).wrong
 
 
 def test_a_policy_swapped_without_new_digests_is_a_mismatch(tmp_path: Path) -> None:

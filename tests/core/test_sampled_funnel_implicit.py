@@ -130,7 +130,6 @@ OF_EVERY_MODEL = [
     "tube cut by 2 %",
     "levels and reaches cut by 2 %",
     "assumption made smaller",
-    "commissioning runs are the fitting bags",
 ]
 FORGERIES = [
     *OF_EVERY_MODEL,

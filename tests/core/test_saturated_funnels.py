@@ -310,9 +310,13 @@ def test_a_nominal_beyond_the_limits_is_refused() -> None:
 def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:
     field, _ = pendulum.problem()
     asked = FunnelProblem(
-        field, still(field, 13, 0.3), pendulum.Q, pendulum.R, Goal(np.zeros(2), GOAL),
+        field,
+        still(field, 13, 0.3),
+        pendulum.Q,
+        pendulum.R,
+        Goal(np.zeros(2), GOAL),
         limits=np.array([[0, -LIMIT, LIMIT]]),
-    )  # fmt: skip
+    )
     file = tmp_path / "problem.json"
     documents.write_document(file, asked.document())
     made = CliRunner().invoke(app, ["funnel", str(tmp_path), "--problem", str(file)])

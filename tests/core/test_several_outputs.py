@@ -62,7 +62,8 @@ def test_two_coupled_outputs_are_identified_to_the_truth_and_proved() -> None:
     assert found.errors["train"][found.method.name] < 1.0
     own, truth = found.model.document(), block_matrix(model)
     assert own["on_out_of_range"] == "clip"
-    poles = [np.sort_complex(np.linalg.eigvals(matrix)) for matrix in
-             (block_matrix(found.model), truth)]  # fmt: skip
+    poles = [
+        np.sort_complex(np.linalg.eigvals(matrix)) for matrix in (block_matrix(found.model), truth)
+    ]
     np.testing.assert_allclose(poles[0], poles[1], atol=0.02)
     assert found.proof.rate < 1.0

@@ -87,10 +87,14 @@ def test_the_simulation_error_of_the_rows_is_that_of_the_model(outputs: int) -> 
     objective = SimulationError(rows)
     point = objective.at(theta)
     model = stacked.model(theta, point.p)
-    errors = np.concatenate([
-        ((model.simulate(trial.u, trial.y[: len(model)]) - trial.y) / model.y_scale)[len(model) :]
-        for trial in stacked.dataset
-    ]).ravel()  # fmt: skip
+    errors = np.concatenate(
+        [
+            ((model.simulate(trial.u, trial.y[: len(model)]) - trial.y) / model.y_scale)[
+                len(model) :
+            ]
+            for trial in stacked.dataset
+        ]
+    ).ravel()
     assert pytest.approx(errors @ errors, rel=1e-9) == point.J
     assert pytest.approx(point.J, rel=1e-9) == Bound(rows, theta).at(theta).J
     gradient, hessian = objective.derivatives(point)

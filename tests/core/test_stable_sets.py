@@ -87,9 +87,7 @@ def test_proposition_2_14_stable_matrices_satisfy_lemma_2_13(seed: int, radius: 
     names = ["x0", "x1"]
     e, f = linear_map(P, names), linear_map(P @ A, names)
     for condition in (conditions.derivatives, conditions.increments):
-        assert feasible(
-            condition(e, f, P, names, delta=0.5), names=("x0", "x1", "x0~", "x1~")
-        )  # fmt: skip
+        assert feasible(condition(e, f, P, names, delta=0.5), names=("x0", "x1", "x0~", "x1~"))
 
 
 def test_a_cubic_map_needs_a_domain_and_gets_one() -> None:

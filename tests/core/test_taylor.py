@@ -26,9 +26,14 @@ def swinging(x: Any, u: Any) -> list[Any]:
 
 
 def expanded(
-    function: Any, centre: Any, radius: Any, *, states: int, uncertain: Any = None,
+    function: Any,
+    centre: Any,
+    radius: Any,
+    *,
+    states: int,
+    uncertain: Any = None,
     affine: bool = False,
-) -> tuple[list[Polynomial], FloatArray]:  # fmt: skip
+) -> tuple[list[Polynomial], FloatArray]:
     """Cubics in t, x, u, w on a box of (x, u), from t = 0 to 0.1, and the bounds of the rest."""
     centre, radius = np.asarray(centre, float), np.asarray(radius, float)
     rates = Rates.of(function, states, len(centre) - states, uncertain, affine=affine)
@@ -157,8 +162,11 @@ def test_many_inexact_rates_are_pushes_and_exact_ones_have_none() -> None:
     t, x = np.linspace(0, 1, 3), np.zeros((3, n))
     field = taylor_field(
         lambda x: [*np.sin(x[: n - 2]), x[0] / 3 + 0.1 * x[1] + 0.2 * x[1], x[3] ** 3],
-        t, x, np.zeros((3, 0)), radius=np.full(n, 0.1),
-    )  # fmt: skip
+        t,
+        x,
+        np.zeros((3, 0)),
+        radius=np.full(n, 0.1),
+    )
     assert len(field.uncertain) == n - 2
     assert field.is_pushed
 
@@ -326,9 +334,13 @@ def test_known_problems_are_proved_and_no_start_of_the_true_dynamics_leaves(
     check(design.save(tmp_path)[-1])
     assert encloses(design.model, example.truth)
     followed = simulate_boundary(
-        TrueDynamics(example.truth), design.policy, design.funnel,
-        starts=5000, rng=np.random.default_rng(21), substeps=10,
-    )  # fmt: skip
+        TrueDynamics(example.truth),
+        design.policy,
+        design.funnel,
+        starts=5000,
+        rng=np.random.default_rng(21),
+        substeps=10,
+    )
     assert followed.violations == 0
     assert 0.9 < followed.max_v <= 1
 

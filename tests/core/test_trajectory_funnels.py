@@ -150,9 +150,12 @@ def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path
     run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
     assert run.violations == 0
     worse = simulate_boundary(
-        replace(field, uncertain=20 * field.uncertain), design.policy, design.funnel,
-        starts=500, rng=rng,
-    )  # fmt: skip
+        replace(field, uncertain=20 * field.uncertain),
+        design.policy,
+        design.funnel,
+        starts=500,
+        rng=rng,
+    )
     assert worse.violations > 0
 
 
@@ -232,8 +235,15 @@ def decide_inside(
         for part in (centre, inner, other, outer)
     ]
     try:
-        inside(rational[0][0], rational[1], Fraction(1), rational[2][0], rational[3],
-               Fraction(multiplier), "containment")  # fmt: skip
+        inside(
+            rational[0][0],
+            rational[1],
+            Fraction(1),
+            rational[2][0],
+            rational[3],
+            Fraction(multiplier),
+            "containment",
+        )
     except Rejected:
         return False
     return True

@@ -83,9 +83,12 @@ def test_the_recursion_tends_to_the_differential_equation() -> None:
         h = 1 / (knots - 1)
         linear = [field.jacobians(float(t), nominal.x(t), nominal.u(t)) for t in nominal.t[:-1]]
         found = discrete_tvlqr(
-            [np.eye(2) + h * a for a, _ in linear], [h * b for _, b in linear],
-            Q=h * Q, R=h * R, P_final=np.eye(2),
-        )  # fmt: skip
+            [np.eye(2) + h * a for a, _ in linear],
+            [h * b for _, b in linear],
+            Q=h * Q,
+            R=h * R,
+            P_final=np.eye(2),
+        )
         gaps.append(np.abs(found.P - continuous).max())
     assert gaps[1] < 0.6 * gaps[0] < 0.1
 

@@ -77,8 +77,14 @@ def test_bounds_are_kept() -> None:
 def contracting(knots: int) -> tuple[list[Affine], list[tuple[int, int]]]:
     """x₁' = -x₁ + 0.3x₂ - 0.2x₁³, x₂' = -0.3x₁ - 2x₂ - 0.3x₂³: c(D = 0) is a sum of squares."""
     y, mu = np.zeros((2, len(powers(2, 3)))), np.zeros(len(powers(2, 2)))
-    terms = {(0, 1, 0): -1.0, (0, 0, 1): 0.3, (0, 3, 0): -0.2,
-             (1, 1, 0): -0.3, (1, 0, 1): -2.0, (1, 0, 3): -0.3}  # fmt: skip
+    terms = {
+        (0, 1, 0): -1.0,
+        (0, 0, 1): 0.3,
+        (0, 3, 0): -0.2,
+        (1, 1, 0): -0.3,
+        (1, 0, 1): -2.0,
+        (1, 0, 3): -0.3,
+    }
     for (row, *power), value in terms.items():
         y[row, np.flatnonzero((powers(2, 3) == power).all(axis=1))] = value
     mu[0] = 0.8
@@ -114,8 +120,10 @@ def by_cvxpy(samples: list[Affine], pairs: list[tuple[int, int]], free: int, **o
 def test_the_optimum_is_that_of_a_general_solver() -> None:
     samples, pairs = contracting(4)
     options: dict[str, Any] = {
-        "weights": np.array([1.0, 0.5, 0.8]), "margins": [0.05] * len(samples), "trust": 0.4,
-    }  # fmt: skip
+        "weights": np.array([1.0, 0.5, 0.8]),
+        "margins": [0.05] * len(samples),
+        "trust": 0.4,
+    }
     D = improve(samples, pairs, 3, powers(2, 2), **options)
     best = by_cvxpy(samples, pairs, 3, **options)
     assert np.abs(np.linalg.eigvalsh(D)).max() <= 0.4

@@ -54,8 +54,16 @@ def test_a_benchmark_without_its_recordings_is_named_and_leaves_no_file(tmp_path
 
 def test_a_benchmark_that_takes_too_long_is_ended_with_what_it_started(tmp_path: Path) -> None:
     """--limit: named, status 1, no file, and no process of it left."""
-    command = [sys.executable, "-m", "benchmarks", "funnel_scaling", "--limit", "0.2",
-               "--out", str(tmp_path)]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks",
+        "funnel_scaling",
+        "--limit",
+        "0.2",
+        "--out",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "no result: funnel_scaling: " in done.stdout
@@ -70,8 +78,11 @@ def test_the_processes_of_a_benchmark_end_with_it(
     """A child that a benchmark waits for, and that would hold its output open for a minute."""
     started = tmp_path / "started"
     child = f"import os, pathlib; pathlib.Path({str(started)!r}).write_text(str(os.getpid()))"
-    script = ["-c", f"import subprocess, sys; subprocess.run([sys.executable, '-c', "
-              f"{child + '; import time; time.sleep(60)'!r}])"]  # fmt: skip
+    script = [
+        "-c",
+        f"import subprocess, sys; subprocess.run([sys.executable, '-c', "
+        f"{child + '; import time; time.sleep(60)'!r}])",
+    ]
     monkeypatch.setattr(Benchmark, "command", lambda *_: [sys.executable, *script])
     with pytest.raises(subprocess.TimeoutExpired):
         measured(Benchmark("any"), None, 2.0)

@@ -94,23 +94,45 @@ def test_figures_of_pages_are_what_the_benchmarks_wrote(tmp_path: Path) -> None:
 
 def test_figures_that_are_alike_stand_side_by_side(tmp_path: Path) -> None:
     result = {
-        "seconds_10": 0.5, "seconds_20": 1.25, "seconds_40": 25817.3,
-        "gib_10": 1, "gib_20": 2, "gib_40": 4, "proved": True,
-        "n1": {"first": 9.0, "last": 8.0}, "n2": {"first": 7.0, "last": None},
+        "seconds_10": 0.5,
+        "seconds_20": 1.25,
+        "seconds_40": 25817.3,
+        "gib_10": 1,
+        "gib_20": 2,
+        "gib_40": 4,
+        "proved": True,
+        "n1": {"first": 9.0, "last": 8.0},
+        "n2": {"first": 7.0, "last": None},
         "rows": [{"robot": "arm|left", "widths": [0.1, 0.2]}],
-        "differ": {}, "peers": {"drake": "1.51.1"},
-    }  # fmt: skip
-    written = {"command": ["python", "-m", "benchmarks.kernel"], "date": "2026-11-23T09:00",
-               "machine": "one", "commit": "0" * 40, "seconds": 2, "result": result}  # fmt: skip
+        "differ": {},
+        "peers": {"drake": "1.51.1"},
+    }
+    written = {
+        "command": ["python", "-m", "benchmarks.kernel"],
+        "date": "2026-11-23T09:00",
+        "machine": "one",
+        "commit": "0" * 40,
+        "seconds": 2,
+        "result": result,
+    }
     (tmp_path / "kernel.json").write_text(json.dumps(written))
     tables = measured.page(tmp_path, ROOT / "benchmarks").partition("on one:")[2]
     rows = [line for line in tables.splitlines() if line and not line.startswith("|---")]
     assert rows == [
-        "|  | value |", "| proved | yes |", "| differ | - |",
-        "|  | n1 | n2 |", "| first | 9 | 7 |", "| last | 8 | - |",
-        "|  | seconds | gib |", "| 10 | 0.5 | 1 |", "| 20 | 1.25 | 2 |", "| 40 | 25,817 | 4 |",
-        "**rows**", "| robot | widths |", "| arm\\|left | 0.1, 0.2 |",
-    ]  # fmt: skip
+        "|  | value |",
+        "| proved | yes |",
+        "| differ | - |",
+        "|  | n1 | n2 |",
+        "| first | 9 | 7 |",
+        "| last | 8 | - |",
+        "|  | seconds | gib |",
+        "| 10 | 0.5 | 1 |",
+        "| 20 | 1.25 | 2 |",
+        "| 40 | 25,817 | 4 |",
+        "**rows**",
+        "| robot | widths |",
+        "| arm\\|left | 0.1, 0.2 |",
+    ]
 
 
 def test_a_figure_of_a_page_names_a_benchmark_and_a_key_that_its_file_has() -> None:
@@ -120,13 +142,18 @@ def test_a_figure_of_a_page_names_a_benchmark_and_a_key_that_its_file_has() -> N
     ]
     assert len(named) > 50
     assert {found[1] for found in named} <= set(BENCHMARKS)
-    empty = [found[0] for found in named if (results / f"{found[1]}.json").is_file()
-             and measured.filled(found[0], results) == "-"]  # fmt: skip
+    empty = [
+        found[0]
+        for found in named
+        if (results / f"{found[1]}.json").is_file() and measured.filled(found[0], results) == "-"
+    ]
     assert not empty
 
 
 def test_no_result_names_a_folder_of_the_machine_it_was_measured_on() -> None:
-    commands = [json.loads(path.read_text())["command"]
-                for path in (ROOT / "benchmarks" / "results").glob("*.json")]  # fmt: skip
+    commands = [
+        json.loads(path.read_text())["command"]
+        for path in (ROOT / "benchmarks" / "results").glob("*.json")
+    ]
     assert commands
     assert not [word for command in commands for word in command if word.startswith("/")]

@@ -22,9 +22,18 @@ DOWNWARD = {
 }
 # The rooms of bags, each standing on those before it.
 ROOMS = (
-    "recordings", "signals", "tools", "designs", "monitoring", "viewing", "pictures", "chain",
-    "fleet", "setup", "commands",
-)  # fmt: skip
+    "recordings",
+    "signals",
+    "tools",
+    "designs",
+    "monitoring",
+    "viewing",
+    "pictures",
+    "chain",
+    "fleet",
+    "setup",
+    "commands",
+)
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {
     "search": {"identification", "design", "sos", "conic"},
@@ -133,9 +142,11 @@ def test_nothing_private_is_used_outside_its_package() -> None:
             entry.name
             for entry in foreign
             if entry.package in PACKAGES
-            and any((ROOT / Path(*entry.module.split("."), f"{entry.name}{end}")).exists()
-                    for end in (".py", ""))
-        }  # fmt: skip
+            and any(
+                (ROOT / Path(*entry.module.split("."), f"{entry.name}{end}")).exists()
+                for end in (".py", "")
+            )
+        }
         offenders += [
             f"{source}:{node.lineno}: {node.value.id}.{node.attr}"
             for node in ast.walk(source.tree)

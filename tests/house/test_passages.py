@@ -17,7 +17,7 @@ class Block:
     """The statements of one body, what each looks like and how many lines it takes.
 
     Imports and `__all__` are left out, since lists of names say nothing twice, and so are
-    docstrings.
+    docstrings and sentences that have a name.
     """
 
     where: str
@@ -58,6 +58,15 @@ def _is_list_of_names(node: ast.stmt) -> bool:
     )
 
 
+def _is_sentence(node: ast.stmt) -> bool:
+    """Whether a name is given to a text."""
+    return (
+        isinstance(node, ast.Assign)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
 @cache
 def _texts(node: ast.AST) -> int:
     """Lines of the docstrings in it."""
@@ -77,7 +86,8 @@ def blocks(where: str, tree: ast.Module) -> Iterator[Block]:
             body = getattr(node, field, None)
             if not isinstance(body, list):
                 continue  # of a lambda or a conditional expression
-            kept = [s for s in body if not _is_text(s) and not _is_list_of_names(s)]
+            left_out = (_is_text, _is_list_of_names, _is_sentence)
+            kept = [s for s in body if not any(is_one(s) for is_one in left_out)]
             if sum(map(_span, kept)) > LONGEST:
                 yield Block(
                     where,

@@ -32,10 +32,17 @@ def test_an_unproved_policy_runs_in_its_mode_only_and_with_what_stops_the_robot(
     files.write_document(tmp_path / VECTOR_FIELD, field.document())
     files.write_document(tmp_path / POLICY, policy.document())
     settings = {
-        "commissioning": str(tmp_path), "lowest": -20.0, "highest": 20.0, "stop_rate": 100.0,
-        "response": "/joints:position[0]", "command": "/effort:effort[0]", "period": 0.05,
-        "response_type": JOINTS, "command_type": JOINTS, "stale_after": 20.0,
-    }  # fmt: skip
+        "commissioning": str(tmp_path),
+        "lowest": -20.0,
+        "highest": 20.0,
+        "stop_rate": 100.0,
+        "response": "/joints:position[0]",
+        "command": "/effort:effort[0]",
+        "period": 0.05,
+        "response_type": JOINTS,
+        "command_type": JOINTS,
+        "stale_after": 20.0,
+    }
     commands: dict[int, float] = {}
     said: list[tuple[bytes, str]] = []
     stopped: list[bool] = []

@@ -66,9 +66,14 @@ class Driven(Robot):
         self.spin_until(lambda: self.call("start").success)
 
     def feed(
-        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None,
+        self,
+        samples: int,
+        *,
+        ahead: float = 0.0,
+        frame: str = "",
+        margin_at: float | None = None,
         judging: str = "",
-    ) -> list[int]:  # fmt: skip
+    ) -> list[int]:
         """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
 
         margin_at: a monitor's verdict comes with each, stamped so many s from it. judging: of which

@@ -124,8 +124,10 @@ def test_repeats_are_the_same_signal_within_the_limits() -> None:
     assert inputs[-1] == 0.0
     said = [json.loads(text) for text in did]
     assert [(each["repeat"], each.get("ended", "")) for each in said] == [
-        (1, ""), (2, ""), (2, "done"),
-    ]  # fmt: skip
+        (1, ""),
+        (2, ""),
+        (2, "done"),
+    ]
     assert {each["repeat_group"] for each in said} == {said[0]["repeat_group"]}
     assert said[0]["repeat_group"].startswith("/cmd_vel:twist.linear.x, multisine, sha256:")
     assert (said[0]["kind"], said[0]["repeats"]) == ("multisine", 2)
@@ -206,10 +208,14 @@ def test_a_recorder_that_does_not_answer_is_said(tmp_path: Path) -> None:
 
     with (
         node_here("test_robot") as (node, spin_until),
-        process("nlsid_ros.trajectory_recorder", topics="[/cmd_vel]", bag=tmp_path / "bag",
-                at_once=False) as recorder,
+        process(
+            "nlsid_ros.trajectory_recorder",
+            topics="[/cmd_vel]",
+            bag=tmp_path / "bag",
+            at_once=False,
+        ) as recorder,
         process(EXCITATION, **LIMITS, recorder="trajectory_recorder") as running,
-    ):  # fmt: skip
+    ):
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
         spin_until(lambda: "waiting for ~/start" in said)
 

@@ -97,8 +97,9 @@ def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(folder: Path) -> Non
         first_ns, x, k = time.time_ns(), np.array([0.01, 0.01, 0.0, 0.0]), 0
         while not has_said("tracking_controller", "idle; stopped"):
             stamp_ns = first_ns + k * PERIOD_NS
-            message = JointState(name=["cart", "pole"], position=x[:2].tolist(),
-                                 velocity=x[2:].tolist())  # fmt: skip
+            message = JointState(
+                name=["cart", "pole"], position=x[:2].tolist(), velocity=x[2:].tolist()
+            )
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             states.publish(message)
             spin_until(
@@ -131,9 +132,15 @@ def test_samples_that_come_too_slowly_for_the_proof_are_refused_by_name(folder: 
         )
         spin_until(lambda: any("PROVED" in line for line in said))
         stack.enter_context(
-            process("nlsid_ros.tracking_controller", **WIRING, **types, period=0.01, lowest=-40.0,
-                    highest=40.0)
-        )  # fmt: skip
+            process(
+                "nlsid_ros.tracking_controller",
+                **WIRING,
+                **types,
+                period=0.01,
+                lowest=-40.0,
+                highest=40.0,
+            )
+        )
         refused = (
             "samples come every 0.01 s, and the funnel is proved for inputs of at most 0.002 s"
         )

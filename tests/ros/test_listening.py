@@ -17,9 +17,12 @@ pytestmark = pytest.mark.ros
 def init_live(config: Path, *options: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "bags.commands.cli", "init", str(config.parent), "--live"]
     return subprocess.run(
-        [*command, "--yes", *options], capture_output=True, text=True,
-        timeout=200, check=False,
-    )  # fmt: skip
+        [*command, "--yes", *options],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
 
 
 def test_a_running_robot_is_looked_at_for_a_first_configuration(tmp_path: Path) -> None:

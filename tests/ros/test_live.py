@@ -110,7 +110,10 @@ def test_the_publisher_refuses_what_is_not_proved(
     parameter = f"funnel:={tmp_path / documents.FUNNEL}"
     done = subprocess.run(
         [sys.executable, "-m", "nlsid_ros.funnel_publisher", "--ros-args", "-p", parameter],
-        capture_output=True, text=True, timeout=STARTED, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=STARTED,
+        check=False,
+    )
     assert done.returncode == 1
     assert "not published, not proved" in done.stderr + done.stdout

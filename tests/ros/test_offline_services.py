@@ -119,8 +119,13 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
 def test_the_page_about_the_nodes_is_what_the_nodes_are() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "nlsid_ros.interfaces"],
-        capture_output=True, text=True, env=dict(os.environ), cwd=ROOT, timeout=100, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        env=dict(os.environ),
+        cwd=ROOT,
+        timeout=100,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     page = (ROOT / "docs" / "nodes.md").read_text()
     assert page == done.stdout, "run python -m nlsid_ros.interfaces > docs/nodes.md"

@@ -22,9 +22,17 @@ pytestmark = ros_test
 TWIST = "geometry_msgs/msg/TwistStamped"
 SPEED = SignalPath.parse("/cmd_vel:twist.linear.x")
 PLAYED: dict[str, object] = {
-    "kind": "steps", "hold": 0.2, "period": 0.02, "duration": 5.0, "pause": 0.0,
-    "lowest": 0.1, "highest": 0.4, "slew": 5.0, "fade": 0.1, "rest": 0.1,
-}  # fmt: skip
+    "kind": "steps",
+    "hold": 0.2,
+    "period": 0.02,
+    "duration": 5.0,
+    "pause": 0.0,
+    "lowest": 0.1,
+    "highest": 0.4,
+    "slew": 5.0,
+    "fade": 0.1,
+    "rest": 0.1,
+}
 
 
 def test_the_other_fields_are_as_the_template_says() -> None:

@@ -54,10 +54,12 @@ def stuck(how: str, bag: Path) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.mark.parametrize(
     "how",
-    ["threading.Lock().acquire(); (lock := threading.Lock()).acquire(); lock.acquire()",
-     "ctypes.PyDLL(None).pause()"],
+    [
+        "threading.Lock().acquire(); (lock := threading.Lock()).acquire(); lock.acquire()",
+        "ctypes.PyDLL(None).pause()",
+    ],
     ids=["a lock", "a call that keeps Python's lock"],
-)  # fmt: skip
+)
 def test_a_recorder_whose_executor_stands_still_says_so_and_ends(how: str, tmp_path: Path) -> None:
     with stuck(how, tmp_path / "bag") as recorder:
         output = recorder.communicate(timeout=STARTED)[0]

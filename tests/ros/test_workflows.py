@@ -364,17 +364,24 @@ def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
         for message in source.messages():
             if message.topic in topics:
                 writer.write(
-                    topics[message.topic], message.msgtype, message.data,
-                    log_time_ns=message.log_time_ns, publish_time_ns=message.log_time_ns,
-                )  # fmt: skip
+                    topics[message.topic],
+                    message.msgtype,
+                    message.data,
+                    log_time_ns=message.log_time_ns,
+                    publish_time_ns=message.log_time_ns,
+                )
 
 
 def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     command = [sys.executable, "-m", "bags.commands.cli", "run", "control"]
     done = subprocess.run(
         [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
-        capture_output=True, text=True, cwd=ROOT, timeout=STARTED, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=STARTED,
+        check=False,
+    )
     assert done.returncode == 2
     assert "'plants:=true' is not one of the arguments of control.launch.xml" in done.stderr
     assert "stale_after:=0.0" in done.stderr

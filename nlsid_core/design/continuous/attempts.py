@@ -66,8 +66,10 @@ def attempts(setting: Setting, again: Again | None, *, other_weights: bool) -> l
         listed += HALVINGS * [("with more knots", partial(_finer, again))]
     listed.append(("around what w reaches", partial(_pushed, again)))
     if again is not None and other_weights:
-        listed += [("with a quarter of R", partial(_weighed, again, FASTER)),
-                   ("with four times R", partial(_weighed, again, SLOWER))]  # fmt: skip
+        listed += [
+            ("with a quarter of R", partial(_weighed, again, FASTER)),
+            ("with four times R", partial(_weighed, again, SLOWER)),
+        ]
     return listed
 
 

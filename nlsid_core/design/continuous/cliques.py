@@ -140,9 +140,13 @@ class CliqueSteps(LSteps):
         return self.cliques
 
     def solved_case(
-        self, section: Section, rho: float, case: int, start: SphereSolution | None,
+        self,
+        section: Section,
+        rho: float,
+        case: int,
+        start: SphereSolution | None,
         enough: float = np.inf,
-    ) -> SphereSolution:  # fmt: skip
+    ) -> SphereSolution:
         """φ, of the only case; `start` and `enough` change nothing."""
         del case, start, enough
         P, g = self._posed(section, rho)

@@ -269,8 +269,7 @@ class _Loop:
             scale = scales[:, j]
             along: Graded = {1: np.einsum("bkij,i->bkj", PT, pushes[:, j])}
             square = multiply(along, along, self.field.n)
-            total = add({q: scale * part for q, part in square.items()},
-                        {0: 1 / scale})  # fmt: skip
+            total = add({q: scale * part for q, part in square.items()}, {0: 1 / scale})
             terms.append({q: radius * h * part for q, part in total.items()})
         return terms
 

@@ -85,17 +85,26 @@ def design_funnel(
         started = time.perf_counter()
         try:
             funnel, proved, steps_taken = enlarge_shape(
-                setting.steps, setting.policy, funnel, margin=margin, executor=executor,
+                setting.steps,
+                setting.policy,
+                funnel,
+                margin=margin,
+                executor=executor,
                 progress=progress,
-            )  # fmt: skip
+            )
             history += steps_taken
         except Infeasible as refusal:  # what is proved already stays
             history.append((f"shape rho kept: {refusal}", funnel.volume_integral()))
         seconds["P"] = time.perf_counter() - started
     search = ContinuousSearch(
-        setting.goal, proved, setting.first_guess(), tuple(history), seconds,
-        _cost(setting, funnel), tried,
-    )  # fmt: skip
+        setting.goal,
+        proved,
+        setting.first_guess(),
+        tuple(history),
+        seconds,
+        _cost(setting, funnel),
+        tried,
+    )
     return decided(setting, funnel, search)
 
 

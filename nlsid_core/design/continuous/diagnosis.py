@@ -75,8 +75,11 @@ class Diagnosis:
         total = sum(part for part in self.taken.values() if part > 0) or 1.0
         shares = sorted(((p, name) for name, p in self.taken.items() if p > 0), reverse=True)
         least = max(0.01 * total, NOISE * abs(self.linear))
-        taking = "; ".join(f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
-                           for p, n in shares if p >= least)  # fmt: skip
+        taking = "; ".join(
+            f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
+            for p, n in shares
+            if p >= least
+        )
         sizes = ", ".join(f"{width:.3g}" for width in self.widths)
         if self.dominant == "knots":
             return (
@@ -160,9 +163,15 @@ def _terms(
         "curvature": falls(whole - at_motion - slope),
         "motion": falls(at_motion - section.x_rate),
     }
-    own = len(steps.field.uncertain) if not (steps.field.expansion or steps.local) else (
-        len(steps.local[section.interval].rates.uncertain) if section.interval in steps.local else 0
-    )  # fmt: skip
+    own = (
+        len(steps.field.uncertain)
+        if not (steps.field.expansion or steps.local)
+        else (
+            len(steps.local[section.interval].rates.uncertain)
+            if section.interval in steps.local
+            else 0
+        )
+    )
     if steps.kappa is not None:
         pushed = -steps.from_pushes(section, x_bar) / rho
     else:

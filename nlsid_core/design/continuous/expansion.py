@@ -109,9 +109,13 @@ class Expansion:
                 share *= BACK
 
     def around(
-        self, policy: ContinuousPolicy, P: FloatArray, k: int, rho: tuple[float, float],
+        self,
+        policy: ContinuousPolicy,
+        P: FloatArray,
+        k: int,
+        rho: tuple[float, float],
         held: FloatArray | None = None,
-    ) -> Cubic:  # fmt: skip
+    ) -> Cubic:
         """The cubics on interval k on a box that holds the funnel with these ρ at its knots.
 
         held: (m,) by how much more the inputs may be off.

@@ -153,9 +153,16 @@ class _Rates:
     ) -> Graded:
         """What has to be positive for this room (B,); end: only its value at 0 or at 1."""
         return rate_polynomial(
-            steps.field, policy, funnel, self.pieces, self.w, room=room, entry=self.entry,
-            sign=self.sign, end=end,
-        )  # fmt: skip
+            steps.field,
+            policy,
+            funnel,
+            self.pieces,
+            self.w,
+            room=room,
+            entry=self.entry,
+            sign=self.sign,
+            end=end,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,15 +209,23 @@ class Changes:
                 c, _ = _at_end(steps, policy, funnel, batch, curving, end)
                 at_corners = [part[order].reshape(len(first), count, -1) for part in c]
                 found[end].append([signs.T @ part / count for part in at_corners])
-        together = [[np.concatenate(parts) for parts in zip(*of_end, strict=True)]
-                    for of_end in found]  # fmt: skip
+        together = [
+            [np.concatenate(parts) for parts in zip(*of_end, strict=True)] for of_end in found
+        ]
         interval, entry, taken, shoved = (
             np.concatenate(parts) for parts in zip(*rows, strict=True)
         )
         return cls(
-            interval, entry, taken, shoved, (together[0], together[1]), chosen, signs,
-            np.diff(funnel.t), curving,
-        )  # fmt: skip
+            interval,
+            entry,
+            taken,
+            shoved,
+            (together[0], together[1]),
+            chosen,
+            signs,
+            np.diff(funnel.t),
+            curving,
+        )
 
     def rates(self, widths: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
         """(intervals, m) the largest at the ends of intervals, for δ in these widths.
@@ -225,8 +240,10 @@ class Changes:
         sizes = np.broadcast_to(size, len(self.h) + 1)
         for end, products in enumerate(self.products):
             scale = sizes[self.interval + end, None, None]
-            p = [self.signs @ (weights[..., None] * part) * scale**q
-                 for q, part in enumerate(products)]  # fmt: skip
+            p = [
+                self.signs @ (weights[..., None] * part) * scale**q
+                for q, part in enumerate(products)
+            ]
             for sign in (-1, 1):
                 flat = [sign * part.reshape(len(h), -1) for part in p]
                 least = least_rates(flat, self.curving).least
@@ -254,9 +271,12 @@ def fastest(
 
 
 def prove_rates(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray,
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    rates: FloatArray,
     basis: IntArray,
-) -> list[Json]:  # fmt: skip
+) -> list[Json]:
     """The rate pieces of a proof with this basis (k, n), in its order.
 
     Raises Infeasible if a rate is not shown on some part of time.
@@ -274,8 +294,12 @@ def prove_rates(
             rows = rate_documents(funnel, batch.pieces, c, basis, used)
             places = zip(batch.entry.tolist(), batch.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
-                part = Part(*(int(e[b]) for e in (batch.pieces.interval, batch.pieces.level,
-                                                  batch.pieces.index)))  # fmt: skip
+                part = Part(
+                    *(
+                        int(e[b])
+                        for e in (batch.pieces.interval, batch.pieces.level, batch.pieces.index)
+                    )
+                )
                 stated = None if row is None else row | {"input": entry, "sign": sign}
                 written.setdefault(part, []).append(stated)
         waiting = []
@@ -294,14 +318,21 @@ def prove_rates(
 
 
 def _batches(
-    steps: LSteps, policy: ContinuousPolicy, parts: list[Part], basis: IntArray, widths: FloatArray,
-    *, signs: tuple[int, ...] = (-1, 1),
-) -> Iterator[_Rates]:  # fmt: skip
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    parts: list[Part],
+    basis: IntArray,
+    widths: FloatArray,
+    *,
+    signs: tuple[int, ...] = (-1, 1),
+) -> Iterator[_Rates]:
     """Every rate on these parts of time, one span of the equations after the other."""
     field, n = steps.field, steps.program.n
     own = _pushing(field, 1 + n + field.m, len(field.uncertain))
-    boxes = [((a + b) / 2,) if pushes else (a, b)
-             for pushes, (a, b) in zip(own, field.uncertain.tolist(), strict=True)]  # fmt: skip
+    boxes = [
+        ((a + b) / 2,) if pushes else (a, b)
+        for pushes, (a, b) in zip(own, field.uncertain.tolist(), strict=True)
+    ]
     values = _grid(boxes)
     corners = _corners(field)
     limited = steps.limits[:, 0].astype(int).tolist()
@@ -320,17 +351,24 @@ def _batches(
     for span in sorted(set(spans.values())):
         alike = [part for part in parts if spans[part] == span]
         count = len(alike) * len(cases)
-        place = np.repeat(np.array([(p.interval, p.level, p.index) for p in alike]),
-                          len(cases), axis=0)  # fmt: skip
+        place = np.repeat(
+            np.array([(p.interval, p.level, p.index) for p in alike]), len(cases), axis=0
+        )
         v, i, side, m = (np.tile(row, len(alike)) for row in (vertex, entry, sign, mode))
         pieces = Pieces(
-            basis, interval=place[:, 0], vertex=v, level=place[:, 1], index=place[:, 2],
+            basis,
+            interval=place[:, 0],
+            vertex=v,
+            level=place[:, 1],
+            index=place[:, 2],
             T=np.tile(np.eye(n), (count, 1, 1)),
-            mu=np.zeros((count, 2, 0)), gram=np.zeros((count, 2, len(basis), len(basis))),
-            mode=steps.modes[m], tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
+            mu=np.zeros((count, 2, 0)),
+            gram=np.zeros((count, 2, len(basis), len(basis))),
+            mode=steps.modes[m],
+            tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
             push=corners[v // len(values)] * widths[place[:, 0]],
             stated=np.empty(count, dtype=object),
-        )  # fmt: skip
+        )
         gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
         shoved, own_shoved = (
             np.abs(gains @ _pushes(field, span, first, found)).max(axis=1)
@@ -369,9 +407,13 @@ def _pushes(field: VectorField, span: int, first: int, pushing: list[bool]) -> F
 
 
 def _at_end(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates,
-    curving: tuple[int, ...], end: int,
-) -> tuple[list[FloatArray], Frames]:  # fmt: skip
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    batch: _Rates,
+    curving: tuple[int, ...],
+    end: int,
+) -> tuple[list[FloatArray], Frames]:
     """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and the frames of z."""
     pieces, n = batch.pieces, funnel.n
     k, at = pieces.interval, _ends(pieces)[end]
@@ -384,9 +426,13 @@ def _at_end(
 
 
 def _witnessed(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates,
-    curving: tuple[int, ...], rates: FloatArray,
-) -> _Rates:  # fmt: skip
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    batch: _Rates,
+    curving: tuple[int, ...],
+    rates: FloatArray,
+) -> _Rates:
     """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
     pieces, k = batch.pieces, batch.pieces.interval
     tau, gram = pieces.tau.copy(), pieces.gram.copy()

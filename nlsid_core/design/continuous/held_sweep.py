@@ -39,9 +39,12 @@ class HeldSteps(LSteps):
         self, steps: LSteps, setting: Setting, free: FloatArray, table: FloatArray
     ) -> None:
         super().__init__(
-            steps.field, setting.policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+            steps.field,
+            setting.policy,
+            nonlinear=steps.nonlinear,
+            pushed=steps.pushed,
             widths=table[-1].copy(),
-        )  # fmt: skip
+        )
         self.tightness = steps.tightness
         self.free, self.table = free, table
 
@@ -95,8 +98,9 @@ def changes_by_size(setting: Setting, expansion: Expansion | None) -> dict[float
     for size in (1.0,) if expansion is None else EXPANDED:
         rho, field = size**2 * free, setting.steps.field
         if expansion is not None and size < 1:
-            cubics = [expansion.around(policy, P, k, (rho[k], rho[k + 1]))
-                      for k in range(len(P) - 1)]  # fmt: skip
+            cubics = [
+                expansion.around(policy, P, k, (rho[k], rho[k + 1])) for k in range(len(P) - 1)
+            ]
             field = field_of(cubics, policy.t)
         outer = ContinuousFunnel(policy.x, P, rho, "", "")
         found[size] = Changes.of(with_widths(setting, field), policy, outer)
@@ -133,11 +137,26 @@ def held_sweep(
     margin = setting.margin(rho_final)
     if expansion is not None:
         steps.field = expansion.linear()
-        found = sweep_expanded(expansion, steps, policy, P, margin=margin, rho_final=rho_final,
-                               caps=caps, most_back=MOST_BACK, progress=progress)  # fmt: skip
+        found = sweep_expanded(
+            expansion,
+            steps,
+            policy,
+            P,
+            margin=margin,
+            rho_final=rho_final,
+            caps=caps,
+            most_back=MOST_BACK,
+            progress=progress,
+        )
         return found.rho, field_of(found.cubics, policy.t)
     caps = np.minimum(validity_caps(steps.field, policy, P), caps)
     rho_final = min(rho_final, float(caps[-1]))
-    rho, _ = sweep_rho(steps, sections(steps, policy, P), margin=margin, rho_final=rho_final,
-                       caps=caps, progress=progress)  # fmt: skip
+    rho, _ = sweep_rho(
+        steps,
+        sections(steps, policy, P),
+        margin=margin,
+        rho_final=rho_final,
+        caps=caps,
+        progress=progress,
+    )
     return rho, steps.field

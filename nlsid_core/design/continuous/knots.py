@@ -59,14 +59,23 @@ class KnotForms:
                 # ρ is that of this end on both sides: Ẇ is the rate of W, not of W/ρ.
                 scale = np.sqrt(funnel.rho[other] / funnel.rho[own])
                 sample = Sample(
-                    own, other, 1 / self.h[k], 1 if end == 0 else -1,
+                    own,
+                    other,
+                    1 / self.h[k],
+                    1 if end == 0 else -1,
                     np.linalg.solve(self.frames[own], error),
                     scale * np.linalg.solve(self.frames[other], self.frames[own]),
-                )  # fmt: skip
+                )
                 growth = (funnel.rho[k + 1] - funnel.rho[k]) / self.h[k] / funnel.rho[own]
                 m = solutions[k][case].m + growth
-                _, mu = end_proof(steps.program, solutions[k][case], _by_degree(target, n), 1.0, m,
-                                  constant=CONSTANT)  # fmt: skip
+                _, mu = end_proof(
+                    steps.program,
+                    solutions[k][case],
+                    _by_degree(target, n),
+                    1.0,
+                    m,
+                    constant=CONSTANT,
+                )
                 target[0] -= growth
                 form = affine_form(sample)
                 pushed = self._pushed(steps, policy, k, own)
@@ -76,9 +85,13 @@ class KnotForms:
                 self.margins.append(min(margin, KEEP * m))
 
     def _at(
-        self, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel,
-        solutions: list[list[SphereSolution]], end: int,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        self,
+        steps: LSteps,
+        policy: ContinuousPolicy,
+        funnel: ContinuousFunnel,
+        solutions: list[list[SphereSolution]],
+        end: int,
+    ) -> tuple[FloatArray, FloatArray]:
         """Errors (B, n, M₃), and c of D = 0 with ρ̇ (B, M₄), by interval and case, in 1/s."""
         n, intervals = funnel.n, len(self.h)
         T = np.array([self.frames[k + end] for k in range(intervals)])

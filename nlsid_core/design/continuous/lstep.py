@@ -297,9 +297,13 @@ class LSteps:
         return [found[case] for case in range(len(cases))]
 
     def solved_case(
-        self, section: Section, rho: float, case: int, start: SphereSolution | None,
+        self,
+        section: Section,
+        rho: float,
+        case: int,
+        start: SphereSolution | None,
         enough: float = np.inf,
-    ) -> SphereSolution:  # fmt: skip
+    ) -> SphereSolution:
         """φ of one case."""
         (g,) = self.values(section, rho, [case])
         tau: FloatArray = np.zeros((0, 0, 0))

@@ -127,9 +127,13 @@ def plan_motion(
                 f"{mesh.t[worst]:.4g} s between {len(mesh.t)} knots: "
                 + ("leave out `knots`, or take more" if knots is not None else "take more seconds")
             )
-        t = np.concatenate([np.linspace(a, b, count + 1)[:-1] for a, b, count in
-                            zip(mesh.t[:-1], mesh.t[1:], more.tolist(), strict=True)]
-                           + [mesh.t[-1:]])  # fmt: skip
+        t = np.concatenate(
+            [
+                np.linspace(a, b, count + 1)[:-1]
+                for a, b, count in zip(mesh.t[:-1], mesh.t[1:], more.tolist(), strict=True)
+            ]
+            + [mesh.t[-1:]]
+        )
         z = np.hstack([found.x(t), found.u(t)])
         z[-1, :n] = ends[1]
         mesh = replace(mesh, t=t)
@@ -149,8 +153,10 @@ def _held(
     """The knots, first or last, at which the input is `rest`: where that keeps the state."""
     if not ((box[:, 0] <= rest) & (rest <= box[:, 1])).all():
         return []
-    moving = [np.abs(rates(s, x[None], rest[None])).max() * seconds for s, x in
-              zip((0.0, seconds), ends, strict=True)]  # fmt: skip
+    moving = [
+        np.abs(rates(s, x[None], rest[None])).max() * seconds
+        for s, x in zip((0.0, seconds), ends, strict=True)
+    ]
     size = max(float(np.abs(ends[1] - ends[0]).max()), SMALLEST)
     return [k for k, rate in zip((0, -1), moving, strict=True) if rate <= AT_REST * size]
 
@@ -194,9 +200,14 @@ class _Mesh:
 
     def values(self, t: FloatArray, z: FloatArray) -> FloatArray:
         """ẋ at times t and rows of z."""
-        rows = [self.rates(float(s), row[None, : self.n], row[None, self.n :])[0] for s, row in
-                zip(t, z, strict=True)] if self.alone else [
-                self.rates(float(self.t[0]), z[:, : self.n], z[:, self.n :])]  # fmt: skip
+        rows = (
+            [
+                self.rates(float(s), row[None, : self.n], row[None, self.n :])[0]
+                for s, row in zip(t, z, strict=True)
+            ]
+            if self.alone
+            else [self.rates(float(self.t[0]), z[:, : self.n], z[:, self.n :])]
+        )
         return np.asarray(np.vstack(rows))
 
     @property

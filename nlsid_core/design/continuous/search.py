@@ -106,9 +106,12 @@ def _longest(held: Callable[[float], Found]) -> Found:
 
 
 def _held(
-    setting: Setting, expansion: Expansion | None, hold: Hold, changes: dict[float, Changes],
+    setting: Setting,
+    expansion: Expansion | None,
+    hold: Hold,
+    changes: dict[float, Changes],
     progress: Progress,
-) -> Found:  # fmt: skip
+) -> Found:
     """The funnel for one hold, in one that a sweep expects within scaled copies of the free one.
 
     changes: of the free funnel by size; empty without a hold.
@@ -164,9 +167,13 @@ def _free(setting: Setting, progress: Progress) -> FloatArray:
     caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
     rho, _ = sweep_rho(
-        steps, sections(steps, policy, P), margin=setting.margin(rho_final),
-        rho_final=rho_final, caps=caps, progress=progress,
-    )  # fmt: skip
+        steps,
+        sections(steps, policy, P),
+        margin=setting.margin(rho_final),
+        rho_final=rho_final,
+        caps=caps,
+        progress=progress,
+    )
     return rho
 
 
@@ -192,8 +199,15 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
     expected = setting.hold is not None and setting.hold.rates is not None
 
     def search(margin: float) -> Swept:
-        found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
-                          expected=expected, progress=progress)  # fmt: skip
+        found = sweep_rho(
+            steps,
+            pairs,
+            margin=margin,
+            rho_final=rho_final,
+            caps=caps,
+            expected=expected,
+            progress=progress,
+        )
         return Swept(setting, *found)
 
     return proved_for(setting, rho_final, search)
@@ -203,8 +217,15 @@ def _expanded(setting: Setting, progress: Progress, margin: float) -> Swept:
     """The sweep that expands the dynamics around what it finds; the setting has their field."""
     assert setting.expansion is not None
     steps, policy = setting.steps, setting.policy
-    found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
-                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
+    found = sweep_expanded(
+        setting.expansion,
+        steps,
+        policy,
+        setting.P,
+        margin=margin,
+        rho_final=setting.rho_final,
+        progress=progress,
+    )
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)

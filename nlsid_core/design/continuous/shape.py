@@ -150,8 +150,13 @@ def _normalised(
     """
     P, final = funnel.P, float(funnel.rho[-1])
     for _ in range(SWEEPS):
-        rho, _ = sweep_rho(steps, sections(steps, policy, P), margin=margin, rho_final=final,
-                           caps=INSIDE * validity_caps(steps.field, policy, P))  # fmt: skip
+        rho, _ = sweep_rho(
+            steps,
+            sections(steps, policy, P),
+            margin=margin,
+            rho_final=final,
+            caps=INSIDE * validity_caps(steps.field, policy, P),
+        )
         P, final = P / rho[:, None, None], 1.0
         if np.abs(rho - 1).max() < NEAR:
             break
@@ -211,9 +216,16 @@ def _enlarged(
     volumes = np.array([funnel.volume(float(t)) for t in funnel.t[:-1]])
     weights = share * volumes / (share * volumes).max()
     try:
-        D = improve(forms.samples, forms.pairs, len(weights), proof_basis(steps.program),
-                    weights=weights, margins=forms.margins, trust=TRUST,
-                    bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)])  # fmt: skip
+        D = improve(
+            forms.samples,
+            forms.pairs,
+            len(weights),
+            proof_basis(steps.program),
+            weights=weights,
+            margins=forms.margins,
+            trust=TRUST,
+            bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)],
+        )
     except SolverError:
         return None
     for part in (1.0, 0.5, 0.2):

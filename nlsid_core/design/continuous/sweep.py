@@ -112,8 +112,11 @@ def _largest(
         if expected and infeasible > cap:
             rho = cap
         else:
-            rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
-                        LOWEST * after, min(cap, infeasible))  # fmt: skip
+            rho = _root(
+                lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
+                LOWEST * after,
+                min(cap, infeasible),
+            )
         if best is not None and rho <= feasible:
             break
         least = -ACCEPT * margin - slack(rho, 0.0)

@@ -183,8 +183,9 @@ def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePol
     if len(counts) > 1:
         raise DataError(f"u should return as many inputs at all times, returns {sorted(counts)}")
     # Values at the four points from Bernstein control points, inverted.
-    to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
-                          for s in share])  # fmt: skip
+    to_values = np.array(
+        [[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3] for s in share]
+    )
     pieces = [np.linalg.solve(to_values, np.array(rows)) for rows in values]
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]

@@ -81,8 +81,15 @@ def _tables(n: int) -> _Tables:
     linear = [starts[r + 1] + product_table(n, 1, r) for r in range(MAX_DEGREE + 1)]
     quadratic = [starts[r + 2] + product_table(n, 2, r)[pairs] for r in range(DEGREE - 1)]
     on = p == q
-    return _Tables(p, q, starts[2] + pairs, np.where(on, 1.0, 2.0), on.astype(float),
-                   np.hstack(linear), np.hstack(quadratic).T)  # fmt: skip
+    return _Tables(
+        p,
+        q,
+        starts[2] + pairs,
+        np.where(on, 1.0, 2.0),
+        on.astype(float),
+        np.hstack(linear),
+        np.hstack(quadratic).T,
+    )
 
 
 def affine_form(sample: Sample) -> Affine:
@@ -113,8 +120,9 @@ def squares_along(along: FloatArray, scale: FloatArray) -> FloatArray:
     outer: FloatArray = 2 * (along * scale) @ along.T  # z'g z'Dg, twice
     for a, b in ((tables.p, tables.q), (tables.q, tables.p)):
         for column, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
-            np.add.at(result[:, column], tables.linear[i, 1 : n + 1],
-                      outer[j] * tables.twice[column] / 2)  # fmt: skip
+            np.add.at(
+                result[:, column], tables.linear[i, 1 : n + 1], outer[j] * tables.twice[column] / 2
+            )
     return result
 
 

@@ -300,11 +300,13 @@ def _lift(J: int, N: int) -> FloatArray:
     """(N+1, J+1) Bernstein control points of degree N from those of degree J."""
     return np.array(
         [
-            [comb(J, j) * comb(N - J, k - j) / comb(N, k) if 0 <= k - j <= N - J else 0.0
-             for j in range(J + 1)]
+            [
+                comb(J, j) * comb(N - J, k - j) / comb(N, k) if 0 <= k - j <= N - J else 0.0
+                for j in range(J + 1)
+            ]
             for k in range(N + 1)
         ]
-    )  # fmt: skip
+    )
 
 
 def together(c: Graded, n: int) -> tuple[FloatArray, IntArray]:

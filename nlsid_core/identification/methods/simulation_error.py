@@ -105,9 +105,14 @@ class Band:
             found, info = dtbtrs(self.band, columns, uplo="L", trans=trans, overwrite_b=overwrite)
         else:
             found, info = dgbtrs(
-                self.band, self.below, self.above, columns, self.order,
-                trans=int(transposed), overwrite_b=overwrite,
-            )  # fmt: skip
+                self.band,
+                self.below,
+                self.above,
+                columns,
+                self.order,
+                trans=int(transposed),
+                overwrite_b=overwrite,
+            )
         if info != 0:
             raise LinAlgError(f"triangular solve failed ({info})")
         return np.asarray(found.reshape(B.shape, order="F"))

@@ -105,19 +105,28 @@ def identify_block_cascade(
     history = [Step(str(choice), choice.validation_rms) for choice in tried]
     best = min(tried, key=lambda choice: choice.validation_rms)
     polished = _choice(
-        best.parameters, fitted, judged, scales[1],
-        steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
-    )  # fmt: skip
+        best.parameters,
+        fitted,
+        judged,
+        scales[1],
+        steps=FINAL_STEPS,
+        tolerance=FINAL_TOLERANCE,
+        radius=slowest,
+    )
     history.append(Step(f"{polished}, minimised further", polished.validation_rms))
     parameters = min(best, polished, key=lambda choice: choice.validation_rms).parameters
     if whole is not None:
         progress("fitted to all trials", 1.0 - 1.0 / total)
         all_trials = _trials(whole, scales, transient, model_class)
         refitted = _choice(
-            with_intervals(parameters, all_trials, parameters.f.intervals), all_trials, all_trials,
+            with_intervals(parameters, all_trials, parameters.f.intervals),
+            all_trials,
+            all_trials,
             scales[1],
-            steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
-        )  # fmt: skip
+            steps=FINAL_STEPS,
+            tolerance=FINAL_TOLERANCE,
+            radius=slowest,
+        )
         parameters = refitted.parameters
         history.append(Step("fitted to all trials, training error", refitted.train_rms))
     progress("minimised further", 1.0)

@@ -107,9 +107,14 @@ def minimise(
         return J @ J.T / len(residual) + weight * (D.T @ D), gradient
 
     theta, _, taken = descend(
-        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        begin,
+        cost,
+        normal,
+        steps=steps,
+        tolerance=tolerance,
+        damping=FIRST_DAMPING,
         patience=PATIENCE,
-    )  # fmt: skip
+    )
     found = at(theta)
     return Minimum(found, _mean_square(_residual(trials, found)), taken)
 

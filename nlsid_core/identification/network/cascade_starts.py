@@ -43,9 +43,13 @@ def best_start(
 
     def minimised(start: Parameters, steps: int) -> Minimum:
         return minimise(
-            trials, start, smoothing=smoothing, steps=steps, tolerance=START_TOLERANCE,
+            trials,
+            start,
+            smoothing=smoothing,
+            steps=steps,
+            tolerance=START_TOLERANCE,
             radius=radius,
-        )  # fmt: skip
+        )
 
     screened = [
         minimised(
@@ -124,10 +128,12 @@ def _random_start(
     low, spacing = _knots(np.concatenate(inputs, axis=1), START_INTERVALS)
     flat = replace(flat, b1=gain * b1, f=replace(flat.f, low=low, spacing=spacing))
     R = np.concatenate(
-        [basis_responses(flat, x, t)[:, t.transient :]
-         for x, t in zip(inputs, trials, strict=True)],
+        [
+            basis_responses(flat, x, t)[:, t.transient :]
+            for x, t in zip(inputs, trials, strict=True)
+        ],
         axis=1,
-    )  # fmt: skip
+    )
     y = np.concatenate([(t.y - simulate(flat, t))[t.transient :] for t in trials])
     H = R @ R.T
     H += max(RIDGE, smoothing) * np.trace(H) / len(H) * np.eye(len(H))

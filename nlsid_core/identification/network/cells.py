@@ -114,11 +114,15 @@ class Cascade:
         low, per = self.knots[:, 0].tolist(), (K / np.ptp(self.knots, axis=1)).tolist()
         knots, phi, g = self.knots.tolist(), self.phi.tolist(), self.g.tolist()
         widths = np.diff(self.knots, axis=1)
-        at_knots = [np.concatenate([[0.0], np.cumsum(self.phi * widths, axis=1)[i]]) + self.level[i]
-                    for i in range(cells)]  # fmt: skip
+        at_knots = [
+            np.concatenate([[0.0], np.cumsum(self.phi * widths, axis=1)[i]]) + self.level[i]
+            for i in range(cells)
+        ]
         own = [values.tolist() for values in at_knots]
-        onward = [np.concatenate([[0.0], np.cumsum(self.g[i] * widths[i - 1])]).tolist()
-                  for i in range(cells)]  # fmt: skip
+        onward = [
+            np.concatenate([[0.0], np.cumsum(self.g[i] * widths[i - 1])]).tolist()
+            for i in range(cells)
+        ]
         top, gamma = self.top.tolist(), self.gamma.tolist()
         half, rest = self.half.tolist(), self.rest.tolist()
         x, xs, zs = x0.tolist(), [], []
@@ -271,9 +275,11 @@ def _minimised(
             low[cell["half"]] = LEAST_FRICTION
     smooth = [
         (place.start + k, place.start + k + 1)
-        for cell in places for name, place in cell.items() if name in ("phi", "g")
+        for cell in places
+        for name, place in cell.items()
+        if name in ("phi", "g")
         for k in range(place.stop - place.start - 1)
-    ]  # fmt: skip
+    ]
     bend = np.zeros((len(smooth), len(theta)))
     for row, (first, second) in enumerate(smooth):
         bend[row, first], bend[row, second] = -1.0, 1.0
@@ -297,9 +303,15 @@ def _minimised(
 
     inside = np.clip(theta, low + 1e-9, high - 1e-9)
     found = least_squares(
-        residual, inside, jac=jacobian, bounds=(low, high), x_scale="jac",
-        ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=steps,
-    )  # fmt: skip
+        residual,
+        inside,
+        jac=jacobian,
+        bounds=(low, high),
+        x_scale="jac",
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+        max_nfev=steps,
+    )
     error = found.fun[: len(found.fun) - len(bend)]
     return float(np.linalg.norm(error)), start.unpacked(found.x)
 

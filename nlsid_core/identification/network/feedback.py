@@ -203,9 +203,13 @@ def identify_feedback(
     further = replace(first_loop, a=_within(first_loop.a, slowest))
     for maps in range(1, model_class.structure.stages + 1):
         _, stages = minimise_stages(
-            [*stages, further], first_basis, known,
-            radius=slowest, steps=steps, tolerance=TOLERANCE,
-        )  # fmt: skip
+            [*stages, further],
+            first_basis,
+            known,
+            radius=slowest,
+            steps=steps,
+            tolerance=TOLERANCE,
+        )
         further = stages[-1]
         reached = _rms(stages, first_basis, [*others, *unseen])
         history.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * reached))
@@ -213,9 +217,13 @@ def identify_feedback(
         if reached < WORTH * best:
             best, chosen = reached, stages
     _, stages = minimise_stages(
-        chosen, basis, _known(loop, basis, trials, model_class),
-        radius=slowest, steps=steps, tolerance=TOLERANCE,
-    )  # fmt: skip
+        chosen,
+        basis,
+        _known(loop, basis, trials, model_class),
+        radius=slowest,
+        steps=steps,
+        tolerance=TOLERANCE,
+    )
     error = _rms(stages, basis, trials)
     history.append(Step("fitted to all trials, training error", scaled.y[1] * error))
     model = network_of(stages, basis, scaled, trials, train, model_class, error)

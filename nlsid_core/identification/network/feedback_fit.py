@@ -158,11 +158,17 @@ def loop_sensitivities(
     n, N, q = len(loop.a), len(y), trial.u.shape[1]
     responses = basis.responses(y)
     none = np.zeros((1, N))
-    direct = np.concatenate([
-        lagged(y, n)[1:], lagged(trial.u, n).transpose(0, 2, 1).reshape(-1, N), none + 1.0, none,
-        lagged(loop.phi @ responses, n)[1:], moving_sum(loop.e, responses),
-        np.zeros((n, N)),
-    ])  # fmt: skip
+    direct = np.concatenate(
+        [
+            lagged(y, n)[1:],
+            lagged(trial.u, n).transpose(0, 2, 1).reshape(-1, N),
+            none + 1.0,
+            none,
+            lagged(loop.phi @ responses, n)[1:],
+            moving_sum(loop.e, responses),
+            np.zeros((n, N)),
+        ]
+    )
     direct[:, :n] = 0.0
     direct[-n:, :n] = np.eye(n)
     slopes, bands = basis.slopes(loop.phi, y), np.zeros((n + 1, N))
@@ -205,9 +211,11 @@ def stage_sensitivities(
         if k:
             before = basis.slopes(stage.phi, ys[k - 1]) * moved
             direct = [
-                moving_sum(stage.e, before), *direct, lagged(ws[k - 1], n),
+                moving_sum(stage.e, before),
+                *direct,
+                lagged(ws[k - 1], n),
                 moving_sum(stage.e, basis.responses(ys[k - 1])),
-            ]  # fmt: skip
+            ]
         forcing = np.concatenate(direct)
         forcing[:, :n] = 0.0
         moved = lfilter([1.0], np.concatenate([[1.0], -stage.a]), forcing)
@@ -227,10 +235,12 @@ def minimise_loop(
 
     def cost(theta: FloatArray) -> float:
         here, starts = taken(theta)
-        return mean_square([
-            (simulate_loop(here, basis, trial.u, start) - trial.y)[trial.skipped :]
-            for trial, start in zip(trials, starts, strict=True)
-        ])  # fmt: skip
+        return mean_square(
+            [
+                (simulate_loop(here, basis, trial.u, start) - trial.y)[trial.skipped :]
+                for trial, start in zip(trials, starts, strict=True)
+            ]
+        )
 
     def normal(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         here, starts = taken(theta)
@@ -247,9 +257,14 @@ def minimise_loop(
 
     begin = np.concatenate([loop.vector(), *(trial.start for trial in trials)])
     theta, reached, _ = descend(
-        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        begin,
+        cost,
+        normal,
+        steps=steps,
+        tolerance=tolerance,
+        damping=FIRST_DAMPING,
         patience=PATIENCE,
-    )  # fmt: skip
+    )
     found, starts = taken(theta)
     moved = [replace(trial, start=start) for trial, start in zip(trials, starts, strict=True)]
     return reached**0.5, found, moved
@@ -289,9 +304,14 @@ def minimise_stages(
 
     begin = np.concatenate([stage.vector() for stage in stages])
     theta, reached, _ = descend(
-        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        begin,
+        cost,
+        normal,
+        steps=steps,
+        tolerance=tolerance,
+        damping=FIRST_DAMPING,
         patience=PATIENCE,
-    )  # fmt: skip
+    )
     return reached**0.5, taken(theta)
 
 

@@ -42,15 +42,23 @@ def _certified(train: Dataset, model_class: Network[Any], task: Task, method: Se
         return _filter_map_filter(train, model_class, task)
     if isinstance(model_class.structure, CellRow):
         return identify_cells(
-            train, model_class, transient=task.transient, slowest=task.searched_rate,
+            train,
+            model_class,
+            transient=task.transient,
+            slowest=task.searched_rate,
             steps=method.iterations,
-        )  # fmt: skip
+        )
     fitted, judged = hold_out(train)
     return identify_feedback(
-        train, fitted, judged, model_class, transient=task.transient,
-        slowest=min(MAX_RADIUS, task.searched_rate), steps=method.iterations,
+        train,
+        fitted,
+        judged,
+        model_class,
+        transient=task.transient,
+        slowest=min(MAX_RADIUS, task.searched_rate),
+        steps=method.iterations,
         progress=task.progress,
-    )  # fmt: skip
+    )
 
 
 def _filter_map_filter(train: Dataset, model_class: Network[FilterMapFilter], task: Task) -> Found:

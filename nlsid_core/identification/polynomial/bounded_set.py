@@ -122,10 +122,13 @@ def _tightened(
 ) -> FloatArray:
     """The largest ℓ and smallest h that the multipliers of the box can show for this θ."""
     fixed = [
-        MatrixInequality(np.concatenate([[b.F[0] + np.tensordot(theta, b.F[1 : 1 + len(theta)], 1)],
-                                         b.F[1 + len(theta) :]]))
+        MatrixInequality(
+            np.concatenate(
+                [[b.F[0] + np.tensordot(theta, b.F[1 : 1 + len(theta)], 1)], b.F[1 + len(theta) :]]
+            )
+        )
         for b in bounds
-    ]  # fmt: skip
+    ]
     objective = np.zeros(len(extra))
     objective[:2] = -1.0, 1.0
     gap = TIGHT * float(extra[1] - extra[0])

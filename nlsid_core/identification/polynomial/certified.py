@@ -63,9 +63,13 @@ def certified_simulation_error(
     for _ in range(iterations):
         bound = Bound(problem.rows, linearised)
         found = minimise(
-            bound, theta, inequalities=inside.inequalities(), extra=inside.extra,
-            steps=steps, gap=gap,
-        )  # fmt: skip
+            bound,
+            theta,
+            inequalities=inside.inequalities(),
+            extra=inside.extra,
+            steps=steps,
+            gap=gap,
+        )
         gap = max(GAP_FALL * gap, INEQUALITY_GAP)
         theta = linearised = found.point.theta
         inside = inside.renewed(theta, found.extra)

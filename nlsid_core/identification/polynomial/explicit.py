@@ -172,6 +172,7 @@ def _without_slow_comparators(task: Task, problem: StateAffineRows) -> Task:
     if left_out:
         log.warning(
             "%d rows of %d unknowns: no comparison with %s; ask for one to have it",
-            *problem.rows.errors.shape, left_out,
-        )  # fmt: skip
+            *problem.rows.errors.shape,
+            left_out,
+        )
     return replace(task, comparators=beside)

@@ -55,18 +55,23 @@ class ImplicitSet:
         ]
         n_v, n, names = len(y_mean), rows.states, rows.names
         known = n + len(names.w)
-        exponents = np.vstack([
-            np.hstack([rows.left, np.zeros((len(rows.left), known), dtype=np.int64)]),
-            np.hstack([np.zeros((len(rows.right), n_v), dtype=np.int64), rows.right]),
-        ])  # fmt: skip
+        exponents = np.vstack(
+            [
+                np.hstack([rows.left, np.zeros((len(rows.left), known), dtype=np.int64)]),
+                np.hstack([np.zeros((len(rows.right), n_v), dtype=np.int64), rows.right]),
+            ]
+        )
         model = ImplicitModel(
             h=Polynomials(exponents, np.zeros((len(exponents), n_v))),
-            shift=delayed_states(n - n_v, known), monotonicity=MONOTONE,
-            period=rows.dataset.period, states=names.x, inputs=names.w,
+            shift=delayed_states(n - n_v, known),
+            monotonicity=MONOTONE,
+            period=rows.dataset.period,
+            states=names.x,
+            inputs=names.w,
             y=tuple(Signal(name, "") for name in names.v),
             u=tuple(Signal(f"u{i}", "") for i in range(len(u_mean))),
             window=rows.model_class.window(len(u_mean)),
-        )  # fmt: skip
+        )
         return Rollout(model, scaled)
 
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

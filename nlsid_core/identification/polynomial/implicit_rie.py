@@ -152,9 +152,13 @@ def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitP
     gaps = dict(zip((*rows.names.v, *known), (*spread[:n_v], *spread), strict=True))
     scale |= {name + GAP: gaps[name] for name in (*rows.names.v, *rows.names.x)}
     return prove_implicit(
-        model, delta=delta, set=rows.set, ends=rows.ends,
-        storage_degree=made.storage_degree, scale=scale,
-    )  # fmt: skip
+        model,
+        delta=delta,
+        set=rows.set,
+        ends=rows.ends,
+        storage_degree=made.storage_degree,
+        scale=scale,
+    )
 
 
 def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:

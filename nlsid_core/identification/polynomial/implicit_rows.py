@@ -52,8 +52,12 @@ class ImplicitRows:
     def names(self) -> Names:
         """The variables v, x, w."""
         n_v, m = len(self.y_scale[0]), self.right.shape[1] - self.states
-        return Names(*(tuple(f"{c}{i}" for i in range(k))
-                       for c, k in (("v", n_v), ("x", self.states), ("w", m))))  # fmt: skip
+        return Names(
+            *(
+                tuple(f"{c}{i}" for i in range(k))
+                for c, k in (("v", n_v), ("x", self.states), ("w", m))
+            )
+        )
 
     @property
     def set(self) -> str:
@@ -128,10 +132,14 @@ class ImplicitRows:
         mean, spread = self.units
         mean, spread = (np.concatenate([part[:n_v], part]) for part in (mean, spread))
         everything = (*names.v, *names.x, *names.w)
-        exponents = np.vstack([
-            np.hstack([self.left, np.zeros((len(self.left), n + len(names.w)), dtype=np.int64)]),
-            np.hstack([np.zeros((len(self.right), n_v), dtype=np.int64), self.right]),
-        ])  # fmt: skip
+        exponents = np.vstack(
+            [
+                np.hstack(
+                    [self.left, np.zeros((len(self.left), n + len(names.w)), dtype=np.int64)]
+                ),
+                np.hstack([np.zeros((len(self.right), n_v), dtype=np.int64), self.right]),
+            ]
+        )
         scaled = {
             name: (x - float(m)) / float(s)
             for name, x, m, s in zip(everything, variables(everything), mean, spread, strict=True)
@@ -197,10 +205,12 @@ def right_basis(model_class: Options, states: int, inputs: int) -> IntArray:
         return monomials(states + inputs, range(d.past + 1))
     of_x = monomials(states, range(d.past + 1))
     of_w = monomials(inputs, range(1, d.inputs + 1))
-    return np.vstack([
-        np.hstack([of_x, np.zeros((len(of_x), inputs), dtype=np.int64)]),
-        np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
-    ])  # fmt: skip
+    return np.vstack(
+        [
+            np.hstack([of_x, np.zeros((len(of_x), inputs), dtype=np.int64)]),
+            np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
+        ]
+    )
 
 
 def refuse_large(model_class: Options, outputs: int, inputs: int) -> None:
@@ -280,8 +290,10 @@ def _stacked(parts: list[Polynomial]) -> Polynomials:
 
 def _with_symmetric_left(h: Polynomials, n_v: int) -> Polynomials:
     """E = E' to the last digit."""
-    rows = [int(np.flatnonzero((h.exponents == unit).all(axis=1))[0])
-            for unit in np.eye(h.exponents.shape[1], dtype=np.int64)[:n_v]]  # fmt: skip
+    rows = [
+        int(np.flatnonzero((h.exponents == unit).all(axis=1))[0])
+        for unit in np.eye(h.exponents.shape[1], dtype=np.int64)[:n_v]
+    ]
     coefficients = h.coefficients.copy()
     coefficients[rows] = (coefficients[rows] + coefficients[rows].T) / 2.0
     return replace(h, coefficients=coefficients)

@@ -133,9 +133,15 @@ def minimise_monotone_simulation_error(
     if float(np.max(residual(theta[free]))) == DIVERGED:
         raise DataError("the simulation of the first model diverges; start from a stable one")
     found = least_squares(
-        residual, theta[free], jac=jacobian, method="lm", x_scale="jac",
-        ftol=LM_TOLERANCE, xtol=LM_TOLERANCE, max_nfev=LM_EVALUATIONS,
-    )  # fmt: skip
+        residual,
+        theta[free],
+        jac=jacobian,
+        method="lm",
+        x_scale="jac",
+        ftol=LM_TOLERANCE,
+        xtol=LM_TOLERANCE,
+        max_nfev=LM_EVALUATIONS,
+    )
     best = model(found.x)
     if best is None:
         raise DataError("the minimiser left the increasing e")

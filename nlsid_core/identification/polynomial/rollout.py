@@ -176,8 +176,9 @@ def _stepped(model: ImplicitModel, trial: Trajectory) -> FloatArray:
 def _is_delayed(model: ImplicitModel) -> bool:
     """ã is the first states: x stacks the past outputs."""
     size = len(model) - model.unknowns
-    given: dict[tuple[int, ...], FloatArray] = dict(_terms(model.shift.exponents,
-                                                           model.shift.coefficients))  # fmt: skip
+    given: dict[tuple[int, ...], FloatArray] = dict(
+        _terms(model.shift.exponents, model.shift.coefficients)
+    )
     units = np.eye(model.shift.exponents.shape[1], dtype=np.int64)[:size]
     wanted = dict(_terms(units, np.eye(size)))
     return given.keys() == wanted.keys() and all(

@@ -65,9 +65,13 @@ def _monotone(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Mono
 
     def without_bias(method: Rie) -> MomentFit:
         return identify_from_repeats(
-            train, model_class, transient=task.transient, executor=task.executor,
-            accept_untested_repeats=method.accept_untested_repeats, slowest=task.searched_rate,
-        )  # fmt: skip
+            train,
+            model_class,
+            transient=task.transient,
+            executor=task.executor,
+            accept_untested_repeats=method.accept_untested_repeats,
+            slowest=task.searched_rate,
+        )
 
     def biased() -> MomentFit:
         return minimise_moment_rie(
@@ -98,9 +102,13 @@ def _monotone(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Mono
     def inside(method: Sem) -> MonotoneEquation:
         def minimised(start: MonotoneEquation) -> MonotoneEquation | None:
             return minimise_certified(
-                start, plain, model_class, train.trajectories,
-                slowest=task.searched_rate, steps=method.iterations,
-            )  # fmt: skip
+                start,
+                plain,
+                model_class,
+                train.trajectories,
+                slowest=task.searched_rate,
+                steps=method.iterations,
+            )
 
         begun = (*starts, lambda: _best_minimum(starts, train))
         found = [model for start in begun if (model := tried(start, minimised)) is not None]

@@ -74,9 +74,15 @@ def linear(E: Polynomials, F: Polynomials, delta: Number = 1, *, rate: Number = 
 
 
 def increments(
-    e: Polynomials, f: Polynomials, P: Polynomials, states: Sequence[str], *,
-    delta: Number = 1, rate: Number = 1, domain: Domain = (),
-) -> Inequality:  # fmt: skip
+    e: Polynomials,
+    f: Polynomials,
+    P: Polynomials,
+    states: Sequence[str],
+    *,
+    delta: Number = 1,
+    rate: Number = 1,
+    domain: Domain = (),
+) -> Inequality:
     """[ρ²(2Δ'(e - ê) - |Δ|²_P) - δ|Δ|², (f - f̂)'; f - f̂, P] ⪰ 0, Δ = x - x̂, ρ = rate.
 
     V = |e - ê|²_{P⁻¹} ≥ 2Δ'(e - ê) - |Δ|²_P shrinks by ρ² or more. Source: Lemma 2.12.
@@ -91,9 +97,15 @@ def increments(
 
 
 def derivatives(
-    e: Polynomials, f: Polynomials, P: Polynomials, states: Sequence[str], *,
-    delta: Number = 1, rate: Number = 1, domain: Domain = (),
-) -> Inequality:  # fmt: skip
+    e: Polynomials,
+    f: Polynomials,
+    P: Polynomials,
+    states: Sequence[str],
+    *,
+    delta: Number = 1,
+    rate: Number = 1,
+    domain: Domain = (),
+) -> Inequality:
     """[ρ²(He(E(x)) - P) - δI, F(x, w)'; F(x, w), P] ⪰ 0 with E = ∂e/∂x, F = ∂f/∂x, ρ = rate.
 
     Global only if deg E ≥ 2 deg F; otherwise give a domain. Source: Lemma 2.13.
@@ -104,9 +116,16 @@ def derivatives(
 
 
 def implicit_increments(
-    h: Polynomials, shift: Polynomials, V: Polynomial, v: Sequence[str], x: Sequence[str], *,
-    delta: Number = 1, rate: Number = 1, domain: Domain = (),
-) -> Inequality:  # fmt: skip
+    h: Polynomials,
+    shift: Polynomials,
+    V: Polynomial,
+    v: Sequence[str],
+    x: Sequence[str],
+    *,
+    delta: Number = 1,
+    rate: Number = 1,
+    domain: Domain = (),
+) -> Inequality:
     """2(v - v̂)'(h - ĥ) + ρ²V(x, x̂) - V(x⁺, x̂⁺) - δ|x - x̂|² ≥ 0, x⁺ = [v; ã(x, w)], ρ = rate.
 
     V: in x and its gap, zero without gap; `storage` asks V ≥ 0. Source: Lemma 2.10.
@@ -131,9 +150,16 @@ def storage(V: Polynomial, x: Sequence[str], *, domain: Domain = ()) -> Inequali
 
 
 def implicit_derivatives(
-    h: Polynomials, shift: Polynomials, M: Polynomials, v: Sequence[str], x: Sequence[str], *,
-    delta: Number = 1, rate: Number = 1, domain: Domain = (),
-) -> Inequality:  # fmt: skip
+    h: Polynomials,
+    shift: Polynomials,
+    M: Polynomials,
+    v: Sequence[str],
+    x: Sequence[str],
+    *,
+    delta: Number = 1,
+    rate: Number = 1,
+    domain: Domain = (),
+) -> Inequality:
     """2ν'(H₁ν + H₂Δ) + |Δ|²_{ρ²M(x)-δI} - |[ν; ÃΔ]|²_{M(x⁺)} ≥ 0 for every ν, Δ, as a matrix.
 
     ρ = rate, H₁ = ∂h/∂v, H₂ = ∂h/∂x, Ã = ∂ã/∂x; M: (n_x, n_x) in x, M ⪰ 0 to be asked for beside

@@ -79,10 +79,14 @@ def prove_well_posed(
 
 
 def prove_implicit(
-    model: ImplicitModel, *, delta: float, set: str = "2.13",
-    ends: Sequence[tuple[float, float]] = (), storage_degree: int = 0,
+    model: ImplicitModel,
+    *,
+    delta: float,
+    set: str = "2.13",
+    ends: Sequence[tuple[float, float]] = (),
+    storage_degree: int = 0,
     scale: Mapping[str, float] | None = None,
-) -> ImplicitProof | None:  # fmt: skip
+) -> ImplicitProof | None:
     """A proof at the stated δ that the model is in the set, or None if the search finds none.
 
     set: of thesis Chapter 2; "2.10" and "2.11" for any model, "2.12" and "2.13" for separable ones,

@@ -201,11 +201,13 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
     found = run(folder / "*" / "*.mcap", config, tmp_path / "out")
     assert set(found.left_out) == {"robot_0/cut", "robot_0/text", "robot_1/copy"}
     assert "truncated or unfinished" in found.left_out["robot_0/cut"]
-    assert "is not an MCAP file" in found.left_out["robot_0/text"]
+    assert "is no MCAP, SQLite or ROS 1 file" in found.left_out["robot_0/text"]
     assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
     assert (set(found.unread), set(found.unusable), set(found.copies)) == (
-        {"robot_0/cut", "robot_0/text"}, set(), {"robot_1/copy"},
-    )  # fmt: skip
+        {"robot_0/cut", "robot_0/text"},
+        set(),
+        {"robot_1/copy"},
+    )
     assert len(found.trials.train) + len(found.trials.test) == 6
     with pytest.raises(BagError, match=r"cut\.mcap"):
         run(folder / "*" / "*.mcap", config, tmp_path / "strict", strict=True)
@@ -349,9 +351,17 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, config: Path) -> None
     pattern = fleet(tmp_path / "fleet", 30) / "*" / "*.mcap"
     out = tmp_path / "out"
     command = [
-        sys.executable, "-m", "bags.commands.cli", "identify", str(out), str(pattern),
-        "--config", str(config), "--workers", "1",
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "bags.commands.cli",
+        "identify",
+        str(out),
+        str(pattern),
+        "--config",
+        str(config),
+        "--workers",
+        "1",
+    ]
     started = subprocess.Popen(command)
     deadline = time.monotonic() + 60.0
     while _rows(out / MANIFEST) < 3 and time.monotonic() < deadline:

@@ -68,9 +68,12 @@ def test_of_a_compressed_file_only_the_chunks_with_wanted_topics_are_fetched(
     bucket: Bucket, tmp_path: Path
 ) -> None:
     local = drive(
-        tmp_path / "d.mcap", samples=60, image_bytes=100_000, chunk_size=50_000,
+        tmp_path / "d.mcap",
+        samples=60,
+        image_bytes=100_000,
+        chunk_size=50_000,
         compression=CompressionType.ZSTD,
-    )  # fmt: skip
+    )
     path = remote(bucket.put(local, "d.mcap"))
     with Bag(path) as bag:
         images = [message.data for message in bag.messages([IMAGE])]
@@ -121,8 +124,10 @@ def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
     assert not is_url(tmp_path)
     path = remote("s3://bucket/a/b.mcap")
     assert (str(path), path.name, str(path.parent)) == (
-        "s3://bucket/a/b.mcap", "b.mcap", "s3://bucket/a",
-    )  # fmt: skip
+        "s3://bucket/a/b.mcap",
+        "b.mcap",
+        "s3://bucket/a",
+    )
 
 
 @pytest.mark.parametrize(
@@ -446,8 +451,9 @@ def test_a_huge_file_without_a_summary_is_refused_before_it_is_fetched(tmp_path:
     )
     with web_server(tmp_path) as url:
         for name, reason in (
-            ("huge", "1073741824 bytes and no summary"), ("far", "summary offset is damaged"),
-        ):  # fmt: skip
+            ("huge", "1073741824 bytes and no summary"),
+            ("far", "summary offset is damaged"),
+        ):
             path = remote(f"{url}/{name}.mcap")
             with pytest.raises(BagError, match=reason):
                 read_signals(path, [SPEED])

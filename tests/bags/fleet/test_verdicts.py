@@ -69,8 +69,10 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
         alone = replay_bag(proved, path, centre=Centre.COMMAND)
         assert alone.worst is not None
         assert (row.verdict, row.margin, row.span) == (
-            alone.verdict, alone.worst.margin, alone.span,
-        )  # fmt: skip
+            alone.verdict,
+            alone.worst.margin,
+            alone.span,
+        )
         assert row.spent == max(r.assumption for r in alone.judged)
         most = max(range(len(alone.readings)), key=lambda k: _spent(alone.readings[k]))
         when = datetime.fromtimestamp(alone.stamps_ns[most] // 10**9, UTC)
@@ -138,8 +140,10 @@ def test_the_histogram_counts_every_bag_once() -> None:
 
 def test_groups_with_trouble_come_first() -> None:
     rows = (
-        judged(0.1, robot="a"), judged(0.2, robot="b", verdict="outside"), judged(0.3, robot="b"),
-    )  # fmt: skip
+        judged(0.1, robot="a"),
+        judged(0.2, robot="b", verdict="outside"),
+        judged(0.3, robot="b"),
+    )
     found = FleetVerdict((*rows, judged(0.4, robot="c", verdict="copy")), (), frozenset())
     assert list(found.by("robot")) == ["b", "a", "c"]
     assert [trouble_in(own) for own in found.by("robot").values()] == [1, 0, 0]
@@ -160,7 +164,7 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     assert "robot_2/cut: " in done.output
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
     assert f"nlsid view {design.parent} {worst}" in done.output
-    assert "is not an MCAP file" in done.output
+    assert "is no MCAP, SQLite or ROS 1 file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
     assert set(rows) == {"robot_1/other", "robot_2/cut"}
@@ -177,9 +181,13 @@ def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: 
     (tmp_path / "b" / "drive.mcap").write_bytes(original.read_bytes())
     drive(tmp_path / "c" / "drive.mcap", samples=117, chunk_size=2**20)
     found = monitor_fleet(
-        named_bags([tmp_path / "*" / "*.mcap"]), design, documents.load_proved(design),
-        centre=Centre.COMMAND, definitions={}, workers=Workers(),
-    )  # fmt: skip
+        named_bags([tmp_path / "*" / "*.mcap"]),
+        design,
+        documents.load_proved(design),
+        centre=Centre.COMMAND,
+        definitions={},
+        workers=Workers(),
+    )
     assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
@@ -208,9 +216,13 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
     assert tails["a.mcap"] == tails["b.mcap"]
     with web_server(web) as url:
         found = monitor_fleet(
-            named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]), design,
-            documents.load_proved(design), centre=Centre.COMMAND, definitions={}, workers=Workers(),
-        )  # fmt: skip
+            named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]),
+            design,
+            documents.load_proved(design),
+            centre=Centre.COMMAND,
+            definitions={},
+            workers=Workers(),
+        )
     rows = {row.bag: row for row in found.rows}
     assert rows["b"].judged > 0
     assert "copy" not in (rows["a"].verdict, rows["b"].verdict)
@@ -240,7 +252,7 @@ def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
     rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
     assert [row.bag for row in rows] == list(bags)
     assert rows[-1].verdict == "not read"
-    assert "is not an MCAP file" in rows[-1].trouble
+    assert "is no MCAP, SQLite or ROS 1 file" in rows[-1].trouble
     assert all(row.findings and row.start.startswith("2022-01-01T00:") for row in rows[:3])
     parquet = pytest.importorskip("pyarrow.parquet")
     write_parquet(rows, tmp_path / "t.parquet")
@@ -312,14 +324,19 @@ def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
     split = config.split.model_copy(update={"test": ["r0/*"], "calibration": []})
     config = config.model_copy(update={"split": split})
     checked = {
-        verdict: {row.bag for row in check_fleet(bags, config, workers=Workers()).rows
-                  if row.verdict == verdict}
+        verdict: {
+            row.bag
+            for row in check_fleet(bags, config, workers=Workers()).rows
+            if row.verdict == verdict
+        }
         for verdict in ("not read", "bad", "copy")
-    }  # fmt: skip
+    }
     read = read_fleet(bags, config, tmp_path, workers=Workers())
     assert checked == {
-        "not read": set(read.unread), "bad": set(read.unusable), "copy": set(read.copies),
-    }  # fmt: skip
+        "not read": set(read.unread),
+        "bad": set(read.unusable),
+        "copy": set(read.copies),
+    }
 
 
 def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
@@ -364,9 +381,13 @@ def test_a_table_of_groups_says_how_many_it_does_not_show(capsys: Any) -> None:
 def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_path: Path) -> None:
     bags = named_bags([drive(tmp_path / "drive.mcap", samples=117)])
     (row,) = monitor_fleet(
-        bags, design, documents.load_proved(design),
-        centre=Centre.COMMAND, definitions={}, workers=Workers(),
-    ).rows  # fmt: skip
+        bags,
+        design,
+        documents.load_proved(design),
+        centre=Centre.COMMAND,
+        definitions={},
+        workers=Workers(),
+    ).rows
     assert row.verdict == "assumption violated"
     assert row.reason.startswith(row.assumption.partition(" ...")[0])
     assert not re.search(r"\d", row.assumption)
@@ -414,16 +435,20 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
     said = Console(file=io.StringIO(), width=80)
     with pytest.raises(DataError, match="all of the bags are test trials"):
         fleet_cli.identify(
-            said, [tmp_path / "bags"], config.model_copy(update={"split": split}), tmp_path / "out",
+            said,
+            [tmp_path / "bags"],
+            config.model_copy(update={"split": split}),
+            tmp_path / "out",
             fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )  # fmt: skip
+        )
     lines = said.file.getvalue().splitlines()  # type: ignore[attr-defined]
     assert lines[0].startswith(
         "2 bags: 1 used, 1 not read, 0 not usable, 0 copies; 0 of them known"
     )
     assert lines[1:3] == [
         "left out, not read: 1 bag",
-        "  cut: is not an MCAP file: it starts with 6e 6f 20 62 61 67",
+        "  cut: is damaged or not a bag: it is no MCAP, SQLite or ROS 1 file: "
+        "it starts with 6e 6f 20 62 61 67",
     ]
 
 
@@ -445,9 +470,12 @@ def test_names_that_cannot_be_split_are_refused_before_a_bag_is_read(
     said = Console(file=io.StringIO(), width=80)
     with pytest.raises(DataError, match=reason):
         fleet_cli.identify(
-            said, [tmp_path], config.model_copy(update={"split": split}), tmp_path / "out",
+            said,
+            [tmp_path],
+            config.model_copy(update={"split": split}),
+            tmp_path / "out",
             fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )  # fmt: skip
+        )
     assert said.file.getvalue() == ""  # type: ignore[attr-defined]
     assert not (tmp_path / "out" / "fleet.sqlite").exists()
 
@@ -485,10 +513,14 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
             check_fleet(named, load_config(CONFIG), workers=Workers()).rows
             if verb == "check"
             else monitor_fleet(
-                named, design, documents.load_proved(design),
-                centre=Centre.COMMAND, definitions={}, workers=Workers(),
+                named,
+                design,
+                documents.load_proved(design),
+                centre=Centre.COMMAND,
+                definitions={},
+                workers=Workers(),
             ).rows
-        )  # fmt: skip
+        )
     rows = {row.bag: row for row in found}
     assert [row.bag for row in found] == sorted(rows) == sorted(named)
     said = {

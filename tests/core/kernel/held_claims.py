@@ -15,25 +15,50 @@ def claim(low: float) -> Files:
     """dx/dt = -x, valid for u >= low from 1.25 s on; u = clip(u₀) to [-1, 1], held for 1 s."""
     free, nothing = [[0], [1]], {"unit": 0, "factors": [[]]}
     field = {
-        "format": "nlsid/vector_field", "version": 2, "states": 1, "inputs": 1, "uncertain": [],
-        "breaks": [1.25], "valid": [[1, low, 10.0, 1]], "expansion": "",
+        "format": "nlsid/vector_field",
+        "version": 2,
+        "states": 1,
+        "inputs": 1,
+        "uncertain": [],
+        "breaks": [1.25],
+        "valid": [[1, low, 10.0, 1]],
+        "expansion": "",
         "pieces": [[{"exponents": [[0, 1, 0]], "coefficients": [-1.0]}]] * 2,
-    }  # fmt: skip
+    }
     policy = {
-        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
-        "t": TIMES, "x": [[[0.0]]] * 3, "u": [[[a], [b]] for a, b in WANTED],
-        "K": [[[[0.0]]]] * 3, "limits": [[0, *LIMITS]],
-    }  # fmt: skip
+        "format": "nlsid/policy",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "t": TIMES,
+        "x": [[[0.0]]] * 3,
+        "u": [[[a], [b]] for a, b in WANTED],
+        "K": [[[[0.0]]]] * 3,
+        "limits": [[0, *LIMITS]],
+    }
     funnel = {
-        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
-        "policy": "", "t": TIMES, "x": [[[0.0]]] * 3, "P": [[[1.0]]] * 4, "rho": [1.0] * 4,
-    }  # fmt: skip
+        "format": "nlsid/funnel",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "policy": "",
+        "t": TIMES,
+        "x": [[[0.0]]] * 3,
+        "P": [[[1.0]]] * 4,
+        "rho": [1.0] * 4,
+    }
 
     def witness(k: int, root: int) -> dict[str, Any]:
         """r is the whole polynomial; τ = root² for what holds in the mode."""
         tau = {"columns": [0, 0], "squares": {"unit": 0, "factors": [[[root, 0]]]}}
-        return {"interval": k, "level": 0, "index": 0, "columns": [0, 0], "squares": nothing,
-                "tau": [tau]}  # fmt: skip
+        return {
+            "interval": k,
+            "level": 0,
+            "index": 0,
+            "columns": [0, 0],
+            "squares": nothing,
+            "tau": [tau],
+        }
 
     lengths = [[int(4 * (TIMES[k + 1] - TIMES[k])), 0] for k in range(3)]
     mu = [{"shifts": [-2, 0], "start": h, "end": h} for h in lengths]  # μ = h
@@ -49,14 +74,25 @@ def claim(low: float) -> Files:
         piece |= {"vertex": 0, "mode": [0], "input": 0, "sign": sign, "tau": [still, *piece["tau"]]}
         rates.append(piece)
     proof = {
-        "margin": 0.5, "basis": free, "multiplier": free, "sides": free, "pieces": pieces,
-        "rates": [[1.0]] * 3, "rate_pieces": rates,
-    }  # fmt: skip
-    about = {role: {"file": f"{role}.json", "digest": ""}
-             for role in ("vector_field", "policy", "funnel")}  # fmt: skip
+        "margin": 0.5,
+        "basis": free,
+        "multiplier": free,
+        "sides": free,
+        "pieces": pieces,
+        "rates": [[1.0]] * 3,
+        "rate_pieces": rates,
+    }
+    about = {
+        role: {"file": f"{role}.json", "digest": ""}
+        for role in ("vector_field", "policy", "funnel")
+    }
     stated = {"kind": "continuous_funnel", "about": about, "hold": HOLD}
-    files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
-             PROOF: proofs.proof_document(stated, proof)}  # fmt: skip
+    files = {
+        FIELD: field,
+        POLICY: policy,
+        FUNNEL: funnel,
+        PROOF: proofs.proof_document(stated, proof),
+    }
     bind(files)
     return files
 
@@ -67,18 +103,38 @@ def integrator(rate: float) -> Files:
     rate: claimed, in 1/s.
     """
     field = {
-        "format": "nlsid/vector_field", "version": 2, "states": 1, "inputs": 1, "uncertain": [],
-        "breaks": [], "valid": [], "expansion": "",
+        "format": "nlsid/vector_field",
+        "version": 2,
+        "states": 1,
+        "inputs": 1,
+        "uncertain": [],
+        "breaks": [],
+        "valid": [],
+        "expansion": "",
         "pieces": [[{"exponents": [[0, 0, 1]], "coefficients": [1.0]}]],
-    }  # fmt: skip
+    }
     policy = {
-        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
-        "t": [0.0, 2.0], "x": [[[0.0]]], "u": [[[0.0]]], "K": [[[[1.0]]]], "limits": [],
-    }  # fmt: skip
+        "format": "nlsid/policy",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "t": [0.0, 2.0],
+        "x": [[[0.0]]],
+        "u": [[[0.0]]],
+        "K": [[[[1.0]]]],
+        "limits": [],
+    }
     funnel = {
-        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
-        "policy": "", "t": [0.0, 2.0], "x": [[[0.0]]], "P": [[[1.0]]] * 2, "rho": [1.0] * 2,
-    }  # fmt: skip
+        "format": "nlsid/funnel",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "policy": "",
+        "t": [0.0, 2.0],
+        "x": [[[0.0]]],
+        "P": [[[1.0]]] * 2,
+        "rho": [1.0] * 2,
+    }
     part: dict[str, Any] = {"interval": 0, "level": 0, "index": 0, "columns": [0, 0]}
 
     def squared(constant: int, unit: int) -> dict[str, Any]:
@@ -94,18 +150,35 @@ def integrator(rate: float) -> Files:
     # 2 (R - W) - sign 2x - (1 - x²) = (x - sign)² + 2 (R - W - 1)
     shell = {"columns": [0, 0], "squares": {"unit": 0, "factors": [[[1, 0]]]}}
     rates = [
-        {**part, "vertex": 0, "input": 0, "sign": sign, "tau": [shell],
-         "squares": squared(-sign, 0)}
+        {
+            **part,
+            "vertex": 0,
+            "input": 0,
+            "sign": sign,
+            "tau": [shell],
+            "squares": squared(-sign, 0),
+        }
         for sign in (-1, 1)
-    ]  # fmt: skip
+    ]
     proof = {
-        "margin": 0.5, "basis": [[0], [1]], "multiplier": [[0]], "sides": [[0], [1]],
-        "pieces": pieces, "rates": [[rate]], "rate_pieces": rates,
-    }  # fmt: skip
-    about = {role: {"file": f"{role}.json", "digest": ""}
-             for role in ("vector_field", "policy", "funnel")}  # fmt: skip
+        "margin": 0.5,
+        "basis": [[0], [1]],
+        "multiplier": [[0]],
+        "sides": [[0], [1]],
+        "pieces": pieces,
+        "rates": [[rate]],
+        "rate_pieces": rates,
+    }
+    about = {
+        role: {"file": f"{role}.json", "digest": ""}
+        for role in ("vector_field", "policy", "funnel")
+    }
     stated = {"kind": "continuous_funnel", "about": about, "hold": 0.25}
-    files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
-             PROOF: proofs.proof_document(stated, proof)}  # fmt: skip
+    files = {
+        FIELD: field,
+        POLICY: policy,
+        FUNNEL: funnel,
+        PROOF: proofs.proof_document(stated, proof),
+    }
     bind(files)
     return files

@@ -28,13 +28,20 @@ def equal_hashes(pairs: int) -> Claim:
             exponents[1 + pair + pair // 10 * 10 + 10 * other] = 1 + other
         rows.append(exponents)
     model = {
-        "format": "nlsid/model", "version": 2, "kind": "implicit", "period": 1, "monotonicity": 1,
-        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]", "inputs": [f"u{i}" for i in range(m)],
+        "format": "nlsid/model",
+        "version": 2,
+        "kind": "implicit",
+        "period": 1,
+        "monotonicity": 1,
+        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]",
+        "inputs": [f"u{i}" for i in range(m)],
         "states": [f"x{i}" for i in range(n)],
         "h": {"exponents": rows, "coefficients": [[1]] * len(rows)},
-        "shift": {"exponents": [[int(i == j) for j in range(n + m)] for i in range(n)],
-                  "coefficients": [[int(i == j) for j in range(n - 1)] for i in range(n)]},
-    }  # fmt: skip
+        "shift": {
+            "exponents": [[int(i == j) for j in range(n + m)] for i in range(n)],
+            "coefficients": [[int(i == j) for j in range(n - 1)] for i in range(n)],
+        },
+    }
     witness = {"basis": [[0] * 83], "columns": [0], "squares": {"unit": 0, "factors": [[]]}}
     return bound("stable_set", model, {}, {"inequalities": {"monotone": witness}})
 
@@ -45,12 +52,21 @@ def network(n: int) -> Claim:
     width, m = n + 10, 8
     knots = {"knots": [0, 1, 2], "values": [0, 0.123456789, 0.3]}
     model = {
-        "format": "nlsid/model", "version": 2, "kind": "cell_network", "period": 1, "training": "",
-        "bags": [], "y": [signal], "u": [signal], "maps": [knots] * m,
+        "format": "nlsid/model",
+        "version": 2,
+        "kind": "cell_network",
+        "period": 1,
+        "training": "",
+        "bags": [],
+        "y": [signal],
+        "u": [signal],
+        "maps": [knots] * m,
         "into": [[0] * m + [0.01234567 / (i + j + 1) for j in range(n)] + [0, 0] for i in range(m)],
         "next": [[0.01234567 / (i + j + 3) for j in range(width)] for i in range(n)],
-        "output": [[0] * width], "start": [0] * n, "start_samples": 1,
-    }  # fmt: skip
+        "output": [[0] * width],
+        "start": [0] * n,
+        "start_samples": 1,
+    }
     P = [[float(i == j) for j in range(n)] for i in range(n)]
     N = [[float(i == j) for j in range(m)] for i in range(m + n)]
     return bound("stability", model, {"rate": 0.9}, {"P": P, "multipliers": {"N": N}})
@@ -60,10 +76,19 @@ def long_numbers(n: int) -> Claim:
     """Order n with 1000 bits an entry."""
     signal = {"name": "s", "unit": "", "path": ""}
     model = {
-        "format": "nlsid/model", "version": 2, "kind": "difference_equation", "period": 1,
-        "training": "", "bags": [], "y": signal, "u": signal, "a": [0.1] * n, "b": [0] * (n + 1),
-        "c": 0, "u_range": [0, 1],
-    }  # fmt: skip
+        "format": "nlsid/model",
+        "version": 2,
+        "kind": "difference_equation",
+        "period": 1,
+        "training": "",
+        "bags": [],
+        "y": signal,
+        "u": signal,
+        "a": [0.1] * n,
+        "b": [0] * (n + 1),
+        "c": 0,
+        "u_range": [0, 1],
+    }
     P = [
         [2.0**-900 * (i + j) + (1.0 + 2.0**-40 * i) * (i == j) for j in range(n)] for i in range(n)
     ]

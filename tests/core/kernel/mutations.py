@@ -41,9 +41,27 @@ ORACLES: dict[str, Callable[[Json, Mapping[str, Json]], bool]] = {
     "funnel_composition": oracle_composition.agrees,
 }
 WILD: tuple[Any, ...] = (
-    0, -0.0, 1, -1, 1e-300, 5e-324, 1e300, 1.7976931348623157e308, 2**53, 1e-12, True, None, "1/3",
-    "-7", "1e5", "nan", "", [], {}, "9" * 100,
-)  # fmt: skip
+    0,
+    -0.0,
+    1,
+    -1,
+    1e-300,
+    5e-324,
+    1e300,
+    1.7976931348623157e308,
+    2**53,
+    1e-12,
+    True,
+    None,
+    "1/3",
+    "-7",
+    "1e5",
+    "nan",
+    "",
+    [],
+    {},
+    "9" * 100,
+)
 
 
 @dataclass(frozen=True)
@@ -157,8 +175,21 @@ def _change(part: Any, rng: np.random.Generator) -> None:
     numbers = [place for place in _leaves(part) if type(place[0][place[1]]) in (int, float)]
     lists = [entries for entries in _containers(part) if isinstance(entries, list) and entries]
     objects = [entries for entries in _containers(part) if isinstance(entries, dict) and entries]
-    kind = rng.choice(["ulp", "digit", "step", "sign", "wild", "order", "drop", "swap", "shift",
-                       "members", "rename"])  # fmt: skip
+    kind = rng.choice(
+        [
+            "ulp",
+            "digit",
+            "step",
+            "sign",
+            "wild",
+            "order",
+            "drop",
+            "swap",
+            "shift",
+            "members",
+            "rename",
+        ]
+    )
     if kind in ("ulp", "digit", "step", "sign", "wild") and numbers:
         owner, key = numbers[rng.integers(len(numbers))]
         owner[key] = _other(owner[key], str(kind), rng)

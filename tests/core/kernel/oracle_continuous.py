@@ -52,8 +52,9 @@ def power(row: list[int], values: list[Fraction]) -> Fraction:
     return result
 
 
-def squares(basis: list[list[int]], columns: list[int], node: Document, s: Fraction,
-            x: list[Fraction]) -> Fraction:  # fmt: skip
+def squares(
+    basis: list[list[int]], columns: list[int], node: Document, s: Fraction, x: list[Fraction]
+) -> Fraction:
     """Σ_j B_j(s) |R_j V v|² / 4^unit, V = diag 2^columns; a row may leave out leading zeros."""
     v = [power(row, x) * Fraction(2) ** c for row, c in zip(basis, columns, strict=True)]
     points = []
@@ -98,9 +99,13 @@ class Oracle:
     """c(s, x̄) of the pieces of one proof about three documents."""
 
     def __init__(
-        self, field: Document, policy: Document, funnel: Document, proof: Document,
+        self,
+        field: Document,
+        policy: Document,
+        funnel: Document,
+        proof: Document,
         claim: Document | None = None,
-    ):  # fmt: skip
+    ):
         self.field, self.policy, self.funnel, self.proof = field, policy, funnel, proof
         self.claim = claim or {}
         self.n, self.m = field["states"], field["inputs"]
@@ -149,14 +154,23 @@ class Oracle:
         """The entries of `ranges` that are alone in every monomial that they are in."""
         rows = [r for span in self.field["pieces"] for e in span for r in e["exponents"]]
         first = 1 + self.n + (self.m if self.sides() == [()] else 0)
-        return [j for j in range(len(self.ranges(0)))
-                if all(sum(row) == 1 for row in rows if row[first + j])]  # fmt: skip
+        return [
+            j
+            for j in range(len(self.ranges(0)))
+            if all(sum(row) == 1 for row in rows if row[first + j])
+        ]
 
     def rate_corners(self, k: int) -> list[tuple[Fraction, ...]]:
         """The vertices of rates in `ranges`: what pushes only is in the middle."""
         pushing = self.pushing()
-        return list(product(*(((a + b) / 2,) if j in pushing else (a, b)
-                              for j, (a, b) in enumerate(self.ranges(k)))))  # fmt: skip
+        return list(
+            product(
+                *(
+                    ((a + b) / 2,) if j in pushing else (a, b)
+                    for j, (a, b) in enumerate(self.ranges(k))
+                )
+            )
+        )
 
     def rate_vertices(self) -> int:
         """How many vertices a rate is proved at."""
@@ -168,8 +182,9 @@ class Oracle:
         s = (piece["index"] + sigma) / Fraction(2) ** piece["level"]
         t0, t1 = (Fraction(self.funnel["t"][j]) for j in (k, k + 1))
         h, ranges = t1 - t0, self.ranges(k)
-        x0, u0, K = (numbers(part[k]) for part in (self.funnel["x"], self.policy["u"],
-                                                   self.policy["K"]))  # fmt: skip
+        x0, u0, K = (
+            numbers(part[k]) for part in (self.funnel["x"], self.policy["u"], self.policy["K"])
+        )
         nominal = [bernstein([p[j] for p in x0], s) for j in range(n)]
         motion = [slope([p[j] for p in x0], s) for j in range(n)]
         wanted = [
@@ -181,8 +196,13 @@ class Oracle:
         for place, (number, low, high) in enumerate(numbers(self.policy["limits"])):
             j, mode = int(number), piece["mode"][place]
             applied[j] = wanted[j] if mode == 0 else low if mode < 0 else high
-            taken.append((high - wanted[j]) * (wanted[j] - low) if mode == 0
-                         else low - wanted[j] if mode < 0 else wanted[j] - high)  # fmt: skip
+            taken.append(
+                (high - wanted[j]) * (wanted[j] - low)
+                if mode == 0
+                else low - wanted[j]
+                if mode < 0
+                else wanted[j] - high
+            )
         corner = list(self.rate_corners(k)[piece["vertex"]])
         off = corner[: len(corner) - len(self.field["uncertain"])]
         applied = [u + by for u, by in zip_longest(applied, off, fillvalue=Fraction(0))]
@@ -196,18 +216,23 @@ class Oracle:
         for j in self.pushing():
             low, high = ranges[j]
             none = [Fraction(0)] * self.n, [Fraction(0)] * self.m, [Fraction(0)] * len(w)
-            unit = [[Fraction(int(a == j)) for a in range(len(off))],
-                    [Fraction(int(a == j - len(off))) for a in range(len(w))]]  # fmt: skip
+            unit = [
+                [Fraction(int(a == j)) for a in range(len(off))],
+                [Fraction(int(a == j - len(off))) for a in range(len(w))],
+            ]
             there = self.rate(k, t0, none[0], unit[0] or none[1], unit[1])
             g = [a - b for a, b in zip(there, self.rate(k, t0, *none), strict=True)]
             room -= (high - low) / 2 * max(abs(dot(gain[i], g)) for gain in K)
         P0, P1 = (numbers(self.funnel["P"][j]) for j in (k, k + 1))
-        Pe = [dot([(1 - s) * a + s * b for a, b in zip(*rows, strict=True)], e)
-              for rows in zip(P0, P1, strict=True)]  # fmt: skip
+        Pe = [
+            dot([(1 - s) * a + s * b for a, b in zip(*rows, strict=True)], e)
+            for rows in zip(P0, P1, strict=True)
+        ]
         rho0, rho1 = (Fraction(self.funnel["rho"][j]) for j in (k, k + 1))
         left: Fraction = h * room - piece["sign"] * change
-        for q, tau in zip([(1 - s) * rho0 + s * rho1 - dot(e, Pe), *taken], piece["tau"],
-                          strict=True):  # fmt: skip
+        for q, tau in zip(
+            [(1 - s) * rho0 + s * rho1 - dot(e, Pe), *taken], piece["tau"], strict=True
+        ):
             left -= q * squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
         return left
 
@@ -216,8 +241,9 @@ class Oracle:
         start = Fraction(self.funnel["t"][k])
         return sum(1 for t in self.field["breaks"] if Fraction(t) <= start)
 
-    def rate(self, k: int, t: Fraction, x: list[Fraction], u: list[Fraction],
-             w: list[Fraction]) -> list[Fraction]:  # fmt: skip
+    def rate(
+        self, k: int, t: Fraction, x: list[Fraction], u: list[Fraction], w: list[Fraction]
+    ) -> list[Fraction]:
         """f(t, x, u, w)."""
         values = [t, *x, *u, *w]
         result = []
@@ -272,8 +298,9 @@ class Oracle:
         total: Fraction = rho1 - rho0 - growth - margin * h * rho + mu * (rho - W) - held - pushed
         return total
 
-    def pushed(self, k: int, t0: Fraction, Pe: list[Fraction], u: list[Fraction],
-               w: list[Fraction]) -> Fraction:  # fmt: skip
+    def pushed(
+        self, k: int, t0: Fraction, Pe: list[Fraction], u: list[Fraction], w: list[Fraction]
+    ) -> Fraction:
         """Σ_j h r_j (κ_j (x̄'Pg_j)² + 1/κ_j), if the proof has kappa."""
         total, h = Fraction(0), Fraction(self.funnel["t"][k + 1]) - t0
         nowhere = [Fraction(0)] * self.n
@@ -471,8 +498,9 @@ def stays_valid(oracle: "Oracle", k: int) -> bool:
             least, most = limits[j - n]
             if (least < low and low + off > most) or (most > high and least > high - off):
                 return False
-            room = [r for r, kept in zip(room, (least >= low, most <= high), strict=True)
-                    if not kept]  # fmt: skip
+            room = [
+                r for r, kept in zip(room, (least >= low, most <= high), strict=True) if not kept
+            ]
         if not room:
             continue
         if min(room) < 0:
@@ -538,8 +566,14 @@ def is_followed(oracle: "Oracle") -> bool:
 def holds(oracle: "Oracle", piece: Document, *, rates: bool) -> bool:
     """Whether a piece is decided by its own witness."""
     without = {
-        "pieces", "rate_pieces", "goal", "goal_multiplier", "about", "vector_field", "policy",
-    }  # fmt: skip
+        "pieces",
+        "rate_pieces",
+        "goal",
+        "goal_multiplier",
+        "about",
+        "vector_field",
+        "policy",
+    }
     about = [
         {key: part for key, part in document.items() if key not in without}
         for document in (oracle.policy, oracle.funnel, oracle.proof, oracle.claim)

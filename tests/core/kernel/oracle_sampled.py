@@ -245,11 +245,17 @@ def makes_sense(model: Json, policy: Json, funnel: Json) -> bool:
     rows = model["exponents"]
     arrays = [
         (model["coefficients"], (len(rows), outputs)),
-        (model["x_range"], (n, 2)), (model["u_range"], (p, 2)),
-        (policy["L"], (n, n)), (policy["u"], (N, p)), (policy["x"], (N + 1, n)),
-        (policy["K"], (N, p, n)), (funnel["S"], (N + 1, n, n)), (funnel["A"], (N, n, n)),
-        (funnel["half_widths"], (N + 1, n)), *((funnel[chain], (N + 1,)) for chain in CHAINS),
-    ]  # fmt: skip
+        (model["x_range"], (n, 2)),
+        (model["u_range"], (p, 2)),
+        (policy["L"], (n, n)),
+        (policy["u"], (N, p)),
+        (policy["x"], (N + 1, n)),
+        (policy["K"], (N, p, n)),
+        (funnel["S"], (N + 1, n, n)),
+        (funnel["A"], (N, n, n)),
+        (funnel["half_widths"], (N + 1, n)),
+        *((funnel[chain], (N + 1,)) for chain in CHAINS),
+    ]
     if implicit:
         arrays.append((funnel["roots"], (N + 1,)))
     radii = [*funnel["tube"], *funnel["inlet"], *(funnel["roots"] if implicit else [])]
@@ -314,8 +320,9 @@ def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
     tube = Fraction(funnel["tube"][k]) + widens
     both = max(tube, Fraction(funnel["inlet"][k]) + widens)
     wanted = [(g, Fraction(w), tube) for g, w in zip(units, funnel["half_widths"][k], strict=True)]
-    signals = [(g, c, box) for g, c, box in
-               zip(units, policy["x"][k], model["x_range"], strict=True)]  # fmt: skip
+    signals = [
+        (g, c, box) for g, c, box in zip(units, policy["x"][k], model["x_range"], strict=True)
+    ]
     if k < len(policy["u"]):
         signals += zip(fractions(policy["K"][k]), policy["u"][k], model["u_range"], strict=True)
     for g, c, (low, high) in signals:

@@ -163,10 +163,14 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
 def quadratic(rows: Rows, P: Rows) -> Rows:
     """rows'P rows."""
     size, n = len(rows[0]), len(rows)
-    PF = [[sum((P[a][b] * rows[b][j] for b in range(n)), Fraction(0)) for j in range(size)]
-          for a in range(n)]  # fmt: skip
-    return [[sum((rows[a][i] * PF[a][j] for a in range(n)), Fraction(0)) for j in range(size)]
-            for i in range(size)]  # fmt: skip
+    PF = [
+        [sum((P[a][b] * rows[b][j] for b in range(n)), Fraction(0)) for j in range(size)]
+        for a in range(n)
+    ]
+    return [
+        [sum((rows[a][i] * PF[a][j] for a in range(n)), Fraction(0)) for j in range(size)]
+        for i in range(size)
+    ]
 
 
 def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, kept: int) -> bool:

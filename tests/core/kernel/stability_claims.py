@@ -99,9 +99,17 @@ def split() -> StateAffineModel:
 
 def monotone() -> MonotoneEquation:
     return MonotoneEquation(
-        np.array([3.0, 0.6, 1.0]), np.array([1.2, -0.5]), np.array([1.0]), 0.1, ((0, 0),), 0.0,
-        np.zeros(1), 0.025, Y, (U,),
-    )  # fmt: skip
+        np.array([3.0, 0.6, 1.0]),
+        np.array([1.2, -0.5]),
+        np.array([1.0]),
+        0.1,
+        ((0, 0),),
+        0.0,
+        np.zeros(1),
+        0.025,
+        Y,
+        (U,),
+    )
 
 
 def straight() -> MonotoneEquation:
@@ -120,8 +128,12 @@ def network() -> CellNetwork:
         into=np.array([[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 1, 0, 0]]),
         next=np.array([[0, 1, 0, 0, 0, 0, 0], [0.5, -0.5, 1, 1, 0, 0.5, 0]]),
         output=np.array([[0, 0, 0, 0, 2, 0, 0.25]]),
-        start=np.zeros(2), start_samples=3, period=0.025, y=(Y,), u=(U,),
-    )  # fmt: skip
+        start=np.zeros(2),
+        start_samples=3,
+        period=0.025,
+        y=(Y,),
+        u=(U,),
+    )
 
 
 MODELS: dict[str, Callable[[], Any]] = {

@@ -28,8 +28,12 @@ def decided(kind: str, documents: dict[str, Json], proof: Json, **claim: Any) ->
         contents[role] = json.dumps(bound).encode()
         digests[role] = digest(contents[role])
         about[role] = {"file": role, "digest": digests[role]}
-    document = {"format": "nlsid/proof", "version": 2,
-                "claim": {"kind": kind, "about": about, **claim}, "proof": proof}  # fmt: skip
+    document = {
+        "format": "nlsid/proof",
+        "version": 2,
+        "claim": {"kind": kind, "about": about, **claim},
+        "proof": proof,
+    }
     return kernel.decide(json.dumps(document).encode(), contents.__getitem__)
 
 
@@ -38,25 +42,58 @@ def tube(name: str = "speed", unit: str = "m/s", n: int = 1, samples: int = 2) -
     low = 0.123456
     unity = [[float(i == j) for j in range(n)] for i in range(n)]
     model = {
-        "format": "nlsid/model", "version": 2, "kind": "difference_equation", "period": 0.1,
-        "training": "", "bags": [], "y": {"name": name, "unit": unit, "path": "/y"}, "u": SIGNAL,
-        "a": [0.5] + [0] * (n - 1), "b": [0, 1] + [0] * (n - 1), "c": 0, "u_range": [low, 1],
-    }  # fmt: skip
+        "format": "nlsid/model",
+        "version": 2,
+        "kind": "difference_equation",
+        "period": 0.1,
+        "training": "",
+        "bags": [],
+        "y": {"name": name, "unit": unit, "path": "/y"},
+        "u": SIGNAL,
+        "a": [0.5] + [0] * (n - 1),
+        "b": [0, 1] + [0] * (n - 1),
+        "c": 0,
+        "u_range": [low, 1],
+    }
     policy = {
-        "format": "nlsid/policy", "version": 2, "kind": "tube", "model": "", "period": 0.1,
-        "K": [[0.25] + [0] * (n - 1)], "L": [[0.25]] + [[0]] * (n - 1), "u": [[low]] * samples,
+        "format": "nlsid/policy",
+        "version": 2,
+        "kind": "tube",
+        "model": "",
+        "period": 0.1,
+        "K": [[0.25] + [0] * (n - 1)],
+        "L": [[0.25]] + [[0]] * (n - 1),
+        "u": [[low]] * samples,
         "start": [0] * n,
-    }  # fmt: skip
+    }
     funnel = {
-        "format": "nlsid/funnel", "version": 2, "kind": "tube", "model": "", "policy": "",
-        "settling": n, "tubes": [{
-            "rho": 1, "L": policy["L"], "P": unity, "R": [[1]], "level": 0, "inlet": 0,
-            "tau": [0.25], "half_widths": [2.0**-20],
-            "assumption": {"kind": "energy", "samples": 2, "measured": 0, "safety_factor": 1,
-                           "measured_on": [{"name": "a", "digest": "sha256:" + 64 * "b"}],
-                           "designed_on": []},
-        }],
-    }  # fmt: skip
+        "format": "nlsid/funnel",
+        "version": 2,
+        "kind": "tube",
+        "model": "",
+        "policy": "",
+        "settling": n,
+        "tubes": [
+            {
+                "rho": 1,
+                "L": policy["L"],
+                "P": unity,
+                "R": [[1]],
+                "level": 0,
+                "inlet": 0,
+                "tau": [0.25],
+                "half_widths": [2.0**-20],
+                "assumption": {
+                    "kind": "energy",
+                    "samples": 2,
+                    "measured": 0,
+                    "safety_factor": 1,
+                    "measured_on": [{"name": "a", "digest": "sha256:" + 64 * "b"}],
+                    "designed_on": [],
+                },
+            }
+        ],
+    }
     return {"model": model, "policy": policy, "funnel": funnel}
 
 
@@ -85,10 +122,27 @@ def test_a_tube_is_not_about_trajectories_that_start_elsewhere() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["speed stays within 0.001 m of every trajectory for 9000 samples, margin 0.9; x",
-     "e-9", "e9", "5", "", 'a"b', "m, u", "אב", "x̸", "ｍ", "=", "<= 3", "1/2", "m/1000", "m*1000",
-     "m/.5", "m-2", "m+1"],
-)  # fmt: skip
+    [
+        "speed stays within 0.001 m of every trajectory for 9000 samples, margin 0.9; x",
+        "e-9",
+        "e9",
+        "5",
+        "",
+        'a"b',
+        "m, u",
+        "אב",
+        "x̸",
+        "ｍ",
+        "=",
+        "<= 3",
+        "1/2",
+        "m/1000",
+        "m*1000",
+        "m/.5",
+        "m-2",
+        "m+1",
+    ],
+)
 def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
     verdict = decided("tube", tube(name=text), {})
     assert f" under the same inputs, {json.dumps(text)} within " in verdict.statement
@@ -143,25 +197,41 @@ def test_combinations_are_counted_before_they_are_listed() -> None:
     """1024 corners x 27 modes x 9999 intervals of a file of 1 MB: 276 million table entries."""
     knots = 10_000
     field = {
-        "format": "nlsid/vector_field", "version": 2, "states": 1, "inputs": 3,
-        "uncertain": [[0, 1]] * 10, "breaks": [], "valid": [], "expansion": "",
+        "format": "nlsid/vector_field",
+        "version": 2,
+        "states": 1,
+        "inputs": 3,
+        "uncertain": [[0, 1]] * 10,
+        "breaks": [],
+        "valid": [],
+        "expansion": "",
         "pieces": [[{"exponents": [], "coefficients": []}]],
-    }  # fmt: skip
+    }
     nominal = {"t": list(range(knots)), "x": [[[0]]] * (knots - 1)}
     policy = nominal | {
-        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
-        "u": [[[0, 0, 0]]] * (knots - 1), "K": [[[[0], [0], [0]]]] * (knots - 1),
+        "format": "nlsid/policy",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "u": [[[0, 0, 0]]] * (knots - 1),
+        "K": [[[[0], [0], [0]]]] * (knots - 1),
         "limits": [[i, -1, 1] for i in range(3)],
-    }  # fmt: skip
+    }
     funnel = nominal | {
-        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
-        "policy": "", "P": [[[1]]] * knots, "rho": [1] * knots,
-    }  # fmt: skip
+        "format": "nlsid/funnel",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "policy": "",
+        "P": [[[1]]] * knots,
+        "rho": [1] * knots,
+    }
     proof = {"margin": 1, "basis": [[0]], "multiplier": [[0]], "sides": [[0]], "pieces": [{}]}
     started = time.process_time()
     with pytest.raises(Rejected, match="modes; at most 100000"):
-        decided("continuous_funnel", {"vector_field": field, "policy": policy, "funnel": funnel},
-                proof)  # fmt: skip
+        decided(
+            "continuous_funnel", {"vector_field": field, "policy": policy, "funnel": funnel}, proof
+        )
     assert time.process_time() - started < SECONDS
 
 
@@ -187,18 +257,38 @@ def test_solutions_on_two_branches_are_not_near_each_other() -> None:
     documents = tube()
     del documents["policy"], documents["funnel"]["policy"]
     signals = [SIGNAL | {"name": name} for name in ("real", "imaginary")]
-    terms = [([3, 0, 0, 0, 0], 1, 0), ([1, 2, 0, 0, 0], -3, 0), ([2, 1, 0, 0, 0], 0, 3),
-             ([0, 3, 0, 0, 0], 0, -1), ([0, 0, 0, 0, 1], -1, 0)]  # fmt: skip
+    terms = [
+        ([3, 0, 0, 0, 0], 1, 0),
+        ([1, 2, 0, 0, 0], -3, 0),
+        ([2, 1, 0, 0, 0], 0, 3),
+        ([0, 3, 0, 0, 0], 0, -1),
+        ([0, 0, 0, 0, 1], -1, 0),
+    ]
     documents["model"] = {
-        "format": "nlsid/model", "version": 2, "kind": "implicit", "period": 0.1,
-        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]", "states": ["a", "b"],
-        "inputs": ["w"], "monotonicity": 1, "y": signals, "u": [SIGNAL], "window": [[0, 0]],
+        "format": "nlsid/model",
+        "version": 2,
+        "kind": "implicit",
+        "period": 0.1,
+        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]",
+        "states": ["a", "b"],
+        "inputs": ["w"],
+        "monotonicity": 1,
+        "y": signals,
+        "u": [SIGNAL],
+        "window": [[0, 0]],
         "h": {"exponents": [e for e, *_ in terms], "coefficients": [c for _, *c in terms]},
-    }  # fmt: skip
+    }
     unity, nothing = [[1, 0], [0, 1]], [[0, 0]] * 4
     (stated,) = documents["funnel"]["tubes"]
-    stated |= {"rho": 0.5, "L": [[0, 0], [0, 0]], "P": unity, "R": unity, "tau": [0.5, 0.5],
-               "level": 2.0**-14, "half_widths": [2.0**-6, 2.0**-6]}  # fmt: skip
+    stated |= {
+        "rho": 0.5,
+        "L": [[0, 0], [0, 0]],
+        "P": unity,
+        "R": unity,
+        "tau": [0.5, 0.5],
+        "level": 2.0**-14,
+        "half_widths": [2.0**-6, 2.0**-6],
+    }
     stated["assumption"] |= {"kind": "fading"}
     del stated["assumption"]["samples"]
     documents["funnel"]["box"] = {"y": [[0.25, 1.25], [-1.25, 1.25]], "u": [[-2, 2]]}
@@ -208,13 +298,16 @@ def test_solutions_on_two_branches_are_not_near_each_other() -> None:
         if depth < 6:
             i = depth % 2
             middle = sum(box[i]) / 2
-            halves = [[*box[:i], end, *box[i + 1 :]]
-                      for end in ((box[i][0], middle), (middle, box[i][1]))]  # fmt: skip
+            halves = [
+                [*box[:i], end, *box[i + 1 :]] for end in ((box[i][0], middle), (middle, box[i][1]))
+            ]
             return {"split": i, "parts": [multipliers(half, depth + 1) for half in halves]}
         a, b = (sum(ends) / 2 for ends in box)
         size = 3 * (a**2 + b**2) ** 2 / 2
-        turned = [[(a**2 - b**2) / size, 2 * a * b / size],
-                  [-2 * a * b / size, (a**2 - b**2) / size]]  # fmt: skip
+        turned = [
+            [(a**2 - b**2) / size, 2 * a * b / size],
+            [-2 * a * b / size, (a**2 - b**2) / size],
+        ]
         return {"N": [turned + nothing] * 3}
 
     proof = {"multipliers": [multipliers([(0.25, 1.25), (-1.25, 1.25)], 0)]}

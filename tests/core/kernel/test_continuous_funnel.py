@@ -68,8 +68,9 @@ def random_claim(rng: np.random.Generator) -> Files:
             rows = {tuple(rng.integers(0, 2, 1 + n + m).tolist()) for _ in range(4)}
             rows |= {(int(rng.integers(0, 2)), *rng.integers(0, 3, n + m).tolist())}
             rows = {row for row in rows if sum(row) <= 5}
-            whole = [[*row, *([0] * n_w if pushed else rng.integers(0, 2, n_w).tolist())]
-                     for row in rows]  # fmt: skip
+            whole = [
+                [*row, *([0] * n_w if pushed else rng.integers(0, 2, n_w).tolist())] for row in rows
+            ]
             if pushed:
                 whole.append([*[0] * (1 + n + m), *[int(j == i % n_w) for j in range(n_w)]])
             whole.sort()
@@ -85,25 +86,45 @@ def random_claim(rng: np.random.Generator) -> Files:
     roots = rng.integers(-8, 9, (intervals + 1, n, n)) / 8
     P = roots @ roots.transpose(0, 2, 1) + np.eye(n)
     field = {
-        "format": "nlsid/vector_field", "version": 2, "states": n, "inputs": m, "uncertain": box,
-        "breaks": breaks, "valid": [], "expansion": "", "pieces": spans,
-    }  # fmt: skip
+        "format": "nlsid/vector_field",
+        "version": 2,
+        "states": n,
+        "inputs": m,
+        "uncertain": box,
+        "breaks": breaks,
+        "valid": [],
+        "expansion": "",
+        "pieces": spans,
+    }
     policy = {
-        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
-        "t": t.tolist(), "x": x, "u": nested(rng, intervals, int(rng.integers(1, 5)), m),
+        "format": "nlsid/policy",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "t": t.tolist(),
+        "x": x,
+        "u": nested(rng, intervals, int(rng.integers(1, 5)), m),
         "K": nested(rng, intervals, int(rng.integers(1, 5)), m, n),
         "limits": [[i, -1.0, float(rng.integers(0, 9))] for i in range(limited)],
-    }  # fmt: skip
+    }
     funnel = {
-        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
-        "policy": "", "t": t.tolist(), "x": x, "P": P.tolist(),
+        "format": "nlsid/funnel",
+        "version": 2,
+        "kind": "continuous",
+        "vector_field": "",
+        "policy": "",
+        "t": t.tolist(),
+        "x": x,
+        "P": P.tolist(),
         "rho": rng.uniform(0.5, 2, intervals + 1).tolist(),
-    }  # fmt: skip
+    }
     first = [[0] * n, *np.eye(n, dtype=int).tolist()]
     proof: dict[str, Any] = {
-        "margin": abs(number(rng)) + 0.1, "basis": first,
-        "multiplier": [*first, [2, *[0] * (n - 1)]], "pieces": [],
-    }  # fmt: skip
+        "margin": abs(number(rng)) + 0.1,
+        "basis": first,
+        "multiplier": [*first, [2, *[0] * (n - 1)]],
+        "pieces": [],
+    }
     if limited:
         proof["sides"] = first
     if pushed:
@@ -121,8 +142,9 @@ def random_claim(rng: np.random.Generator) -> Files:
         proof["rates"] = rng.uniform(0.5, 2, (intervals, m)).tolist()
         proof["rate_pieces"] = []
         counts = Oracle(field, policy, funnel, proof, claimed).rate_vertices()
-        for k, mode, v, i, sign in product(range(intervals), modes, range(counts), range(m),
-                                           (-1, 1)):  # fmt: skip
+        for k, mode, v, i, sign in product(
+            range(intervals), modes, range(counts), range(m), (-1, 1)
+        ):
             if i >= limited or not mode[i]:
                 rated = proof | {"multiplier": []}
                 piece = random_piece(rng, rated, k, v, 0, 0, (0, *mode))
@@ -131,11 +153,17 @@ def random_claim(rng: np.random.Generator) -> Files:
                 if not mode:
                     del piece["mode"]
                 proof["rate_pieces"].append(piece)
-    about = {role: {"file": f"{role}.json", "digest": ""}
-             for role in ("vector_field", "policy", "funnel")}  # fmt: skip
+    about = {
+        role: {"file": f"{role}.json", "digest": ""}
+        for role in ("vector_field", "policy", "funnel")
+    }
     claim = {"kind": "continuous_funnel", "about": about, **claimed}
-    files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
-             PROOF: proofs.proof_document(claim, proof)}  # fmt: skip
+    files = {
+        FIELD: field,
+        POLICY: policy,
+        FUNNEL: funnel,
+        PROOF: proofs.proof_document(claim, proof),
+    }
     bind(files)
     return files
 
@@ -156,8 +184,11 @@ def random_hold(rng: np.random.Generator, *, files: tuple[Any, Any], proof: Any)
         for equation in (e for span in field["pieces"] for e in span):
             rows = {}
             for row, c in zip(equation["exponents"], equation["coefficients"], strict=True):
-                single = [*row[: 1 + n], *(min(e, 1) for e in row[1 + n : 1 + n + m]),
-                          *row[1 + n + m :]]  # fmt: skip
+                single = [
+                    *row[: 1 + n],
+                    *(min(e, 1) for e in row[1 + n : 1 + n + m]),
+                    *row[1 + n + m :],
+                ]
                 rows[tuple(single)] = c
             equation["exponents"] = [list(row) for row in sorted(rows)]
             equation["coefficients"] = [rows[row] for row in sorted(rows)]
@@ -165,22 +196,40 @@ def random_hold(rng: np.random.Generator, *, files: tuple[Any, Any], proof: Any)
 
 
 def random_piece(
-    rng: np.random.Generator, proof: Any, k: int, vertex: int, level: int, index: int,
+    rng: np.random.Generator,
+    proof: Any,
+    k: int,
+    vertex: int,
+    level: int,
+    index: int,
     mode: tuple[int, ...],
-) -> Any:  # fmt: skip
+) -> Any:
     """A piece with random multipliers."""
     size, count = len(proof["basis"]), len(proof.get("multiplier", []))
     shell = 0 if "multiplier" in proof else 2
-    mu = {"shifts": rng.integers(-9, 3, count), "start": rng.integers(-99, 100, count),
-          "end": rng.integers(-99, 100, count)}  # fmt: skip
+    mu = {
+        "shifts": rng.integers(-9, 3, count),
+        "start": rng.integers(-99, 100, count),
+        "end": rng.integers(-99, 100, count),
+    }
     squares = [
-        {"columns": rng.integers(-3, 4, size).tolist(),
-         "squares": {"unit": int(rng.integers(0, 9)),
-                     "factors": rng.integers(-9, 10, (j + 1, 2, size)).tolist()}}
+        {
+            "columns": rng.integers(-3, 4, size).tolist(),
+            "squares": {
+                "unit": int(rng.integers(0, 9)),
+                "factors": rng.integers(-9, 10, (j + 1, 2, size)).tolist(),
+            },
+        }
         for j in range(1 + shell + len(mode))
-    ]  # fmt: skip
-    piece = {"interval": k, "vertex": vertex, "level": level, "index": index,
-             "mu": {key: row.tolist() for key, row in mu.items()}, **squares[0]}  # fmt: skip
+    ]
+    piece = {
+        "interval": k,
+        "vertex": vertex,
+        "level": level,
+        "index": index,
+        "mu": {key: row.tolist() for key, row in mu.items()},
+        **squares[0],
+    }
     if shell:
         del piece["mu"]
     piece |= {"mode": list(mode)} if mode else {}
@@ -237,8 +286,10 @@ def test_the_reach_of_an_ellipsoid_is_exact(n: int) -> None:
     """M q = g solved by Gauss-Jordan in Fractions; g'q is g'M⁻¹g."""
     rng = np.random.default_rng(n)
     A = [[fraction(rng) for _ in range(n)] for _ in range(n)]
-    M = [[sum((r[i] * r[j] for r in A), Fraction(int(i == j), 5)) for j in range(n)]
-         for i in range(n)]  # fmt: skip
+    M = [
+        [sum((r[i] * r[j] for r in A), Fraction(int(i == j), 5)) for j in range(n)]
+        for i in range(n)
+    ]
     vectors = [[fraction(rng) for _ in range(n)] for _ in range(3)]
     for g, found in zip(vectors, inverse_forms(M, vectors, "M"), strict=True):
         rows = [[*row, e] for row, e in zip(M, g, strict=True)]
@@ -411,12 +462,16 @@ def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
 @pytest.mark.parametrize(
     ("name", "members"),
     [
-        (PROOF, ("claim", "goal", "centre", 0)), (PROOF, ("claim", "goal", "P", 0, 0)),
-        (POLICY, ("limits", 0, 2)), (FIELD, ("valid", 0, 2)), (FIELD, ("uncertain", 0, 1)),
-        (FIELD, ("pieces", 0, 0, "coefficients", 0)), (PROOF, ("proof", "margin")),
+        (PROOF, ("claim", "goal", "centre", 0)),
+        (PROOF, ("claim", "goal", "P", 0, 0)),
+        (POLICY, ("limits", 0, 2)),
+        (FIELD, ("valid", 0, 2)),
+        (FIELD, ("uncertain", 0, 1)),
+        (FIELD, ("pieces", 0, 0, "coefficients", 0)),
+        (PROOF, ("proof", "margin")),
         (FUNNEL, ("rho", 0)),
     ],
-)  # fmt: skip
+)
 def test_whole_numbers_beyond_2_to_the_53_are_refused(
     files: Files, name: str, members: tuple[Any, ...]
 ) -> None:

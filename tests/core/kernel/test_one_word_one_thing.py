@@ -13,10 +13,18 @@ from tests.core.kernel.stability_claims import decide as decide_stable
 from tests.core.kernel.tube_claims import claim, decide
 
 STILL = Scalar(
-    {(1, 0): 0.5, (0, 1): 1.0}, x=[0.0, 0.0], u=[0.0], K=[0.0], S=[1.0, 1.0], A=[0.0],
-    tube=[1.0, 1.0], inlet=[1.0, 1.0], reach={c: [0.75] for c in ("tube", "inlet")},
-    sigma={c: [[[0.5]]] for c in ("tube", "inlet")}, curvature=[0.5],
-)  # fmt: skip
+    {(1, 0): 0.5, (0, 1): 1.0},
+    x=[0.0, 0.0],
+    u=[0.0],
+    K=[0.0],
+    S=[1.0, 1.0],
+    A=[0.0],
+    tube=[1.0, 1.0],
+    inlet=[1.0, 1.0],
+    reach={c: [0.75] for c in ("tube", "inlet")},
+    sigma={c: [[[0.5]]] for c in ("tube", "inlet")},
+    curvature=[0.5],
+)
 
 
 def test_an_input_with_the_name_of_an_output_or_a_state_is_called_the_input() -> None:
@@ -54,6 +62,9 @@ def test_a_narrow_range_is_told_with_as_many_digits_as_leave_one() -> None:
     model, proof = copy.deepcopy(stable("quadratic"))
     (low, high), (offset,), (scale,) = model["u_range"][0], model["u_offset"], model["u_scale"]
     far = 1000000010.0  # the box of the proof stays as it is
-    model |= {"u_range": [[far - 1, far + 1]], "u_scale": [2 * scale / (high - low)],
-              "u_offset": [far - (low + high - 2 * offset) / (high - low)]}  # fmt: skip
+    model |= {
+        "u_range": [[far - 1, far + 1]],
+        "u_scale": [2 * scale / (high - low)],
+        "u_offset": [far - (low + high - 2 * offset) / (high - low)],
+    }
     assert "in [1000000009, 1000000011]" in decide_stable(model, proof).statement

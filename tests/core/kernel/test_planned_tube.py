@@ -192,7 +192,7 @@ def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
         (lambda f: changing(f, level=2**53 + 2), "whole number beyond"),
         (lambda f: changing(f, L=[[0.0], [0.0]]), "the observer of a tube is not the policy's"),
     ],
-)  # fmt: skip
+)
 def test_a_forged_funnel_with_right_digests_is_rejected(
     documents: dict[str, Json], change: object, reason: str
 ) -> None:
@@ -214,7 +214,7 @@ def test_a_forged_funnel_with_right_digests_is_rejected(
         (lambda p: p | {"law": "u = 0"}, "unknown member 'law'"),
         (lambda p: p | {"kind": "linear"}, "expected 'tube'"),
     ],
-)  # fmt: skip
+)
 def test_another_policy_with_right_digests_is_rejected(
     documents: dict[str, Json], change: object, reason: str
 ) -> None:
@@ -240,9 +240,11 @@ def test_a_plan_is_for_a_linear_model(documents: dict[str, Json]) -> None:
     del funnel["response"], funnel["cusum"]  # these, and levels by commands, have no plan
     first(funnel).pop("follows", None)
     policy = documents["policy"] | {
-        "period": model["period"], "start": [0.0] * len(model["a"]), "L": first(funnel)["L"],
+        "period": model["period"],
+        "start": [0.0] * len(model["a"]),
+        "L": first(funnel)["L"],
         "K": [[0.0] * len(model["a"])],
-    }  # fmt: skip
+    }
     found = bound({"model": model, "policy": policy, "funnel": funnel})
     about = {role: proofs.binding(NAMES[role], document) for role, document in found.items()}
     document = proofs.proof_document({"kind": "tube", "about": about}, proof)
@@ -320,12 +322,24 @@ def places(documents: dict[str, Json], rng: random.Random) -> list[list[object]]
     i, j, k = rng.randrange(n), rng.randrange(n), rng.randrange(N)
     tube: list[object] = ["funnel", "tubes", 0]
     return [
-        ["model", "a", i], ["model", "b", rng.randrange(n + 1)], ["model", "c"],
-        ["policy", "K", 0, i], ["policy", "L", i, 0], ["policy", "start", i], ["policy", "u", k, 0],
-        [*tube, "P", i, j], [*tube, "R", 0, 0], [*tube, "level"], [*tube, "inlet"],
-        [*tube, "tau", 0], [*tube, "half_widths", 0], [*tube, "assumption", "measured"],
-        [*tube, "assumption", "safety_factor"], [*tube, "rho"], [*tube, "L", i, 0],
-    ]  # fmt: skip
+        ["model", "a", i],
+        ["model", "b", rng.randrange(n + 1)],
+        ["model", "c"],
+        ["policy", "K", 0, i],
+        ["policy", "L", i, 0],
+        ["policy", "start", i],
+        ["policy", "u", k, 0],
+        [*tube, "P", i, j],
+        [*tube, "R", 0, 0],
+        [*tube, "level"],
+        [*tube, "inlet"],
+        [*tube, "tau", 0],
+        [*tube, "half_widths", 0],
+        [*tube, "assumption", "measured"],
+        [*tube, "assumption", "safety_factor"],
+        [*tube, "rho"],
+        [*tube, "L", i, 0],
+    ]
 
 
 def test_exact_runs_that_keep_the_assumption_stay_in_the_half_width(
@@ -345,8 +359,9 @@ def test_the_smallest_tube_that_is_false_is_refused(documents: dict[str, Json]) 
     """At e along the worst direction the output is tau's bound: a larger tau is false."""
     tube = first(documents["funnel"])
     P, rho = np.array(tube["P"]), Fraction(tube["rho"])
-    outputs = [oracle.closed(documents["model"], documents["policy"], Fraction(k))[1][0]
-               for k in (0, 1)]  # fmt: skip
+    outputs = [
+        oracle.closed(documents["model"], documents["policy"], Fraction(k))[1][0] for k in (0, 1)
+    ]
     false = []
     for output in outputs:
         x = [Fraction(v) for v in np.linalg.solve(P, np.array(output, dtype=float)) / tube["rho"]]

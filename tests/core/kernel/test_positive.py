@@ -52,8 +52,10 @@ def random_claim(seed: int) -> tuple[Claim, Any]:
     squares: dict[str, Any] = {"unit": int(rng.integers(0, 20)), "factors": []}
     rows = int(rng.integers(1, k + 1))
     for _ in range(J + 1):
-        factor = [rng.integers(-1000, 1000, size=int(rng.integers(1, k + 1))).tolist()
-                  for _ in range(rows)]  # fmt: skip
+        factor = [
+            rng.integers(-1000, 1000, size=int(rng.integers(1, k + 1))).tolist()
+            for _ in range(rows)
+        ]
         squares["factors"].append(factor)
     if rng.random() < 0.5:
         squares["weights"] = [int(w) for w in rng.integers(0, 9, size=rows)]
@@ -67,9 +69,11 @@ def random_claim(seed: int) -> tuple[Claim, Any]:
             square = {tuple(2 * e for e in row): share * Fraction(4) ** column}
             point.terms = (point + oracle.P(n, square)).terms
         i, j = rng.integers(k, size=2)
-        cross = {tuple(a + b for a, b in zip(basis[i], basis[j], strict=True)): (
-            slack * int(rng.integers(-2, 3)) * Fraction(2) ** (columns[i] + columns[j]) / 3
-        )}  # fmt: skip
+        cross = {
+            tuple(a + b for a, b in zip(basis[i], basis[j], strict=True)): (
+                slack * int(rng.integers(-2, 3)) * Fraction(2) ** (columns[i] + columns[j]) / 3
+            )
+        }
         point.terms = (point + oracle.P(n, cross)).terms
     return powers(points), witness
 
@@ -154,9 +158,10 @@ def _squared(exponents: list[int]) -> dict[oracle.Key, Fraction | int]:
 def test_the_same_square_does_not_balance_two_cross_terms() -> None:
     """x²y² is the square of xy and the product of x² and y²: it counts once."""
     witness = {
-        "basis": [[2, 0], [0, 2], [1, 1]], "columns": [0, 0, 0],
+        "basis": [[2, 0], [0, 2], [1, 1]],
+        "columns": [0, 0, 0],
         "squares": {"unit": 0, "factors": [[]]},
-    }  # fmt: skip
+    }
     c = oracle.P(2, {(4, 0): 1, (0, 4): 1, (2, 2): -2})  # (x² - y²)²: true, with zeros
     with pytest.raises(Rejected):
         decide([c], witness, strict=False)

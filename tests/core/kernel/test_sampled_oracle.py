@@ -63,16 +63,16 @@ def value(p: Polynomial, ring: Ring, point: list[Fraction]) -> Fraction:
     return total
 
 
-CASES = (
-    [(explicit, "response"), (implicit, "peak")]
-    + [
-        pytest.param(make, form, marks=pytest.mark.slow)
-        for make, form in (
-            (explicit, "peak"), (explicit, "energy"), (explicit, "fading"), (implicit, "response"),
-            (two_joints, "response"),
-        )
-    ]
-)  # fmt: skip
+CASES = [(explicit, "response"), (implicit, "peak")] + [
+    pytest.param(make, form, marks=pytest.mark.slow)
+    for make, form in (
+        (explicit, "peak"),
+        (explicit, "energy"),
+        (explicit, "fading"),
+        (implicit, "response"),
+        (two_joints, "response"),
+    )
+]
 
 
 @pytest.mark.parametrize(("make", "form"), CASES)

@@ -115,8 +115,9 @@ def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
         elif name == "linear":
             _move([model["a"]], size, rng)
         else:
-            _move([row for block in model["G"][trial % 2]["coefficients"] for row in block],
-                  size, rng)  # fmt: skip
+            _move(
+                [row for block in model["G"][trial % 2]["coefficients"] for row in block], size, rng
+            )
         truth = oracle.is_proved(model, proof["claim"], proof["proof"])
         decided[truth] += 1
         if truth:
@@ -152,8 +153,10 @@ def test_solutions_of_the_model_itself_approach_at_the_stated_rate(name: str) ->
     _, p, box = oracle.increments(model)
     n = len(P)
     for _ in range(100):
-        w = [low + (high - low) * Fraction(rng.choice((0, 8, rng.randrange(9))), 8)
-             for low, high in box]  # fmt: skip
+        w = [
+            low + (high - low) * Fraction(rng.choice((0, 8, rng.randrange(9))), 8)
+            for low, high in box
+        ]
         E = oracle.value_at(model, w)
         x = [[Fraction(rng.randrange(-9, 10))] for _ in range(n)]
         right = [[-sum((E[a][p + k] * x[k][0] for k in range(n)), Fraction(0))] for a in range(p)]
@@ -205,8 +208,10 @@ def test_a_box_far_away_keeps_every_digit_of_its_ends() -> None:
     far = model.document() | {"u_range": ranges.tolist(), "u_offset": [0.0], "u_scale": [1.0]}
     form = read_model(parse(files.encode(far), "model"))
     lead = [E[0][0] for E in form.E.vertices(form.E.box, None)]
-    exact = (Fraction(9) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
-             Fraction(11) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2))  # fmt: skip
+    exact = (
+        Fraction(9) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
+        Fraction(11) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
+    )
     assert (min(lead), max(lead)) == exact
 
 

@@ -172,8 +172,12 @@ def term(funnel: Json, i: int = 0) -> Json:
     ("change", "reason"),
     [
         (lambda f: tubes(f)["follows"]["weights"][0].__setitem__(0, -1e-9), "0 or more"),
-        (lambda f: tubes(f)["follows"].update(weights=[[0.0] * len(tubes(f)["follows"]["terms"])]),
-         "some positive"),
+        (
+            lambda f: tubes(f)["follows"].update(
+                weights=[[0.0] * len(tubes(f)["follows"]["terms"])]
+            ),
+            "some positive",
+        ),
         (lambda f: tubes(f)["follows"].update(weights=[]), "should have shape"),
         (lambda f: tubes(f)["follows"].update(terms=[]), "list of 1 to 200"),
         (lambda f: term(f).update(fading=1.0), "fading in"),
@@ -185,7 +189,7 @@ def term(funnel: Json, i: int = 0) -> Json:
         (lambda f: term(f).update(future=1), "unknown member 'future'"),
         (lambda f: tubes(f).update(inlet=1e-12), "without an inlet"),
     ],
-)  # fmt: skip
+)
 def test_a_level_by_commands_that_makes_no_sense_is_refused(
     change: Callable[[Json], Any], reason: str
 ) -> None:
@@ -193,10 +197,17 @@ def test_a_level_by_commands_that_makes_no_sense_is_refused(
     change(funnel)
     assert not oracle.agrees(
         proofs.proof_document(
-            {"kind": "tube", "about": {"model": proofs.binding(MODEL, model),
-                                       "funnel": proofs.binding(FUNNEL, funnel)}}, proof),
+            {
+                "kind": "tube",
+                "about": {
+                    "model": proofs.binding(MODEL, model),
+                    "funnel": proofs.binding(FUNNEL, funnel),
+                },
+            },
+            proof,
+        ),
         {MODEL: model, FUNNEL: funnel},
-    )  # fmt: skip
+    )
     with pytest.raises(CertificateRejected, match=reason):
         decide(model, funnel, proof)
 
@@ -208,12 +219,10 @@ OTHER_MODELS: dict[str, tuple[str, Change]] = {
     "steeper nonlinearity": ("cascade", lambda c: scaled(c.model["f"], "coefficients", 50.0)),
     "second filter": ("cascade", lambda c: scaled(c.model, "b2", 1.3)),
     "flatter left side": ("monotone", lambda c: scaled(c.model, "e", 0.7)),
-    "implicit left side": (
-        "implicit_ray", lambda c: scaled(c.model["h"]["coefficients"], 0, 0.5)
-    ),
+    "implicit left side": ("implicit_ray", lambda c: scaled(c.model["h"]["coefficients"], 0, 0.5)),
     "implicit linear": ("implicit_linear", lambda c: scaled(c.model["h"]["coefficients"], 0, 0.5)),
     "wider box": ("implicit_box", lambda c: scaled(c.funnel["box"], "u", 20.0)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", OTHER_MODELS)
@@ -246,17 +255,23 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
         ("linear", lambda c: tubes(c.funnel).update(tau=[-1.0]), "should be positive"),
         ("linear", lambda c: scaled(tubes(c.funnel), "P", -1.0), "P is not positive"),
         ("linear", lambda c: tubes(c.funnel).update(R=[[-1.0]]), "R is not positive definite"),
-        ("monotone", lambda c: c.proof["multipliers"][0]["N"][0][1].__setitem__(0, 1e-9),
-         "unbounded slope"),
+        (
+            "monotone",
+            lambda c: c.proof["multipliers"][0]["N"][0][1].__setitem__(0, 1e-9),
+            "unbounded slope",
+        ),
         ("monotone", lambda c: c.proof["multipliers"][0]["N"].pop(), "should have shape"),
         ("monotone", lambda c: c.proof["multipliers"].pop(), "list of 1 to 1"),
-        ("implicit_ray", lambda c: c.funnel.update(box={"y": [[-1.0, 1.0]], "u": [[-1.0, 1.0]]}),
-         "needs no box"),
+        (
+            "implicit_ray",
+            lambda c: c.funnel.update(box={"y": [[-1.0, 1.0]], "u": [[-1.0, 1.0]]}),
+            "needs no box",
+        ),
         ("implicit_box", lambda c: c.funnel.pop("box"), "known on a box only"),
         ("implicit_box", lambda c: c.funnel["box"].update(u=[[1.0, 1.0]]), "is empty"),
         ("implicit_box", lambda c: c.model.pop("window"), "'window' is missing"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_tube_is_refused_with_the_reason(name: str, change: Change, reason: str) -> None:
     model, funnel, proof = claim(name)
     change(SimpleNamespace(model=model, funnel=funnel, proof=proof))

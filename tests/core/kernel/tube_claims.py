@@ -32,9 +32,19 @@ def recorded(model: ImplicitModel, *window: tuple[int, int]) -> ImplicitModel:
 # A design of each takes about a second.
 LONG = {"two_following", "implicit_linear", "split", "network", "moving_lags", "cascade"}
 MODELS: dict[str, Callable[[], Any]] = {
-    **{name: stability_claims.MODELS[name] for name in
-       ("linear", "quadratic", "moving_lags", "two_outputs", "split", "cascade", "network",
-        "monotone")},
+    **{
+        name: stability_claims.MODELS[name]
+        for name in (
+            "linear",
+            "quadratic",
+            "moving_lags",
+            "two_outputs",
+            "split",
+            "cascade",
+            "network",
+            "monotone",
+        )
+    },
     "implicit_ray": lambda: recorded(implicit_models.lagged(), (0, 0)),
     "implicit_linear": lambda: recorded(
         implicit_models.linear(np.array([[0.6, 0.3], [-0.2, 0.5]])), (0, 1)
@@ -42,7 +52,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "implicit_box": lambda: recorded(implicit_models.cubic_spring(), (0, 0)),
     "following": stability_claims.MODELS["linear"],
     "two_following": stability_claims.MODELS["two_outputs"],
-}  # fmt: skip
+}
 LOW, HIGH = -0.5, 0.9  # of the inputs: inside every model's range
 
 
@@ -59,9 +69,14 @@ def dataset(model: Any, seed: int, count: int = 5, samples: int = 120) -> Datase
             after, x = stepper.advance(x, u[t] + 0.05 * rng.normal(size=u.shape[1]))
             y[t] = after[0] + 0.02 * rng.normal(size=y.shape[1])
         trials.append(
-            Trajectory(t=np.arange(samples) * model.period, y=y, u=u, name=f"trial {k}",
-                       digest=f"sha256:{k:064x}")
-        )  # fmt: skip
+            Trajectory(
+                t=np.arange(samples) * model.period,
+                y=y,
+                u=u,
+                name=f"trial {k}",
+                digest=f"sha256:{k:064x}",
+            )
+        )
     return Dataset(tuple(trials))
 
 

@@ -273,16 +273,41 @@ def turns_more_slowly(files: Files) -> None:
 @pytest.mark.coq
 @pytest.mark.parametrize(
     ("name", "forge"),
-    [("clipped", forge) for forge in
-     (rho_raised, gain_lower, multiplier_sign, piece_missing, limit_wider, goal_smaller,
-      bounds_too_narrow, input_bounds_too_narrow)]
-    + [("pushed", forge) for forge in
-       (bounds_too_narrow, input_bounds_too_narrow, kappa_smaller, pushed_more,
-        pushed_by_the_state)]
-    + [("held", forge) for forge in
-       (rho_raised, gain_lower, input_bounds_too_narrow, held_longer, measured_worse,
-        turns_more_slowly)],
-)  # fmt: skip
+    [
+        ("clipped", forge)
+        for forge in (
+            rho_raised,
+            gain_lower,
+            multiplier_sign,
+            piece_missing,
+            limit_wider,
+            goal_smaller,
+            bounds_too_narrow,
+            input_bounds_too_narrow,
+        )
+    ]
+    + [
+        ("pushed", forge)
+        for forge in (
+            bounds_too_narrow,
+            input_bounds_too_narrow,
+            kappa_smaller,
+            pushed_more,
+            pushed_by_the_state,
+        )
+    ]
+    + [
+        ("held", forge)
+        for forge in (
+            rho_raised,
+            gain_lower,
+            input_bounds_too_narrow,
+            held_longer,
+            measured_worse,
+            turns_more_slowly,
+        )
+    ],
+)
 def test_both_kernels_refuse_a_forgery(
     name: str, forge: Callable[[Files], None], build: Path, tmp_path: Path
 ) -> None:
@@ -300,11 +325,22 @@ def test_both_kernels_refuse_a_forgery(
 
 
 MODELS = (
-    "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
-    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
-    "tube/lasting_cascade", "stability/linear", "stability/network", "stability/cascade",
-    "stability/ends", "stability/moving_lags", "stability/split", "stability/two_outputs",
-)  # fmt: skip
+    "tube/engaged",
+    "tube/lasting_linear",
+    "tube/lasting_monotone",
+    "tube/lasting_split",
+    "tube/lasting_two_outputs",
+    "tube/lasting_implicit_ray",
+    "tube/lasting_network",
+    "tube/lasting_cascade",
+    "stability/linear",
+    "stability/network",
+    "stability/cascade",
+    "stability/ends",
+    "stability/moving_lags",
+    "stability/split",
+    "stability/two_outputs",
+)
 
 
 SAMPLED = tuple(f"sampled_funnel/{form}" for form in ("response", "peak", "energy", "fading"))
@@ -413,8 +449,11 @@ def wide_window(files: Files) -> None:
         ("lasting_linear", at("funnel.json box", {}), "unknown members: 'box'"),
         ("lasting_linear", at("funnel.json tubes 0 rho", 1.0), "exactly for an energy"),
         ("lasting_linear", at(f"{ASSUMED} samples", 3), "unknown members: 'samples'"),
-        ("lasting_linear", at("funnel.json tubes 0 follows", {"terms": [], "weights": [[]]}),
-         "1 to 200 entries"),
+        (
+            "lasting_linear",
+            at("funnel.json tubes 0 follows", {"terms": [], "weights": [[]]}),
+            "1 to 200 entries",
+        ),
         ("lasting_linear", at("claim.proof.json proof multipliers", []), "unknown members"),
         ("lasting_split", at("model.json window 0", [0, 9]), "a delay of the window"),
         ("lasting_split", at("model.json y_scale 0", -1.0), "should be > 0"),
@@ -426,8 +465,11 @@ def wide_window(files: Files) -> None:
         ("lasting_cascade", at("model.json f coefficients", [0.0, 1.0, 2.0]), "4 to"),
         ("lasting_cascade", at("model.json b1 1", [1.0]), "3 to 3 entries"),
         ("lasting_cascade", at("model.json b2", [[1.0]]), "2 to 2 entries"),
-        ("lasting_implicit_ray", at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
-         "a box of a model that needs none"),
+        (
+            "lasting_implicit_ray",
+            at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
+            "a box of a model that needs none",
+        ),
         ("engaged", at("policy.json u 0 0", 7.0), "outside the model's range"),
         ("engaged", at("policy.json period", 0.2), "another period"),
         ("engaged", at("policy.json L 0 0", 0.0), "L is not the policy's"),
@@ -449,14 +491,27 @@ def wide_window(files: Files) -> None:
         ("peak", at("claim.proof.json version", 2.0), "not of version 2"),
         ("peak", at("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
         ("peak", at("claim.proof.json proof steps 0 tube squares scale", 1.0), "is allowed"),
-        ("lasting_split", at("funnel.json tubes 0 follows", {
-            "terms": [{"inputs": ["0"], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.5}],
-            "weights": [[1.0]]}), "0 to 0 is allowed"),
+        (
+            "lasting_split",
+            at(
+                "funnel.json tubes 0 follows",
+                {
+                    "terms": [
+                        {"inputs": ["0"], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.5}
+                    ],
+                    "weights": [[1.0]],
+                },
+            ),
+            "0 to 0 is allowed",
+        ),
         ("lasting_split", wide_window, "a degree above 63"),
-        ("lasting_split", at("model.json p", {"exponents": [], "coefficients": []}),
-         "p has no monomials"),
+        (
+            "lasting_split",
+            at("model.json p", {"exponents": [], "coefficients": []}),
+            "p has no monomials",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_the_pages_do_not_allow_is_refused(
     name: str, forge: Callable[[Files], None], said: str, tmp_path: Path
 ) -> None:
@@ -589,9 +644,19 @@ def program(build: Path) -> Path:
 @pytest.mark.coq
 @pytest.mark.parametrize(
     "forge",
-    [fades_faster, narrower, tau_larger, storage_of_another_size, indefinite,
-     outputs_counted_twice, multipliers_gone, feedback_stronger, spline_steeper, filter_stronger],
-)  # fmt: skip
+    [
+        fades_faster,
+        narrower,
+        tau_larger,
+        storage_of_another_size,
+        indefinite,
+        outputs_counted_twice,
+        multipliers_gone,
+        feedback_stronger,
+        spline_steeper,
+        filter_stronger,
+    ],
+)
 def test_both_kernels_refuse_a_forged_tube(
     forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
 ) -> None:
@@ -723,9 +788,15 @@ def stage_of_another_motion(case: mutations.Case) -> None:
 @pytest.mark.coq
 @pytest.mark.parametrize(
     "forge",
-    [start_narrower, multiplier_raised, multiplier_negative, stages_swapped, stage_repeated,
-     stage_of_another_motion],
-)  # fmt: skip
+    [
+        start_narrower,
+        multiplier_raised,
+        multiplier_negative,
+        stages_swapped,
+        stage_repeated,
+        stage_of_another_motion,
+    ],
+)
 def test_both_kernels_refuse_a_forged_composition(
     forge: Callable[[mutations.Case], None], program: Path, tmp_path: Path
 ) -> None:
