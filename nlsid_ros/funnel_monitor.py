@@ -360,7 +360,10 @@ class FunnelMonitor(ManagedNode):
         if watch.pairing.measures(topic, message):
             self._numbers.setdefault(topic, Sequence()).update(info["publication_sequence_number"])
         if not responds:
-            self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
+            unfit = self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
+            if unfit:  # nor does a stamp far ahead say that no other command is still to come
+                self._publish(watch.missing(unfit, doubted=True))
+                return
         elif reason := self._distrust(topic, stamp_ns, message, logged=logged):
             self._publish(watch.refuse(stamp_ns, reason))
             return
@@ -558,7 +561,9 @@ class FunnelMonitor(ManagedNode):
     def _on_heartbeat(self) -> None:
         clock_ns = self.get_clock().now().nanoseconds
         if self._simulated and clock_ns == self._beat_ns and self._watch is not None:
-            reason = "simulated time stands still: nobody publishes /clock"
+            reason = "simulated time stands still"
+            if not self.count_publishers("/clock"):
+                reason += ": nobody publishes /clock"
             self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN)
         self._beat_ns = clock_ns
         self._diagnostics.publish(self._status_message())

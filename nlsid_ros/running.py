@@ -79,7 +79,7 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str, arguments: Arguments = None) -> None:
         try:
             super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
-        except (RuntimeError, NameValidationException) as error:
+        except (RuntimeError, NameValidationException, ParameterException) as error:
             raise _unreadable(error) from error
         self.declared: list[Declared] = []
         self._is_configured = False

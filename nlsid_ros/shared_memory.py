@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 FOLDER = Path("/dev/shm")
+OWN = "fastrtps_*"  # of this transport; what else is there has no such locks, and may be in use
 FRESH = 1.0  # s: what is younger may be locked in a moment
 TRANSPORTS, PROFILES = "FASTDDS_BUILTIN_TRANSPORTS", "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -37,10 +38,10 @@ def clear(folder: Path = FOLDER) -> bool:
 
     Return whether no port of a dead participant is left.
     """
-    locks = [*folder.glob("fast*_el"), *folder.glob("fast*_sl")]
+    locks = [*folder.glob(f"{OWN}_el"), *folder.glob(f"{OWN}_sl")]
     held = {lock.name[:-3] for lock in locks if is_held(lock)}
     left = False
-    for file in folder.glob("fast*"):
+    for file in folder.glob(OWN):
         name = file.name.removesuffix("_el").removesuffix("_sl")
         if name in held:
             continue

@@ -84,7 +84,7 @@ def read_fleet(
     strict: bool = False,
     progress: Progress = silent,
 ) -> FleetTrials:
-    """`read_trials` of bags by name, by workers; what they read is kept in OUT/fleet.sqlite.
+    """`read_trials` of bags by name, by workers; what they read is kept in DIR/fleet.sqlite.
 
     A bag that cannot be read or used is left out, and so is a second copy of one recording; with
     `strict` the first of them raises BagError. DataError, before any is read, if their names leave

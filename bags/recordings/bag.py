@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.definitions import Definition
-from bags.recordings.folders import METADATA, BagFiles, bag_files, data_files
+from bags.recordings.folders import METADATA, BagFiles, bag_files, data_files, without_twins
 from bags.recordings.message_types import are_same, ros2_definition, types_in_bag
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.quality import Profile
@@ -106,8 +106,8 @@ class Bag:
 
     @property
     def custom(self) -> dict[str, str]:
-        """The bag's own metadata: `custom_data` of metadata.yaml or of the MCAP file."""
-        return dict(self._described.custom if self.path.is_dir() else self._storage.custom)
+        """The bag's own metadata: `custom_data` of the MCAP files and, before it, metadata.yaml."""
+        return {**self._storage.custom, **self._described.custom}
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -139,6 +139,11 @@ class Bag:
                 stated, there = (counts or {}).get(topic, 0), self._there(topic)
                 if stated != there:
                     found.append(f"{topic}: {name} states {stated} messages, {there} are there")
+                elif topic not in self.topics:
+                    found.append(f"{topic}: {name} lists it, no file declares it")
+        total, there = self._described.total, sum(channel.count for channel in self.channels)
+        if total not in (None, there):
+            found.append(f"{METADATA} states {total} messages in all, {there} are there")
         return tuple(dict.fromkeys(found))
 
     @property
@@ -268,4 +273,4 @@ def _described(path: Path, *, salvage: bool) -> tuple[BagFiles, list[str]]:
         return BagFiles(files), [str(error)]
     if not salvage or not path.is_dir():
         return found, []
-    return replace(found, files=tuple(dict.fromkeys((*found.files, *data_files(path))))), []
+    return replace(found, files=tuple(without_twins((*found.files, *data_files(path))))), []

@@ -32,7 +32,8 @@ _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class BagFiles:
     """What a bag is made of: its data files in order, and what its metadata.yaml says of it.
 
-    release: of ROS 2; empty if it is not named. notes: what in the metadata is not as it should be.
+    total: messages in all. release: of ROS 2; empty if it is not named. notes: what in the metadata
+    is not as it should be.
     """
 
     files: tuple[Path, ...]
@@ -40,6 +41,7 @@ class BagFiles:
     encodings: dict[str, str] = field(default_factory=dict)
     offered: dict[str, tuple[Profile, ...]] = field(default_factory=dict)
     custom: dict[str, str] = field(default_factory=dict)
+    total: int | None = None
     finished: bool = True
     release: str = ""
     notes: tuple[str, ...] = ()
@@ -133,9 +135,20 @@ def _missing_parts(files: Sequence[Path]) -> tuple[str, ...]:
 
 
 def data_files(folder: Path) -> tuple[Path, ...]:
-    """The data files in a folder; part 2 before part 10."""
+    """The data files in a folder; part 2 before part 10.
+
+    Of a file that lies there compressed and unpacked, as `ros2 bag play` leaves it, the unpacked.
+    """
     there = [p for p in folder.iterdir() if _is_data(p) and p.is_file()]
-    return tuple(sorted(there, key=_by_number))
+    return tuple(sorted(without_twins(sorted(there)), key=_by_number))
+
+
+def without_twins(files: Iterable[Path]) -> list[Path]:
+    """Of a file that lies there compressed and unpacked, only the first of both."""
+    found: dict[str, Path] = {}
+    for file in files:
+        found.setdefault(file.name.removesuffix(COMPRESSED), file)
+    return list(found.values())
 
 
 def _data_name(path: Path) -> Path:
@@ -198,6 +211,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
             profiles[topic] = (*profiles.get(topic, ()), *found)
     except (KeyError, TypeError, ValueError) as error:
         raise _bad(file, f"topics_with_message_count: {type(error).__name__} {error}") from error
+    total = metadata.get("message_count")
     custom = metadata.get("custom_data") or {}
     if not isinstance(custom, dict):
         raise BagError(f"{path}: custom_data in {METADATA} is not a mapping")
@@ -207,6 +221,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         encodings=encodings,
         offered=profiles,
         custom={str(key): str(value) for key, value in custom.items()},
+        total=total if isinstance(total, int) else None,
         release=str(metadata.get("ros_distro") or ""),
         notes=tuple(notes),
     )

@@ -32,6 +32,7 @@ from bags.recordings.mcap_records import (
     Contents,
     add_channel,
     add_schema,
+    counted,
     index_entries,
     messages_at,
     parse,
@@ -45,6 +46,7 @@ from bags.recordings.remote import RemotePath, place
 from nlsid_core.errors import BagError
 
 SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.FOOTER)
+OF_SUMMARY: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.FOOTER)
 ATTACHMENT_FIXED: Final = 8 + 8 + 4 + 4 + 8  # bytes of two times and three lengths
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
@@ -76,6 +78,7 @@ class McapFile:
         remote = isinstance(self.path, RemotePath)
         self._stream = None if remote else self.path.open("rb", buffering=0)
         self._prepared: Prepared | None = None
+        self._total: int | None = None  # messages, as the statistics state
         try:
             if not isinstance(self.path, RemotePath) or not self._read_summary(self.path):
                 self.contents = self._walk()
@@ -144,7 +147,9 @@ class McapFile:
             offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
         for channel in channels:
             if channel in offsets and len(offsets[channel]):
-                yield channel, messages_at(buffer, offsets[channel], channel, where)
+                batch = messages_at(buffer, offsets[channel], channel, where)
+                _refuse_earlier(batch, block)
+                yield channel, batch
 
     def _prepared_batches(
         self, blocks: Sequence[ListedBlock], channels: Collection[int]
@@ -158,7 +163,9 @@ class McapFile:
         for channel in channels:
             found = offsets.get(channel)
             if found is not None and len(found):
-                yield channel, messages_at(buffer, found, channel, where, edges)
+                batch = messages_at(buffer, found, channel, where, edges)
+                _refuse_earlier(batch, min(blocks, key=lambda block: block.start_ns))
+                yield channel, batch
 
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""
@@ -203,13 +210,8 @@ class McapFile:
                 found.lost.append(f"bytes {at} to {following}: no records")
                 at = following
                 continue
-            if repeating and opcode not in (Opcode.STATISTICS, Opcode.FOOTER):
+            if repeating and opcode not in OF_SUMMARY:
                 pass  # what is salvaged is not what a summary says
-            elif opcode == Opcode.MESSAGE:
-                if length < MESSAGE_FIXED:
-                    raise BagError(f"the message at byte {at} has {length} bytes")
-                header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
-                _add_loose(found.blocks, at, end, int(header["log"]))
             else:
                 self._try_note(found, opcode, content, length)
             at = found.good_bytes = end
@@ -249,7 +251,13 @@ class McapFile:
 
     def _note(self, found: Contents, opcode: int, content: int, length: int) -> None:
         """Keep what a record outside chunks says."""
-        if opcode == Opcode.CHUNK:
+        if opcode == Opcode.MESSAGE:
+            at = content - RECORD.size
+            if length < MESSAGE_FIXED:
+                raise BagError(f"the message at byte {at} has {length} bytes")
+            header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
+            _add_loose(found.blocks, at, content + length, int(header["log"]))
+        elif opcode == Opcode.CHUNK:
             found.blocks.append(self._chunk(content, length))
         elif opcode == Opcode.MESSAGE_INDEX and found.blocks:
             self._note_index(found.blocks, content, length)
@@ -266,13 +274,16 @@ class McapFile:
             found.attachments.append((content, length))
         elif opcode == Opcode.STATISTICS:
             statistics = self._parse(Statistics.read, content, length)
-            found.stated = dict(statistics.channel_message_counts)
+            found.stated = counted(statistics)
+            self._total = statistics.message_count
             for what, said, there in (
                 ("attachments", statistics.attachment_count, len(found.attachments)),
                 ("metadata records", statistics.metadata_count, len(found.metadata)),
             ):
                 if said != there:
                     found.lost.append(f"it has {there} {what}, its statistics say {said}")
+        elif opcode == Opcode.DATA_END:
+            self._check_data(found, content)
         elif opcode == Opcode.FOOTER:
             self._check_summary(self._parse(Footer.read, content, length), content)
 
@@ -306,49 +317,66 @@ class McapFile:
         end = content + 16  # the sum goes over everything up to itself
         if not len(MAGIC) <= start <= end:
             raise BagError("the footer's summary offset is damaged")
-        crc = 0
-        for at in range(start, end, 2**20):
-            crc = zlib.crc32(self._read(at, min(2**20, end - at)), crc)
-        if crc != footer.summary_crc:
+        if self._crc(start, end) != footer.summary_crc:
             raise BagError("the summary is damaged: its checksum differs")
+
+    def _check_data(self, found: Contents, content: int) -> None:
+        """Hold all before the end of the data against its checksum, where chunks have none."""
+        stated = int.from_bytes(self._read(content, 4), "little")
+        if not stated or all(block.crc for block in found.blocks):
+            return
+        if self._crc(0, content - RECORD.size) != stated:
+            raise BagError("messages or other records are damaged: the checksum of all differs")
+
+    def _crc(self, start: int, end: int) -> int:
+        crc = 0
+        for at in range(start, end, SEARCH_BYTES):
+            crc = zlib.crc32(self._read(at, min(SEARCH_BYTES, end - at)), crc)
+        return crc
 
     def _find_channels(self) -> None:
         """Look into the blocks for channels the rest of the file does not list; count messages."""
         found = self.contents
-        damaged: list[Block] = []  # or without a message, so that it has no time
+        kept: list[Block] = []  # whole, and with a message, so that it has a time
         for block in found.blocks:
+            start_ns = block.start_ns
             if block.index is not None and all(map(self._is_known, block.index)):
                 entries = {c: length - INDEX.size for c, (_, length) in block.index.items()}
                 counts = {c: length // INDEX_ENTRY.itemsize for c, length in entries.items()}
             else:
                 try:
-                    counts = self._declared_in(block)
+                    counts, start_ns = self._declared_in(block)
                 except BagError as error:
                     if found.ending is None and not self._salvage:
                         raise
                     found.lost.append(str(error))
-                    damaged.append(block)
                     continue
-            if not counts:
-                damaged.append(block)
+            if counts:
+                kept.append(replace(block, start_ns=start_ns))
             for channel_id, count in counts.items():
                 found.counts[channel_id] = found.counts.get(channel_id, 0) + count
-        found.blocks = [block for block in found.blocks if block not in damaged]
+        found.blocks = kept
         if lost := found.counts.keys() - found.channels.keys():
             if not self._salvage:
                 raise BagError(f"messages on channel {min(lost)}, which nothing declares")
             found.lost += [f"{found.counts[c]} messages of unknown channel {c}" for c in lost]
         self._check_statistics()
 
-    def _declared_in(self, block: Block) -> dict[int, int]:
-        """Note the schemas and channels a block declares; how many messages each channel has."""
+    def _declared_in(self, block: Block) -> tuple[dict[int, int], int]:
+        """Note the schemas and channels a block declares; each channel's messages, first time."""
         content = self.content(block)
         schemas, channels = walk_channels(content)
         for schema in schemas:
             add_schema(self.contents.schemas, schema)
         for channel in channels:
             add_channel(self.contents.channels, channel)
-        return {channel_id: len(at) for channel_id, at in walk_messages(content).items()}
+        walked, where = walk_messages(content), f"the block at byte {block.offset}"
+        starts = [
+            int(messages_at(content, np.array(at, np.int64), channel_id, where).log_ns.min())
+            for channel_id, at in walked.items()
+        ]
+        counts = {channel_id: len(at) for channel_id, at in walked.items()}
+        return counts, min(starts, default=block.start_ns)
 
     def _is_known(self, channel_id: int) -> bool:
         """Whether a channel and its schema have been declared so far."""
@@ -359,6 +387,14 @@ class McapFile:
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""
+        there = sum(self.contents.counts.values())
+        if self.contents.stated is None and self._total == there:
+            self.contents.stated = dict(self.contents.counts)
+        elif self.contents.stated is None and self._total is not None:
+            what = f"it has {there} messages, its statistics say {self._total}"
+            if not self._salvage:
+                raise BagError(what)
+            self.contents.lost.append(what)
         stated = self.contents.stated
         if stated is None or self.contents.ending is not None or self._salvage:
             return
@@ -381,6 +417,12 @@ class McapFile:
             return self.path.read_range(offset, offset + size)
         assert self._stream is not None
         return os.pread(self._stream.fileno(), size, offset)
+
+
+def _refuse_earlier(batch: Batch, block: Block) -> None:
+    """BagError if messages are logged before their chunk begins: they would come out of order."""
+    if batch.log_ns.min() < block.start_ns:
+        raise BagError(f"the chunk at byte {block.offset} holds messages before the time it states")
 
 
 def _add_loose(blocks: list[Block], at: int, end: int, log_ns: int) -> None:

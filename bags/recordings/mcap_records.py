@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema, Statistics
 
 from bags.recordings.batch import Batch
 from nlsid_core.arrays import IntArray
@@ -193,6 +193,12 @@ def index_entries(record: bytes, channel: int, where: str) -> IntArray:
     listed: Any = np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
     offsets: IntArray = listed["offset"].astype(np.int64)
     return offsets
+
+
+def counted(statistics: Statistics) -> dict[int, int] | None:
+    """Messages of each channel; None of a writer that states only how many there are in all."""
+    counts = dict(statistics.channel_message_counts)
+    return counts if counts or not statistics.message_count else None
 
 
 def add_schema(schemas: dict[int, Schema], schema: Schema) -> None:

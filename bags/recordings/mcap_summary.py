@@ -36,6 +36,7 @@ from bags.recordings.mcap_records import (
     Record,
     add_channel,
     add_schema,
+    counted,
     index_entries,
     parse,
     uncompressed,
@@ -104,7 +105,8 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
             add_channel(found.channels, _declared(Channel.read, content))
         elif opcode == Opcode.STATISTICS:
             statistics = parse(Statistics.read, content)
-            found.stated = found.counts = dict(statistics.channel_message_counts)
+            found.stated = counted(statistics)
+            found.counts = found.stated or {}
         elif opcode == Opcode.CHUNK_INDEX:
             found.blocks.append(_listed(parse(ChunkIndex.read, content), start))
         elif opcode == Opcode.METADATA_INDEX:
@@ -127,8 +129,8 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
     declared = {
         c.id for c in found.channels.values() if not c.schema_id or c.schema_id in found.schemas
     }
-    counted = {channel for channel, count in found.counts.items() if count}
-    if not named | counted <= declared or not counted <= named:  # some are told elsewhere
+    filled = {channel for channel, count in found.counts.items() if count}
+    if not named | filled <= declared or not filled <= named:  # some are told elsewhere
         return None
     if any(not (len(MAGIC) <= m.offset <= m.offset + m.length <= start) for m in metadata):
         raise BagError("the summary names metadata outside the file")

@@ -68,6 +68,9 @@ class Ros1File:
             if _number(fields, b"op") == MESSAGE:
                 place = start, end - start, _time(fields)
                 found.setdefault(_number(fields, b"conn"), []).append(place)
+        counts = {number: len(places) for number, places in found.items()}
+        if counts != {number: count for number, (_, count) in (block.index or {}).items() if count}:
+            raise BagError(f"the chunk at byte {block.offset} does not hold what its index says")
         for channel in channels:
             if channel in found:
                 start, size, log_ns = np.array(found[channel], np.int64).T
@@ -145,8 +148,10 @@ class Ros1File:
                 found.lost.append(str(error))
         found.blocks = kept
         found.counts = _counts(kept)
-        if unknown := found.counts.keys() - found.channels.keys():
-            raise BagError(f"messages of connection {min(unknown)}, which nothing declares")
+        for number in found.counts.keys() - found.channels.keys():
+            if not self._salvage:
+                raise BagError(f"messages of connection {number}, which nothing declares")
+            found.lost.append(f"{found.counts.pop(number)} messages of unknown connection {number}")
 
     def _indexed(self, block: Block) -> Block:
         counts: dict[int, int] = {}

@@ -26,6 +26,7 @@ from nlsid_core.errors import BagError
 
 BESIDE: Final = ("-wal", "-journal")
 SALVAGED_BYTES: Final = 2**16  # of messages that are lost together where a page is damaged
+WAL_HEADER, WAL_PAGE_HEADER = 32, 24  # bytes, by the format of SQLite's files
 ROWS: Final = "SELECT id, topic_id, timestamp, length(data) FROM messages"
 OLD_RELEASE: Final = "galactic"  # which, like those before it, names no release in its files
 
@@ -90,9 +91,15 @@ class SqliteFile:
                 yield topic, joined(parts, times)
 
     def _look_into(self, beside: list[Path]) -> None:
-        if beside and self._rows("PRAGMA wal_checkpoint")[0][1] == 0:
+        if beside:
+            pages = self._rows("PRAGMA wal_checkpoint")[0][1]
             names = " and ".join(file.name for file in beside)
-            self.contents.lost.append(f"nothing in {names} belongs to this file")
+            if pages == 0:
+                self.contents.lost.append(f"nothing in {names} belongs to this file")
+            elif lost := sum(map(_pages_in_wal, beside)) - pages:
+                self.contents.lost.append(
+                    f"the last {lost} pages in {names} are damaged or were not written to their end"
+                )
         tables = self._rows("SELECT name FROM sqlite_master WHERE type = 'table'")
         if not {("topics",), ("messages",)} <= set(tables):
             raise BagError("it has no tables of topics and messages")
@@ -134,6 +141,7 @@ class SqliteFile:
         most = SALVAGED_BYTES if self._salvage else BATCH_BYTES
         run: list[tuple[int, int, int, int]] = []
         size = 0
+        left_out = 0
         try:
             for row in rows:
                 if size > most:
@@ -142,8 +150,12 @@ class SqliteFile:
                 if self._is_message(row[2], b"" if isinstance(row[3], int) else None):
                     run.append(row)
                     size += row[3]
+                else:
+                    left_out += 1
         finally:
             self._add_block(run)
+        if left_out:
+            self.contents.lost.append(f"{left_out} messages have no time or no data")
 
     def _is_message(self, log_ns: object, data: object) -> bool:
         """Whether a row has a time and data; BagError if not, unless it is salvaged."""
@@ -184,6 +196,16 @@ class SqliteFile:
 
     def _rows(self, query: str) -> list[Any]:
         return self._base.execute(query).fetchall()
+
+
+def _pages_in_wal(file: Path) -> int:
+    """Pages that a -wal file holds of its newest round, as its header and theirs say."""
+    content = file.read_bytes()
+    if not file.name.endswith("-wal") or len(content) < WAL_HEADER:
+        return 0
+    size, salt = int.from_bytes(content[8:12], "big"), content[16:24]
+    starts = range(WAL_HEADER, len(content), WAL_PAGE_HEADER + size)
+    return sum(content[at + 8 : at + 16] == salt for at in starts)
 
 
 def _stated_bytes(path: Path) -> int:

@@ -27,7 +27,7 @@ from bags.recordings.message_types import JAZZY, ros2_definition, standard_types
 from bags.recordings.quality import KEY, Profile, offered
 from bags.recordings.remote import RemotePath
 from bags.recordings.ros1_file import ROS1_MAGIC, Ros1File
-from bags.recordings.sqlite_file import SqliteFile
+from bags.recordings.sqlite_file import BESIDE, SqliteFile
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
@@ -40,6 +40,7 @@ SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_OVERLAP_BYTES: Final = 256 * 2**20  # chunks that overlap in time are sorted in memory
 MOST_PADDING: Final = 3  # bytes that rosserial leaves after a message
+UNPACKED_BYTES: Final = 2**20  # of a file that was compressed whole, at once
 NEVER: Final = 2**63 - 1  # ns: after every message
 
 DataFile = McapFile | SqliteFile | Ros1File
@@ -168,10 +169,15 @@ class Storage:
         folder = TemporaryDirectory()
         self._unpacked.append(folder)
         target = Path(folder.name) / path.name.removesuffix(".zstd")
+        for end in BESIDE:
+            beside = path.with_name(f"{target.name}{end}")
+            if beside.is_file():
+                shutil.copy(beside, folder.name)
         left = shutil.disk_usage(folder.name).free // 2
         with target.open("wb") as unpacked:
             try:
-                for part in zstandard.ZstdDecompressor().read_to_iter(stream):
+                packed = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+                while part := packed.read(UNPACKED_BYTES):
                     left -= unpacked.write(part)
                     if left < 0:
                         raise BagError("unpacked it fills more than half of the free disk")

@@ -70,7 +70,7 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     if not known:  # a part of the trials is too little for a model, and all of them are not
         alone, held_back = True, list(names)
         known = {lags: float(fit.errors["train"][fit.chosen.method.name])}
-    proposal.error = min(known.values())
+    proposal.error = known.get(section["lags"], min(known.values()))
     proposal.varies = _varies(train.select(held_back))
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     if alone:
@@ -106,12 +106,13 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
                     known[tried] = error
     if not known:
         return
-    best = proposal.error = min(known.values())
+    best = min(known.values())
     proposal.varies = _varies(train.select(held_back))
     good = min(
         (c for c, error in known.items() if error * LAGS_BETTER <= best),
         key=lambda c: c.lags + _terms(c),
     )
+    proposal.error = known[good]
     section |= {"lags": good.lags, "right_degree": good.degrees.inputs}
     if good.delays is not None:
         section["delays"] = list(good.delays)

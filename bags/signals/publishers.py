@@ -26,12 +26,13 @@ DISTINCT: Final = 24  # values in a window; fewer are those of a coarse sensor, 
 def counted_in_turn(sequence: IntArray) -> str:
     """Say that the counts (N,) in messages as recorded are of several publishers; else empty.
 
-    They are all equal where none was recorded.
+    They are all equal, or 0, where none was recorded.
     """
-    back = np.flatnonzero(np.diff(sequence) < 0)
+    step = np.diff(sequence)
+    back = np.flatnonzero((step < 0) | ((step == 0) & step.any() & (sequence[1:] > 0)))
     if not (back[BACK - 1 :] - back[: max(len(back) - BACK + 1, 0)] <= WINDOW).any():
         return ""
-    return f"the counts in its messages go back {len(back)} times: several publishers send them"
+    return f"the counts in its messages do not rise {len(back)} times: several publishers send them"
 
 
 def two_curves(stamp_ns: IntArray, values: FloatArray) -> str:

@@ -149,7 +149,7 @@ def _edges(
     step_ns = int(np.median(np.diff(samples.stamp_ns)))
     found = find_period(samples.values)
     if found is None:
-        raise BagError(f"{path}: {repeats} does not repeat itself; split it every so many seconds")
+        raise BagError(f"{path}: {repeats} does not repeat itself; split it by time, with --every")
     count = len(samples) // found
     edges = [int(samples.stamp_ns[k * found]) for k in range(count)]
     last = count * found

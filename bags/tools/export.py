@@ -27,6 +27,7 @@ from bags.signals.grid import seconds
 from bags.signals.reader import expanded, read_signals
 from bags.signals.resample import Method, resample
 from bags.signals.signal import NO_FIELD, SignalPath, numeric_paths
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
 
@@ -87,7 +88,7 @@ def export_topics(
                 what = "; ".join(left_out) or "there are no messages"
                 raise BagError(f"{path}: nothing was exported: {what}")
             folder_path.rename(out)
-        notes = tuple(bag.disagreements)
+        notes = (*bag.lost, *bag.disagreements)
     return Exported(
         {out / name: count for name, count in written.rows.items()}, tuple(left_out), notes
     )
@@ -138,7 +139,7 @@ def export_grid(
     for name, samples in read.items():
         how: Method = "hold" if name in hold else method
         found = resample(samples, grid, method=how, max_gap=max_gap)
-        table[name], errors[name] = found.values, found.error
+        table[name], errors[name] = found.values, found.error + _rounding(samples.values)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         part = Path(folder) / out.name
@@ -146,6 +147,12 @@ def export_grid(
             writer.write(table)
         part.rename(out)
     return errors
+
+
+def _rounding(values: FloatArray) -> float:
+    """How far integers may be from their float64: beyond 2^53 not each has one."""
+    largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values)))
+    return float(np.spacing(largest) / 2) if largest >= 2**53 else 0.0
 
 
 def _every_number(bag: Bag, left_out: list[str]) -> dict[str, dict[str, Expression]]:

@@ -7,6 +7,7 @@ import pytest
 
 from bags.recordings.bag import Bag
 from bags.signals.arrivals import Arrival, Recent, Regularity, Sequence
+from bags.signals.publishers import counted_in_turn
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
 PERIOD_NS = 1_000_000
@@ -36,6 +37,24 @@ def test_a_publishers_count_tells_what_is_missing_until_there_is_another_publish
     for number in (300, 9, 301, 10):  # another one beside it
         sequence.update(number)
     assert sequence.mixed
+
+
+@pytest.mark.parametrize(
+    ("numbers", "alternates"),
+    [
+        ([1, 1, 2, 2, 3, 3, 4, 4], True),
+        ([7] * 6, False),
+        ([1, 9, *range(2, 500), 1], False),  # one sent a message, and long after it one came back
+    ],
+)
+def test_counts_in_step_are_of_two_publishers_unless_the_middleware_does_not_count(
+    numbers: list[int], alternates: bool
+) -> None:
+    sequence = Sequence()
+    for number in numbers:
+        sequence.update(number)
+    assert sequence.alternates == alternates
+    assert bool(counted_in_turn(np.array(numbers))) == alternates
 
 
 def test_the_last_seconds_are_kept_and_nothing_older(tmp_path: Path) -> None:

@@ -434,11 +434,15 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     said = nlsid("init", config.parent, bags, "-u", "/cmd:data", "-y", "/speed:data")
     assert "commands end up to 4.9 s before the responses do" in said
     expected = re.search(
-        r"expect [\d.e-]+ % error in simulation \(of trials held back, in which (.+) varies by "
+        r"expect ([\d.e-]+) % error in simulation \(of trials held back, in which (.+) varies by "
         r"(\S+), rms; of calmer test trials it is more\): good",
         said,
     )
     assert expected
+    lags = yaml.safe_load(config.read_text())["identification"]["lags"]
+    assert f"{lags}: {expected[1]} %" in " ".join(config.read_text().replace("#", "").split()), (
+        "the error of the lags that are proposed"
+    )
     [found] = check_fitness(
         [bags / "run_0"], excitations=["/cmd:data"], responses=["/speed:data"], clock="log"
     )
@@ -452,7 +456,7 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     trained = decoded((tmp_path / "out" / documents.TRAINING).read_bytes(), source="it")["training"]
     assert all(trial.u.min() > 0.4 for trial in trained)
     spread = np.std(np.concatenate([t.y for t in trained if t.name.startswith("run_1")]))
-    assert float(expected[2]) == pytest.approx(spread, rel=5e-3), "run_1 was held back"
+    assert float(expected[3]) == pytest.approx(spread, rel=5e-3), "run_1 was held back"
 
 
 def lagging(folder: Path, *, period: float, trials: int = 3) -> Path:

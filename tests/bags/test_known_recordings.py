@@ -11,6 +11,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from typer.testing import CliRunner
 
 from bags.commands.bag_cli import bag_app
 from bags.recordings.bag import Bag
+from bags.recordings.mcap_records import CUSTOM_DATA
 from bags.recordings.message_types import decode, standard_types, types_in_bag
 from bags.signals.reader import read_signals
 from bags.tools.info import bag_info
@@ -228,8 +230,9 @@ def sqlite_bag(
     known: dict[str, int] = {}
     listed = list(messages)
     for k, (topic, kind, data) in enumerate(listed):
-        if wal and k == len(listed) - wal:
+        if wal and k >= len(listed) - wal:
             base.commit()
+        if wal and k == len(listed) - wal:
             base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         if topic not in known:
             known[topic] = len(known) + 1
@@ -311,10 +314,17 @@ def mcap_bag(
     file: Path,
     channels: Sequence[tuple[str, str, str, str, str]],
     messages: Iterable[tuple[int, int, bytes]],
+    *,
+    change: Callable[[Any], None] = lambda _: None,
+    **options: Any,
 ) -> Path:
-    """Channels of (topic, type, schema's encoding, its text, encoding); (channel, log ns, data)."""
+    """Channels of (topic, type, schema's encoding, its text, encoding); (channel, log ns, data).
+
+    change: what to do to mcap's writer before it ends the file. options: of the writer.
+    """
     with file.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.LZ4, chunk_size=300)
+        settings: dict[str, Any] = {"compression": CompressionType.LZ4, "chunk_size": 300} | options
+        writer = Writer(stream, **settings)
         writer.start(profile="ros2")
         numbers = [
             writer.register_channel(
@@ -324,6 +334,7 @@ def mcap_bag(
         ]
         for k, (channel, log_ns, data) in enumerate(messages):
             writer.add_message(numbers[channel], log_ns, data, log_ns, sequence=k)
+        change(writer)
         writer.finish()  # type: ignore[no-untyped-call]
     return file
 
@@ -377,7 +388,9 @@ def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: 
     else:
         ros1_bag(plain, [(0, data[4:]) for data in rows])
     packed = plain.with_name(f"{plain.name}.zstd")
-    packed.write_bytes(zstd(plain.read_bytes()))
+    content = plain.read_bytes()
+    packed.write_bytes(zstd(content[:500]) + zstd(content[500:]))  # as pzstd does, in frames
+    assert recover(plain.parent, tmp_path / "both").messages == 20
     plain.unlink()
     signal = "speed:data" if suffix == ".bag" else "/x:data"
     assert read_signals(packed, [signal])[signal].values.tolist() == ramp(20)
@@ -626,6 +639,10 @@ def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) 
         "on[0]": "True",
         "on[1]": "False",
     }
+    grid = ["--period", "1e-9", "-s", "/x:n[0]", "--hold", "/x:n[0]", "--clock", "log"]
+    assert (
+        "/x:n[0]: off by at most 1\n" in run("export", bag, "--out", tmp_path / "g.csv", *grid)[1]
+    )
     run("export", bag, "--out", tmp_path / "npz", "-f", "npz")
     with np.load(tmp_path / "npz" / "x.npz") as arrays:
         assert {str(arrays[name].dtype) for name in ("i.u", "i.s", "on[0]")} == {
@@ -663,6 +680,16 @@ def damaged_metadata(change: Callable[[str], str], folder: Path) -> Path:
         (lambda text: text.replace("storage_identifier: mcap", "storage_identifier: sqlite3"), ""),
         (lambda text: text.replace("trial.mcap", "then_0.mcap"), "then_0.mcap, which is not there"),
         (lambda text: text.replace("trial.mcap", "trial/trial.mcap"), ""),
+        (
+            lambda text: text.replace("message_count: 100", "message_count: 120"),
+            "120 messages in all",
+        ),
+        (
+            lambda text: text.replace(
+                "count:\n  -", "count:\n  - {topic_metadata: {name: /q}, message_count: 0}\n  -"
+            ),
+            "/q: metadata.yaml lists it, no file declares it",
+        ),
         (lambda text: text.replace("name: /odom", "name: /gone"), "/gone: metadata.yaml states 50"),
         (lambda text: text.replace("offered_qos_profiles: []", "offered_qos_profiles: 7"), ""),
     ],
@@ -730,6 +757,114 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
     run("convert", tmp_path / "one", merged, "--out", tmp_path / "both")
     assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
+
+
+def test_what_only_a_file_says_of_its_bag_is_kept(tmp_path: Path) -> None:
+    """A topic that only the summary declares, and custom data without a metadata.yaml."""
+
+    def change(writer: Any) -> None:
+        writer.add_metadata(CUSTOM_DATA, {"robot": "x"})
+        known = writer._Writer__channels  # as C++'s writer leaves a topic without a message
+        known[9] = replace(known[1], id=9, topic="/quiet")
+
+    rows = [(0, START_NS + k, float_message(k)) for k in range(5)]
+    (tmp_path / "run").mkdir()
+    mcap_bag(tmp_path / "run" / "run_0.mcap", [FLOAT], rows, change=change)
+    recover(tmp_path / "run", tmp_path / "whole")
+    with Bag(tmp_path / "whole") as bag:
+        assert list(bag.topics) == ["/x", "/quiet"]
+        assert bag.custom == {"robot": "x"}
+
+
+def altered(file: Path, before: bytes, after: bytes) -> Path:
+    content = file.read_bytes()
+    assert before in content
+    file.write_bytes(content.replace(before, after, 1))
+    return file
+
+
+def without_counts(total: int) -> Callable[[Any], None]:
+    def change(writer: Any) -> None:
+        writer._Writer__statistics.channel_message_counts = {}
+        writer._Writer__statistics.message_count = total
+
+    return change
+
+
+MESSAGES = [(0, START_NS + k * STEP_NS, float_message(k)) for k in range(20)]
+PLAIN = CompressionType.NONE
+
+
+def without_data(file: Path) -> Path:
+    sqlite_bag(file, [("/x", FLOAT[1], data) for *_, data in MESSAGES])
+    base = sqlite3.connect(file)
+    base.execute("UPDATE messages SET data = NULL WHERE id = 5")
+    base.commit()
+    base.close()
+    return file
+
+
+def torn_wal(file: Path) -> Path:
+    sqlite_bag(file, [("/x", FLOAT[1], data) for *_, data in MESSAGES], wal=10)
+    beside = Path(f"{file}-wal")
+    beside.write_bytes(beside.read_bytes()[:-100])
+    return file
+
+
+def flipped_loose(file: Path) -> Path:
+    mcap_bag(file, [FLOAT], MESSAGES, use_chunking=False, enable_data_crcs=True)
+    return altered(file, float_message(7), float_message(8))
+
+
+def late_chunk(file: Path) -> Path:
+    mcap_bag(file, [FLOAT], MESSAGES, compression=PLAIN, chunk_size=200)
+    return altered(file, struct.pack("<Q", START_NS), struct.pack("<Q", START_NS + 2**50))
+
+
+def unknown_connection(file: Path) -> Path:
+    ros1_bag(file, [(0, data[4:]) for *_, data in MESSAGES])
+    return altered(file, b"conn=\0\0\0\0\r\0\0\0time", b"conn=\1\0\0\0\r\0\0\0time")
+
+
+# how it is made, status of `recover`, messages there, what is said, what `convert` says (status 2)
+TOLD = [
+    (without_data, 1, 19, "1 messages have no time or no data", "NoneType as data"),
+    (torn_wal, 1, 19, "the last 1 pages in a-wal are damaged", ""),
+    (flipped_loose, 1, 20, "the checksum of all differs", "the checksum of all differs"),
+    (late_chunk, 0, 20, "nothing was lost", "holds messages before the time it states"),
+    (unknown_connection, 1, 19, "1 messages of unknown connection 1", "not hold what its index"),
+    (
+        lambda file: mcap_bag(file, [FLOAT], MESSAGES, change=without_counts(20)),
+        0,
+        20,
+        "nothing was lost",
+        "",
+    ),
+    (
+        lambda file: mcap_bag(file, [FLOAT], MESSAGES, change=without_counts(21)),
+        1,
+        20,
+        "its statistics say 21",
+        "its statistics say 21",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "status", "count", "said", "refused"), TOLD)
+def test_what_is_not_as_a_file_states_is_told(
+    tmp_path: Path, make: Callable[[Path], Path], status: int, count: int, said: str, refused: str
+) -> None:
+    bag = make(tmp_path / "a")
+    found, output = run("recover", bag, "--out", tmp_path / "whole")
+    assert found == status
+    assert f"{count} messages, read back" in output
+    assert said in output
+    assert ("nothing was lost" in output) == (status == 0)
+    with Bag(tmp_path / "whole") as whole:
+        times = [message.log_time_ns for message in whole.messages(as_recorded=True)]
+    assert times == sorted(times)
+    found, output = run("convert", bag, "--out", tmp_path / "copy")
+    assert (found, refused in output) == (2 if refused else 0, True)
 
 
 def test_of_a_damaged_sqlite_file_both_ends_come_back(tmp_path: Path) -> None:

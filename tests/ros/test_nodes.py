@@ -171,6 +171,7 @@ def test_every_node_ends_cleanly_when_asked_to(
         ("funnel_monitor", {"source": "a-b"}, "Invalid topic name: topic name must not contain"),
         ("plant", {"__ns": "robot1"}, "a namespace begins with a slash: /robot1"),
         ("funnel_publisher", {"funnel": "["}, "ROS refuses: failed to initialize rcl: Couldn't"),
+        ("funnel_monitor", {"use_sim_time": "yes please"}, "ROS refuses: Trying to set parameter"),
     ],
 )
 def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(

@@ -162,6 +162,19 @@ def test_a_command_with_a_stamp_that_is_none_is_told_as_that(
         robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
     robot.spin_until(lambda: robot.has_said(says))
     assert not robot.has_said("inside")
+    first_ns = time.time_ns()
+    for k in range(40):
+        command, state = TwistStamped(), Odometry()
+        for message in (command, state):
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(first_ns + k * PERIOD_NS, 10**9)
+        robot.odom.publish(state)
+        time.sleep(0.005)  # for which a sample waits
+        robot.command.publish(command)
+        due = time.monotonic() + 0.02
+        robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
+    robot.spin_until(lambda: robot.has_said("inside"))
+    assert robot.said[NAME][-1][1]["late commands"] == "0"
 
 
 def test_a_controller_does_not_act_on_two_robots_and_names_who_else_commands(
