@@ -187,7 +187,7 @@ def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert "trial 0 sets the level: it uses 8.8 times as much" in poor[1]
     assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor[1]
     assert "off by up to 0.375 m/s" in poor[2]
-    assert "0.563 m/s with the safety factor" in poor[2]
+    assert "0.5625 m/s with the safety factor" in poor[2]
     assert "try more lags, another class" in poor[2]
     loose = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
     assert len(loose) == 2
