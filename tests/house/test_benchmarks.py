@@ -85,7 +85,7 @@ def test_the_processes_of_a_benchmark_end_with_it(
     ]
     monkeypatch.setattr(Benchmark, "command", lambda *_: [sys.executable, *script])
     with pytest.raises(subprocess.TimeoutExpired):
-        measured(Benchmark("any"), None, 2.0)
+        measured(Benchmark("any"), None, 8.0)
     patience = time.monotonic() + 10.0
     while (alive := _is_alive(int(started.read_text()))) and time.monotonic() < patience:
         time.sleep(0.01)

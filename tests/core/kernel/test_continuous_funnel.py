@@ -570,15 +570,6 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
     refused(files, reason)
 
 
-@pytest.mark.slow
-def test_more_pieces_than_the_kernel_has_time_for_are_refused_before_it_starts(
-    files: Files,
-) -> None:
-    pieces = files[PROOF]["proof"]["pieces"]
-    files[PROOF]["proof"]["pieces"] = pieces * (10_001 // len(pieces) + 1)
-    refused(files, "takes more products")
-
-
 def test_a_claim_without_its_goal_says_nothing_of_it(files: Files) -> None:
     del files[PROOF]["claim"]["goal"]
     refused(files, "unknown member 'goal_multiplier'")
