@@ -16,7 +16,6 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -179,18 +178,6 @@ def test_a_recording_stops_while_there_is_room_to_finish_it(robot: Robot, tmp_pa
         robot.spin_until(lambda: robot.has_said("are to stay free", "trajectory_recorder"))
         stop(recorder)
     assert (bag / "metadata.yaml").is_file(), "the bag was closed"
-
-
-def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robot: Robot) -> None:
-    with process(MONITOR, __node="picky_monitor") as monitor:
-        robot.ready(monitors=2)
-        offers_less = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        unreliable = robot.node.create_publisher(Odometry, "/odom", offers_less)
-        time.sleep(1.0)
-        output = stop(monitor)
-        robot.node.destroy_publisher(unreliable)
-    assert "'/odom', offering incompatible QoS" in output
-    assert "RELIABILITY" in output
 
 
 def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path) -> None:
