@@ -180,7 +180,7 @@ def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
     config = write_config(tmp_path / "robot.yaml", {"lags": 3}, compare=compare)
     compared = compare_bags(bags_in(folder), load_config(config), progress=silent)
     best = min(compared.rows, key=lambda row: row.scores.simulation_percent)
-    assert best.label.startswith("block cascade")
+    assert best.label.startswith("network, filter map filter")
     assert compared.skipped_at_start == 60
     assert len({row.scores.samples for row in compared.rows}) == 1, "all on the same samples"
     methods = {row.candidate.method.name for row in compared.rows}
