@@ -183,8 +183,7 @@ def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
     assert best.label.startswith("network, filter map filter")
     assert compared.skipped_at_start == 60
     assert len({row.scores.samples for row in compared.rows}) == 1, "all on the same samples"
-    names = [row.candidate.method.name for row in compared.rows]
-    methods = {name.removesuffix("_certified") for name in names}
+    methods = {row.candidate.method.name.removesuffix("_certified") for row in compared.rows}
     assert methods == set(METHODS), "every method the library has"
     compared.draw(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes()[:4] == b"\x89PNG"
