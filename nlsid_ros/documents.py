@@ -12,7 +12,8 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
-from bags.designs.design import AnyDesign, Wiring
+from bags.designs.wiring import wiring_of
+from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.running import declare_number, declare_text
@@ -31,13 +32,8 @@ def declare_wiring(node: Node) -> Wiring | None:
     period = declare_number(
         node, "period", 0.0, "s between samples of a continuous funnel", between=(0.0, 60.0)
     )
-    if not (response or command):
-        return None
-    return Wiring.parse(
-        (path.strip() for path in response.split(",")),
-        (path.strip() for path in command.split(",")),
-        period,
-    )
+    y, u = ([path.strip() for path in text.split(",") if path] for text in (response, command))
+    return wiring_of(y, u, period)
 
 
 def declare_expected(node: Node) -> str:

@@ -21,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
 from bags.designs.bundle import Bundle, Check
-from bags.designs.design import AnyDesign
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
@@ -135,7 +135,8 @@ class FunnelPublisher(ManagedNode):
         """What to publish, what it is, and what is proved of it."""
         try:
             bundle = Bundle.load(path)
-            return bundle, bundle.design(), str(bundle.decided())
+            verdict = bundle.decided()
+            return bundle, bundle.design(), str(verdict)
         except (NlsidError, OSError) as refusal:
             self._reject(refusal)
             raise

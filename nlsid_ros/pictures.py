@@ -9,8 +9,10 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bags.designs.design import AnyDesign, is_continuous, is_sampled, is_tube
 from nlsid_core.arrays import FloatArray
+from nlsid_core.designs import AnyDesign
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
 
 LIFETIME = 3  # s after the publisher last said so
@@ -33,7 +35,7 @@ class Plan:
 
 def plan_of(design: AnyDesign) -> Plan:
     """The output of a linear model, y_k = C x_k + D u_k + c; of the others every state."""
-    if is_continuous(design):
+    if isinstance(design.funnel, ContinuousFunnel):
         names = tuple(f"x{i}" for i in range(design.funnel.n))
         columns: list[list[FloatArray]] = [[], [], [], []]
         for stage in design.stages:  # a knot where stages change belongs to the later one
@@ -44,7 +46,7 @@ def plan_of(design: AnyDesign) -> Plan:
                 column.append(part[:end])
         t, nominal, half_widths, inputs = map(np.concatenate, columns)
         return Plan(t, names, nominal, half_widths, inputs)
-    if is_tube(design):
+    if isinstance(design.funnel, TubeFunnel):
         model, policy = design.model, design.policy
         assert isinstance(model, DifferenceEquation)
         assert policy is not None
@@ -52,7 +54,6 @@ def plan_of(design: AnyDesign) -> Plan:
         t = np.arange(len(nominal)) * policy.period
         width = np.full((len(t), 1), design.funnel.half_width)
         return Plan(t, (model.y.name,), nominal[:, None], width, policy.u[:, None])
-    assert is_sampled(design)
     t = np.arange(len(design.policy.x)) * design.policy.period
     names = tuple(signal.name for signal in design.model.x)
     return Plan(t, names, design.policy.x, design.funnel.half_widths, design.policy.u)

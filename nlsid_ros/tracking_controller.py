@@ -29,13 +29,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.designs.design import AnyDesign
 from bags.designs.documents import load_unproved
+from bags.designs.wiring import read_at, written_at
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core import files
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import graph, qos
@@ -210,7 +211,7 @@ class TrackingController(ManagedNode):
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """Take a design, but never in the middle of a run: stop that first."""
-        response, command = design.response, design.command
+        response, command = read_at(design), written_at(design)
         response.check(self._response_type, installed_types(self._response_type))
         message = SignalMessage(command, self._command_type, self._others)
         if self._controller is not None or self._stopping:
@@ -227,7 +228,7 @@ class TrackingController(ManagedNode):
                 partial(self._on_response, response),
                 qos.SENSOR,
             )
-        elif (response, command) != (self._design.response, self._design.command):
+        elif (response, command) != (read_at(self._design), written_at(self._design)):
             raise DataError("it is about other signals; deactivate and activate again")
         self._design, self._digest = design, digest
         self._say_run(Run(0, digest, ended="the controller has another design, or began anew"))

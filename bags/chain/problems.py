@@ -14,6 +14,7 @@ from bags.signals.grid import read_dataset
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
+from nlsid_core.designs import Wiring
 from nlsid_core.dynamics import (
     MeasuredPush,
     Nominal,
@@ -151,22 +152,24 @@ class FunnelProblem:
 def measured(
     path: Path,
     bags: Sequence[Path],
+    wiring: Wiring,
     *,
-    responses: Sequence[str],
-    excitations: Sequence[str],
-    period: float | None,
     seconds: float | None,
     safety_factor: float,
     resample: str = "none",
 ) -> tuple[FunnelProblem, Breaking]:
     """The problem of a file with what its equations leave out of bags; and what would break that.
 
-    responses, excitations: its states and inputs as signals. For the rest see `measured_push` and
-    `read_dataset`, whose errors pass through.
+    wiring: where its states and inputs are; period 0: as the samples come. For the rest see
+    `measured_push` and `read_dataset`, whose errors pass through.
     """
     problem = FunnelProblem.load(path)
     trials = read_dataset(
-        bags, responses=responses, excitations=excitations, period=period, resample=resample
+        bags,
+        responses=wiring.response,
+        excitations=wiring.command,
+        period=wiring.period or None,
+        resample=resample,
     )
     push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
     found = breaking(trials, lambda trial: push.used(problem.field, trial))

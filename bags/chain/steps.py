@@ -11,6 +11,7 @@ import numpy as np
 
 from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
+from bags.chain.tracking_config import TrackingConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
@@ -30,8 +31,6 @@ from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
 from nlsid_core.models.signal import Signal, signals_of
 from nlsid_core.progress import Progress, part, silent
-from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import Monitor
 
 USES: Final = ("test", "validation", "calibration")  # that the split names bags for
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
@@ -53,10 +52,20 @@ class Trials:
     filled: int = 0
 
     @property
+    def by_use(self) -> dict[str, Dataset]:
+        """Those there are, by what they are for."""
+        parts = {
+            "training": self.train,
+            "validation": self.validation,
+            "calibration": self.calibration,
+            "test": self.test,
+        }
+        return {use: data for use, data in parts.items() if data is not None}
+
+    @property
     def every(self) -> Dataset:
         """All of them, by name."""
-        parts = (self.train, self.test, self.validation, self.calibration)
-        trials = (trial for part in parts if part is not None for trial in part)
+        trials = (trial for part in self.by_use.values() for trial in part)
         return Dataset(tuple(sorted(trials, key=lambda trial: trial.name)))
 
     @property
@@ -155,15 +164,7 @@ def write_identified(
     progress("drawing the report", 0.9)
     if report_available():
         written.append(out / documents.REPORT)
-        write_report(
-            written[-1],
-            fit,
-            trials.train,
-            trials.test,
-            validation=trials.validation,
-            calibration=trials.calibration,
-            robot=config.robot,
-        )
+        write_report(written[-1], fit, trials.by_use, robot=config.robot)
     progress("done", 1.0)
     return Identified(fit, trials, tuple(written))
 
@@ -176,16 +177,18 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
 
 def read_signals_of(
     bags: Sequence[Path],
-    config: Config,
+    config: Config | TrackingConfig,
     *,
     names: Sequence[str] | None = None,
     progress: Progress = silent,
 ) -> Dataset:
     """The configured signals of bags on the configured grid, with the configured names and units.
 
+    Of a measured state the states are the responses.
+
     names: what the trials are called (None: as their bags are).
     """
-    responses, excitations = config.signals.response, config.signals.excitation
+    responses, excitations = config.signals.roles
     dataset = read_dataset(
         bags,
         responses=[signal.path for signal in responses],
@@ -397,8 +400,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTu
             "the configuration has no section 'funnel'; `funnel: {}` is one, for a tube around the "
             "model's simulation, and with a profile it plans a motion and its policy"
         )
-    load = documents.load_stable_model if options.profile is None else documents.load_model
-    model: StableModel = load(model_path)
+    model = documents.load_model(model_path)
     trials, _ = _trials_beside(model_path, config, model)
     weights = options.policy
     found = design(
@@ -435,13 +437,10 @@ def what_a_funnel_catches(
         return None
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
     return what_it_catches(
-        Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
-        model,
-        design.funnel.half_widths.tolist(),
+        design,
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        factor=design.funnel.tubes[0].safety_factor,
         remedy="another funnel.reaction_time, or a model that leaves less in its residual",
     )
 

@@ -3,6 +3,7 @@
 A command imports what it runs when it is called.
 """
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,9 +17,9 @@ from bags.commands.options import (
     Clock,
     ClockOption,
     DefinitionsOption,
-    ExcitationOption,
     JsonOption,
-    ResponseOption,
+    Signals,
+    flat,
 )
 from bags.commands.progress import progress_bar
 from nlsid_core.errors import BagError, DataError
@@ -66,9 +67,23 @@ SignalsOption = Annotated[
         help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
-UnfinishedOption = Annotated[
-    bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
-]
+
+
+@dataclass(frozen=True)
+class Source:
+    """How a recording is read."""
+
+    definitions: DefinitionsOption = None
+    unfinished: Annotated[
+        bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
+    ] = False
+
+
+@dataclass(frozen=True)
+class Timed(Source):
+    """The same, by which stamps."""
+
+    clock: ClockOption = Clock.HEADER
 
 
 @bag_app.command()
@@ -113,13 +128,12 @@ def signals(
 
 
 @bag_app.command()
+@flat
 def plot(
     bag: BagArgument,
+    source: Timed,
     signals: SignalsOption = None,
     picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")] = PICTURE,
-    clock: ClockOption = Clock.HEADER,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
@@ -129,14 +143,14 @@ def plot(
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
-    drawn = signals or [signal for part in _likeliest([bag], definitions) for signal in part]
+    drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
     with progress_bar("reading", after=PROGRESS_AFTER) as progress:
         samples = read_signals(
             bag,
             drawn,
-            clock=_clock(clock),
-            unfinished=unfinished,
-            definitions=_definitions(definitions),
+            clock=_clock(source.clock),
+            unfinished=source.unfinished,
+            definitions=_definitions(source.definitions),
             progress=progress,
         )
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
@@ -144,10 +158,10 @@ def plot(
 
 
 @bag_app.command()
+@flat
 def check(
     bags: BagsArgument,
-    responses: ResponseOption = None,
-    excitations: ExcitationOption = None,
+    signals: Signals,
     clock: ClockOption = Clock.HEADER,
     definitions: DefinitionsOption = None,
     as_json: JsonOption = False,
@@ -161,8 +175,8 @@ def check(
     from bags.tools.fitness import Level, check_fitness
 
     folders = expand_bags(bags)
-    y, u = _likeliest(folders, definitions, responses or (), excitations or ())
-    if not (responses and excitations) and not as_json:
+    y, u = _likeliest(folders, definitions, signals.response or (), signals.excitation or ())
+    if not (signals.response and signals.excitation) and not as_json:
         out.print(f"of {', '.join(y)} under {', '.join(u)}", soft_wrap=True, markup=False)
     results = check_fitness(
         folders,
@@ -210,29 +224,35 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
         raise typer.Exit(1)
 
 
+@dataclass(frozen=True)
+class CommonGrid:
+    """One table for all signals."""
+
+    period: Annotated[
+        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
+    ] = None
+    hold: Annotated[
+        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
+    ] = None
+    method: Annotated[Resampling, typer.Option(help="Of the other signals, on the grid.")] = (
+        Resampling.LINEAR
+    )
+    max_gap: Annotated[
+        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
+    ] = None
+
+
 @bag_app.command("export")
+@flat
 def export_command(
     bag: BagArgument,
+    grid: CommonGrid,
+    source: Timed,
     target: OutOption = None,
     form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
     signals: Annotated[
         list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
     ] = None,
-    period: Annotated[
-        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
-    ] = None,
-    hold: Annotated[
-        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
-    ] = None,
-    method: Annotated[
-        Resampling, typer.Option(help="Of the other signals, on the grid.")
-    ] = Resampling.LINEAR,
-    max_gap: Annotated[
-        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
-    ] = None,
-    clock: ClockOption = Clock.HEADER,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
 ) -> None:
     """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid.
 
@@ -240,17 +260,17 @@ def export_command(
     """
     from bags.tools import export
 
-    named = Path(f"{bag.stem}.{form.value}") if period is not None else _beside(bag, "tables")
+    named = Path(f"{bag.stem}.{form.value}") if grid.period is not None else _beside(bag, "tables")
     target = target or named
-    if period is None:
+    if grid.period is None:
         with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
             rows = export.export_topics(
                 bag,
                 target,
                 form=form.value,
                 signals=signals,
-                unfinished=unfinished,
-                definitions=_definitions(definitions),
+                unfinished=source.unfinished,
+                definitions=_definitions(source.definitions),
                 progress=progress,
             )
         for file, count in rows.counts.items():
@@ -266,34 +286,48 @@ def export_command(
         target,
         form=form.value,
         signals=signals,
-        period=period,
-        method=method.value,
-        hold=hold or (),
-        max_gap=1.5 * period if max_gap is None else max_gap,
-        clock=clock.value,
-        unfinished=unfinished,
-        definitions=_definitions(definitions),
+        period=grid.period,
+        method=grid.method.value,
+        hold=grid.hold or (),
+        max_gap=1.5 * grid.period if grid.max_gap is None else grid.max_gap,
+        clock=source.clock.value,
+        unfinished=source.unfinished,
+        definitions=_definitions(source.definitions),
     )
     for name, error in errors.items():
         out.print(f"{name}: off by at most {error:.2g}", soft_wrap=True, markup=False)
     out.print(f"wrote {target}", soft_wrap=True, markup=False)
 
 
-@bag_app.command()
-def convert(
-    bags: BagsArgument,
-    bag_out: OutOption = None,
-    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0,
-    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None,
-    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None,
+@dataclass(frozen=True)
+class Stretch:
+    """Which part of a bag is copied."""
+
+    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0
+    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None
+    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Into what a bag is cut."""
+
     every: Annotated[
         float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
-    ] = None,
+    ] = None
     repeats: Annotated[
         str | None, typer.Option(help="A signal whose repetitions become the parts.")
-    ] = None,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
+    ] = None
+
+
+@bag_app.command()
+@flat
+def convert(
+    bags: BagsArgument,
+    stretch: Stretch,
+    parts: Parts,
+    source: Source,
+    bag_out: OutOption = None,
 ) -> None:
     """Copy bags into a new MCAP bag: a stretch of time, some topics, several as one, or in parts.
 
@@ -305,8 +339,7 @@ def convert(
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    is_part = bool(start or end is not None or topics)
-    is_split = every is not None or repeats is not None
+    is_part, is_split = stretch != Stretch(), parts != Parts()
     if is_part + is_split + (len(folders) > 1) > 1:
         raise DataError(
             "one at a time: merge several bags, or take a stretch of one (--start, --end, "
@@ -314,18 +347,20 @@ def convert(
         )
     with progress_bar("copying", after=PROGRESS_AFTER) as progress:
         if is_split:
-            copied = edit.split(folders[0], target, repeats=repeats, every=every, progress=progress)
+            copied = edit.split(
+                folders[0], target, repeats=parts.repeats, every=parts.every, progress=progress
+            )
         elif len(folders) > 1:
             copied = edit.merge(folders, target, progress=progress)
         else:
             copied = edit.cut(
                 folders[0],
                 target,
-                start=start,
-                end=end,
-                topics=topics or None,
-                unfinished=unfinished,
-                definitions=_definitions(definitions),
+                start=stretch.start,
+                end=stretch.end,
+                topics=stretch.topics or None,
+                unfinished=source.unfinished,
+                definitions=_definitions(source.definitions),
                 progress=progress,
             )
     for part in copied.parts:
@@ -335,9 +370,25 @@ def convert(
     _say_notes(copied.notes)
 
 
+@dataclass(frozen=True)
+class Rows:
+    """When the rows of tables were."""
+
+    period: Annotated[float | None, typer.Option(help="s between rows.")] = None
+    time_column: Annotated[
+        str | None, typer.Option("--time", help="The column with the rows' times in s.")
+    ] = None
+    drop_repeats: Annotated[
+        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
+    ] = False
+    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0
+
+
 @bag_app.command("import")
+@flat
 def import_command(
     tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
+    rows: Rows,
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
@@ -352,14 +403,6 @@ def import_command(
         list[str] | None,
         typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState"),
     ] = None,
-    period: Annotated[float | None, typer.Option(help="s between rows.")] = None,
-    time_column: Annotated[
-        str | None, typer.Option("--time", help="The column with the rows' times in s.")
-    ] = None,
-    drop_repeats: Annotated[
-        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
-    ] = False,
-    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0,
     custom: Annotated[
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
@@ -369,18 +412,19 @@ def import_command(
 
     kinds = _pairs(types or (), "--type")
     bag_out = bag_out or Path(tables[0].stem)
+    time_column = rows.time_column
     if not assignments:
-        time_column, assignments, numbers = every_column(tables, time_column, period)
+        time_column, assignments, numbers = every_column(tables, time_column, rows.period)
         kinds = numbers | kinds
     counts = import_tables(
         tables,
         bag_out,
         assignments,
         types=kinds,
-        period=period,
+        period=rows.period,
         time=time_column,
-        drop_repeats=drop_repeats,
-        start_ns=round(start * 1e9),
+        drop_repeats=rows.drop_repeats,
+        start_ns=round(rows.start * 1e9),
         custom=_pairs(custom or (), "--custom"),
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())

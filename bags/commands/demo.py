@@ -18,12 +18,14 @@ from bags import samples
 from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
+from bags.chain.simulation import simulate_excitations, simulate_runs
 from bags.chain.steps import design_funnel_files, identify_bags, what_a_funnel_catches
-from bags.commands import show
+from bags.chain.tracking_config import is_tracking, load_tracking_config
+from bags.commands import show, states
 from bags.commands.options import CONFIG
 from bags.commands.progress import progress_bar
 from bags.designs import documents
-from bags.monitoring.replay import Replay, replay_bag
+from bags.monitoring.replay import Replay
 from bags.pictures.report import report_available, write_catching, write_margins
 from nlsid_core.errors import DataError
 from nlsid_core.proofs import check
@@ -31,6 +33,7 @@ from nlsid_core.running.reading import Status
 
 LIVE_MODULE = "nlsid_ros.demo.live"  # started as a process: bags knows nothing of ROS
 OTHERS_PLOT = "others.png"
+EXCITATIONS, RUNS = "excitations", "runs"  # folders of bags of simulated robots
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,13 @@ DEMOS: Final = {
 
 
 def run_demo(out: Path, console: Console, robot: str) -> bool:
-    """Run every step into `out`, saying what happens; True if all came out as it should."""
+    """Run every step into `out`, saying what happens; True if all came out as it should.
+
+    robot: one of DEMOS, or a simulated one, by the name of a shipped configuration or by its file.
+    """
     if robot not in DEMOS:
-        raise DataError(f"no demo of '{robot}'; there are: {', '.join(DEMOS)}")
+        config = Path(robot) if robot.endswith(".yaml") else config_file(f"{robot}.yaml")
+        return _simulated(config, out, console)
     started = time.perf_counter()
     demo = _Demo(out, console, DEMOS[robot]())
     demo.identify()
@@ -78,6 +85,25 @@ def run_demo(out: Path, console: Console, robot: str) -> bool:
     demo.where_to_look()
     console.print(f"{time.perf_counter() - started:.0f} s in all")
     return monitored and live
+
+
+def _simulated(config: Path, out: Path, console: Console) -> bool:
+    """All steps on a simulated robot; whether its runs are inside."""
+    if not is_tracking(config):
+        raise DataError(f"{config}: no motion and no simulation; demos are of simulated robots")
+    settings = load_tracking_config(config)
+    excited = simulate_excitations(settings, out / EXCITATIONS)
+    console.print(f"wrote {len(excited)} bags of excitations in {out / EXCITATIONS}")
+    states.identify(excited, settings, out)
+    runs = simulate_runs(out, settings, out / RUNS)
+    console.print(f"wrote {len(runs)} bags of runs in {out / RUNS}")
+    design = states.funnel(runs, settings, out)
+    console.print(str(check(out / documents.FUNNEL_PROOF)), soft_wrap=True)
+    replays = show.replayed(design, runs, None)
+    show.say_replays(console, replays)
+    inside = sum(replay.verdict == Status.INSIDE.value for replay in replays)
+    console.print(f"{inside} of {len(runs)} bags are inside from first to last sample")
+    return inside == len(runs)
 
 
 class _Demo:
@@ -109,7 +135,7 @@ class _Demo:
             catching = what_a_funnel_catches(model, self.config, design)
         self.console.print(show.funnel_table(design))
         if catching is not None:
-            show.say_catching(self.console, catching, None)
+            show.say_catching(self.console, catching)
             write_catching(self.out, catching)
 
     def check(self) -> None:
@@ -122,10 +148,9 @@ class _Demo:
         self._heading("4  hold unseen recordings against the tube")
         test = [bag for bag in self.bags if bag.name in self.config.split.test]
         self._command(f"monitor {self.out} BAG... ({len(test)} trials)")
-        with progress_bar("replaying"):
-            replays = self._replay(test)
-            if report_available():
-                write_margins(self.out / documents.MARGIN_PLOT, replays)
+        replays = self._replay(test)
+        if report_available():
+            write_margins(self.out / documents.MARGIN_PLOT, replays)
         self.console.print(show.replay_table(replays))
         inside = sum(r.verdict == Status.INSIDE.value for r in replays)
         self._say(f"{inside} of {len(replays)} test trials inside")
@@ -134,16 +159,14 @@ class _Demo:
 
     def _sabotaged(self, test: Sequence[Path]) -> bool:
         """Copies of the test trials with a broken sensor; whether each is caught."""
-        sabotaged: list[Replay] = []
-        with progress_bar("replaying") as progress, tempfile.TemporaryDirectory() as folder:
-            pairs = [(bag, fault) for bag in test for fault in FAULTS]
-            for done, (bag, fault) in enumerate(pairs):
-                copy = Path(folder) / f"{bag.name}, {fault}"
-                progress(f"sabotaging {copy.name}", done / len(pairs))
-                write_faulty_copy(bag, copy, self.config.signals.response[0].path, FAULTS[fault])
-                sabotaged += self._replay([copy])
-            if report_available():
-                write_margins(self.out / OTHERS_PLOT, sabotaged)
+        signal = self.config.signals.response[0].path
+        with tempfile.TemporaryDirectory() as folder:
+            copies = {Path(folder) / f"{b.name}, {f}": (b, f) for b in test for f in FAULTS}
+            for copy, (bag, fault) in copies.items():
+                write_faulty_copy(bag, copy, signal, FAULTS[fault])
+            sabotaged = self._replay(list(copies))
+        if report_available():
+            write_margins(self.out / OTHERS_PLOT, sabotaged)
         self.console.print(show.caught_table(sabotaged))
         caught = sum(r.first_bad is not None for r in sabotaged)
         self._say(f"{caught} of {len(sabotaged)} sabotaged trials caught")
@@ -197,9 +220,7 @@ class _Demo:
         self._say(f"          {self.out / documents.FUNNEL_PROOF}")
 
     def _replay(self, bags: Sequence[Path]) -> list[Replay]:
-        proved = documents.load_proved(self.out / documents.FUNNEL)
-        centre = self.config.monitor.nominal_source
-        return [replay_bag(proved, bag, centre=centre) for bag in bags]
+        return show.replayed(documents.load(self.out), bags, self.config)
 
     def _heading(self, text: str) -> None:
         self.console.print()

@@ -28,7 +28,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from bags.chain.faults import FAULTS, write_faulty_copy
-from bags.designs.documents import load_proved
+from bags.designs.documents import load
+from bags.designs.wiring import sampler_of
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
@@ -125,8 +126,8 @@ class Observer(Node):
 
 def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
-    proved = load_proved(funnel)
-    signals = proved.design.sampler()
+    proved = load(funnel)
+    signals = sampler_of(proved)
     with Bag(bag) as source:
         topics = {topic: source.types_on(topic)[0] for topic in signals.topics}
     faulty = out / f"{bag.name}, {FAULT}"

@@ -122,7 +122,7 @@ def live_and_replayed(
     funnel: Path, bag: Path, loop: Loop
 ) -> tuple[list[tuple[float, ...]], list[tuple[float, ...]]]:
     """The numbers (margin, ...) of every judged sample, heard live and replayed."""
-    replay = replay_bag(documents.load_proved_funnel(funnel), bag, centre=Centre.PROFILE)
+    replay = replay_bag(documents.load(funnel), bag, centre=Centre.PROFILE)
     judged = {
         stamp_ns: tuple(reading.numbers.values())
         for stamp_ns, reading in zip(replay.stamps_ns, replay.readings, strict=True)

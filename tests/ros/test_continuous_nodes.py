@@ -13,8 +13,8 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 
-from bags.designs.design import Wiring
-from bags.designs.documents import load_proved
+from bags.designs.documents import load
+from bags.designs.wiring import wiring_of
 from nlsid_core.designs import COMPOSITION, FUNNEL
 from nlsid_core.running.comparison import Centre
 from nlsid_ros import qos
@@ -90,8 +90,8 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
         spin_until(lambda: has_said("tracking_controller", "idle; stopped: the proof is over"))
         judged = [first_ns + (k + 1) * PERIOD_NS for k in range(samples)]
         spin_until(lambda: set(judged) <= margins.keys())
-    wiring = Wiring.parse([RESPONSE], [COMMAND], 0.05)
-    monitor = load_proved(path, wiring=wiring).design.monitor(Centre.PROFILE)
+    wiring = wiring_of([RESPONSE], [COMMAND], 0.05)
+    monitor = load(path, wiring=wiring).monitor(Centre.PROFILE)
     readings = [
         monitor.update(k * PERIOD_NS / 1e9, np.array([x]), np.array([u]))
         for k, (x, u) in enumerate(run)

@@ -169,9 +169,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    replayed = replay_bag(
-        documents.load_proved(out / documents.FUNNEL), trial, centre=Centre.COMMAND
-    )
+    replayed = replay_bag(documents.load(out / documents.FUNNEL), trial, centre=Centre.COMMAND)
     assert replayed.verdict == "inside"
     expected = [
         (stamp, reading.margin)
