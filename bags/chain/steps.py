@@ -312,8 +312,8 @@ def check_split(names: Sequence[str], config: Config) -> None:
     if split.share is None:
         named = {"test": split.test, **named}
     possible = with_parts(names, config)
-    _held_out(possible, named)
     refuse_absent(possible, config)
+    _held_out(possible, named)
 
 
 def absent_from(names: Sequence[str], config: Config) -> list[str]:
@@ -323,7 +323,8 @@ def absent_from(names: Sequence[str], config: Config) -> list[str]:
         absent = [name for name in getattr(config.split, use) if not _of_bags(names, [name])]
         if absent:
             near = did_you_mean(absent[0], names)
-            reasons.append(f"split.{use} names {listed(absent)}, and no bag is called so{near}")
+            there = listed(names)
+            reasons.append(f"split.{use} names {listed(absent)}; the bags are {there}{near}")
     return reasons
 
 
@@ -333,7 +334,7 @@ def refuse_absent(names: Sequence[str], config: Config) -> None:
     Its trial would be trained on without a word.
     """
     if absent := absent_from(names, config):
-        raise DataError(f"{absent[0]}; the bags are {listed(names)}")
+        raise DataError(absent[0])
 
 
 def with_parts(names: Sequence[str], config: Config) -> list[str]:

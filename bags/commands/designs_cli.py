@@ -273,7 +273,8 @@ def export(
     """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
 
     Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
-    of Autoware's validators for speeds and distances, and a table of all signals.
+    of Autoware's validators for speeds and distances, and a table of all signals. The tube has to
+    be as wide always: `funnel: {level: constant}` in the configuration.
     """
     from bags.designs import tolerances as proved
 

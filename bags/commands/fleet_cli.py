@@ -29,7 +29,7 @@ from bags.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from bags.fleet.check import Checked
     from bags.fleet.monitor import FleetVerdict, Judged
@@ -80,6 +80,7 @@ def check(
 
     settings = load_config(config_of(folder, config))
     named = named_bags(bags, patience=fleet.patience)
+    _say_misspelt(named, settings)
     with progress_bar("checking") as progress:
         found = check_fleet(
             named, settings, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
@@ -104,6 +105,15 @@ def check(
         out.print(f"wrote {table}", soft_wrap=True)
     if counts[BAD] or counts[UNREAD]:
         raise typer.Exit(1 if counts[BAD] else 2)
+
+
+def _say_misspelt(names: Iterable[str], settings: Config) -> None:
+    """Mind names in the split that are near a bag's: others may be of bags that lie elsewhere."""
+    from bags.chain.steps import absent_from, with_parts
+
+    for line in absent_from(with_parts(list(names), settings), settings):
+        if line.endswith("?"):  # it asks whether another was meant
+            out.print(f"mind: {line}", soft_wrap=True, markup=False, style="dark_orange3")
 
 
 def _checked_table(rows: Sequence[Checked]) -> Table:
@@ -152,6 +162,8 @@ def monitor(
     definitions = read_definitions(settings.definitions if settings else ())
     task = JudgeBag(design, show.centre_of(settings), definitions)
     named = named_bags(bags, patience=fleet.patience)
+    if settings is not None:
+        _say_misspelt(named, settings)
     with progress_bar("judging") as progress:
         found = monitor_fleet(
             named,

@@ -400,7 +400,8 @@ def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
 def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample.
 
-    COLUMNS wide or less: where a row is longer, its words go on in the next line, numbers never.
+    COLUMNS wide or less: where a row is longer it goes on in the next line between words; numbers
+    never do.
     """
     table = Table(
         title="held against the funnel",
@@ -418,7 +419,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     widths = [max(len(Text.from_markup(cell)) for cell in column) for column in cells]
     kept = dict(zip(names, widths, strict=True))
     if sum(widths) + len(widths) > COLUMNS:
-        kept |= {"verdict": 10, "axis": min(kept["axis"], 10), "judged": 8}
+        words = [word for row in rows for word in row[names.index("axis")].split()]
+        kept |= {"verdict": 10, "axis": max(4, *map(len, words)), "judged": 8}
         kept["bag"] = max(COLUMNS + kept["bag"] - sum(kept.values()) - len(kept), 8)
     for name in names:
         left = name in ("bag", "verdict", "axis")

@@ -72,6 +72,9 @@ def read_paces(
             gaps_in=y_paths,
             definitions=types,
         )
+        for name in read:
+            if doubt := read[name].doubt(responds=name in y_paths):
+                raise BagError(f"{path.name}: {doubt}; record it again with one of them")
         for name in y_paths:
             diffs = np.diff(read[name].stamp_ns) / 1e9
             repeated += int((diffs <= 0).sum())

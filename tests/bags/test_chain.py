@@ -582,9 +582,13 @@ def test_a_configuration_that_is_no_mapping_is_refused(tmp_path: Path, text: str
     ("bags", "changes", "reason"),
     [
         (["nowhere"], {}, "there is no bag"),
-        (["01", "02"], {}, "none of the bags is a test trial"),
+        (["01", "02"], {}, "split.test names trial_05; the bags are trial_01, trial_02; did you "),
         (["05"], {}, "all of the bags are test trials"),
-        (["01", "05", "06"], {"split__test": ["trial_05", "trial_6"]}, "no bag is called so"),
+        (
+            ["01", "05", "06"],
+            {"split__test": ["trial_05", "trial_6"]},
+            r"split.test names trial_6; the bags are .*; did you mean 'trial_06'\?$",
+        ),
         (["01", "05"], {"grid__period": 0.05}, "period"),
         (["06", "07", "05"], {}, "constant"),
         (["01", "02", "05"], {"identification__lags": 40}, "equations for 82 parameters"),
