@@ -31,6 +31,7 @@ from bags.commands.options import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from bags.chain.config import Config
     from bags.fleet.check import Checked
     from bags.fleet.monitor import FleetVerdict, Judged
     from bags.fleet.trials import FleetTrials
