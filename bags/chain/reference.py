@@ -209,7 +209,5 @@ def _type(annotation: Any) -> str:
     return text.replace("typing.", "")
 
 
-
-
 if __name__ == "__main__":
     print(page(), end="")

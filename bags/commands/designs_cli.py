@@ -88,7 +88,7 @@ def funnel(
 
     path = config_of(folder, config)
     if not is_tracking(path):
-        _tube(folder, load_config(path))
+        tube(folder, load_config(path))
         return
     if not bags:
         raise typer.BadParameter("give the bags on which the disturbance is measured")
@@ -104,8 +104,8 @@ def _proof_in(path: Path) -> Path:
     return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
-def _tube(folder: Path, settings: Config) -> None:
-    """A tube around the model in a folder, and what it catches."""
+def tube(folder: Path, settings: Config) -> None:
+    """Design a tube around the model in a folder, and what it catches."""
     from bags.chain.steps import (
         design_funnel_files,
         what_a_funnel_catches,

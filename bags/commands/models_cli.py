@@ -29,6 +29,8 @@ from bags.commands.progress import progress_bar
 from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from bags.chain.config import Config
 
 
@@ -126,10 +128,11 @@ def identify(
     elif reading.count or reading.scheduler or reading.strict or any(map(is_url, bags)):
         _by_workers(bags, load_config(path), folder, reading, select=instead.select)
     else:
-        _identify(expand_bags(bags), load_config(path), folder, select=instead.select)
+        identify_here(expand_bags(bags), load_config(path), folder, select=instead.select)
 
 
-def _identify(bags: list[Path], settings: Config, folder: Path, *, select: bool) -> None:
+def identify_here(bags: Sequence[Path], settings: Config, folder: Path, *, select: bool) -> None:
+    """Read and identify in this process, and say what was found."""
     from bags.chain.choosing import select_bags
     from bags.chain.steps import identify_bags
     from bags.commands import show

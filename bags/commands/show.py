@@ -455,25 +455,6 @@ def _percent(part: float) -> str:
     return f"{100 * part:.0f} %" if part < MOST_SAID else f"> {100 * MOST_SAID:.0f} %"
 
 
-def caught_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag that should be caught: verdict, first bad sample, assumption used."""
-    table = Table(title="the same trials with a broken sensor", title_justify="left")
-    table.add_column("bag", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    table.add_column("bad from", justify="right", no_wrap=True)
-    table.add_column("assumption", justify="right", no_wrap=True)
-    for replay in replays:
-        bad = replay.first_bad
-        colour = COLOURS[replay.verdict]
-        table.add_row(
-            replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]",
-            "-" if bad is None else f"{bad.t:.3f} s",
-            _percent(replay.assumption),
-        )
-    return table
-
-
 def centre_of(settings: Config | None) -> Centre:
     """What a tube is configured to be around; without a configuration the received commands."""
     return Centre.COMMAND if settings is None else settings.monitor.nominal_source

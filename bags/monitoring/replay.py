@@ -77,13 +77,34 @@ def _joined(row: Sequence[Stretch]) -> Stretch:
     )
 
 
+class Clock:
+    """The stamps of a bag's messages, topic by topic, and where they go back."""
+
+    def __init__(self) -> None:
+        self.start_ns = 0
+        self._last: dict[str, int] = {}
+        self._back: dict[str, list[int]] = {}  # ns, of each place
+
+    def add(self, topic: str, stamp_ns: int) -> None:
+        last = self._last.get(topic, stamp_ns)
+        self._last[topic] = stamp_ns
+        if stamp_ns < last:
+            self._back.setdefault(topic, []).append(last - stamp_ns)
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"stamps of {topic} go back in {len(steps)} "
+            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
+            for topic, steps in self._back.items()
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Replay:
     """One bag's readings, and what a summary says of them.
 
     axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
-    start_ns: the bag's first log time. clock: what is wrong with the stamps, in words; empty if
-    nothing.
+    noted: the stamps of the bag's messages.
     """
 
     name: str
@@ -93,8 +114,17 @@ class Replay:
     unit: str
     half_width: float
     period: float = 0.0
-    start_ns: int = 0
-    clock: str = ""
+    noted: Clock | None = None
+
+    @property
+    def start_ns(self) -> int:
+        """The bag's first log time; 0 if it is not known."""
+        return self.noted.start_ns if self.noted else 0
+
+    @property
+    def clock(self) -> str:
+        """What is wrong with the stamps, in words; empty if nothing."""
+        return str(self.noted or "")
 
     @property
     def span(self) -> float:
@@ -312,7 +342,7 @@ def replay_bag(
     definitions: of message types that the bag does not define. Raises BagError as
     `replay_messages`.
     """
-    clock = _Clock()
+    clock = Clock()
     stamped = _replayed(design, bag, centre, definitions, clock)
     unit, half_width = "", 0.0
     if isinstance(design.funnel, TubeFunnel) and len(design.signals[0]) == 1:
@@ -325,8 +355,7 @@ def replay_bag(
         unit=unit,
         half_width=half_width,
         period=design.period,
-        start_ns=clock.start_ns,
-        clock=str(clock),
+        noted=clock,
     )
 
 
@@ -344,7 +373,7 @@ def replay_messages(
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
     """
-    return _replayed(design, bag, centre, definitions, _Clock())
+    return _replayed(design, bag, centre, definitions, Clock())
 
 
 def _replayed(
@@ -352,7 +381,7 @@ def _replayed(
     bag: Path | str,
     centre: Centre,
     definitions: Definitions | None,
-    clock: "_Clock",
+    clock: Clock,
 ) -> list[Stamped]:
     """The readings."""
     bag = place(bag)
@@ -381,33 +410,11 @@ def announced_runs(
     return [run for run in found if run.funnel == digest and not run.ended]
 
 
-class _Clock:
-    """The stamps of a bag's messages, topic by topic, and where they go back."""
-
-    def __init__(self) -> None:
-        self.start_ns = 0
-        self._last: dict[str, int] = {}
-        self._back: dict[str, list[int]] = {}  # ns, of each place
-
-    def add(self, topic: str, stamp_ns: int) -> None:
-        last = self._last.get(topic, stamp_ns)
-        self._last[topic] = stamp_ns
-        if stamp_ns < last:
-            self._back.setdefault(topic, []).append(last - stamp_ns)
-
-    def __str__(self) -> str:
-        return "; ".join(
-            f"stamps of {topic} go back in {len(steps)} "
-            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
-            for topic, steps in self._back.items()
-        )
-
-
 def _fed(
     watch: Watch,
     bag: Path,
     definitions: Definitions | None,
-    clock: _Clock,
+    clock: Clock,
     *,
     announced: bool,
 ) -> Iterator[list[Stamped]]:

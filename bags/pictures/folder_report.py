@@ -21,6 +21,7 @@ from bags.pictures.equations_report import equations_chapter
 from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, drawable, report_available
 from bags.tools.info import GAP, BagInfo, TopicInfo
 from nlsid_core import files, proofs
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DocumentError, NlsidError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
@@ -83,13 +84,14 @@ def folder_page(folder: Path, held: Held) -> str:
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     if not proofs and not model:
         raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
-    funnel = "" if REJECTED in decided else equations_chapter(folder)
+    design = None if REJECTED in decided else _design(folder)
+    funnel = "" if design is None else equations_chapter(design)
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     chapters = {
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
         "funnel": ("The funnel of these equations", funnel),
-        "pictures": ("Pictures", _pictures(folder, without=in_model)),
+        "pictures": ("Pictures", _pictures(folder, design, without=in_model)),
         "replays": ("Recordings held against the funnel", _replays(held)),
         "recordings": ("Recordings and their losses", _recordings(held.recordings)),
         "files": ("Files", _files(folder, proofs)),
@@ -153,7 +155,7 @@ def _model_chapter(report: Path) -> str:
     return f'<p class="note">As it was written when model and funnel were made.</p>{chapter}'
 
 
-def _pictures(folder: Path, *, without: set[str]) -> str:
+def _pictures(folder: Path, design: AnyDesign | None, *, without: set[str]) -> str:
     figures = []
     for name, caption in PICTURES.items():
         path = folder / name
@@ -166,23 +168,27 @@ def _pictures(folder: Path, *, without: set[str]) -> str:
                 f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    if not (folder / documents.FUNNEL_PLOT).is_file() and (drawn := _drawn_funnel(folder)):
+    if not (folder / documents.FUNNEL_PLOT).is_file() and (drawn := _drawn(design)):
         figures.append(f"<figure>{drawn}<figcaption>{FUNNEL_CAPTION}</figcaption></figure>")
     return "".join(figures)
 
 
-def _drawn_funnel(folder: Path) -> str:
-    """A proved funnel around a motion, from its files, as <svg>; empty where there is none."""
-    path = documents.funnel_of(folder)
-    if not path.is_file() or not report_available():
-        return ""
+def _design(folder: Path) -> AnyDesign | None:
+    """The design of a folder; None where there is none that is proved."""
     try:
-        design = documents.load(path)
+        return documents.load(folder)
     except (NlsidError, OSError):
-        return ""  # the chapter on the proofs says why
-    if isinstance(design.funnel, TubeFunnel):
-        return ""  # as wide always, or as the commands move it: `catching.png` has it
-    from bags.pictures import plots, tubes
+        return None  # the chapter on the proofs says why
+
+
+def _drawn(design: AnyDesign | None) -> str:
+    """The tube around a motion as <svg>; empty where there is none.
+
+    One around a simulation is as wide always, or as the commands move it: `catching.png` has it.
+    """
+    if design is None or isinstance(design.funnel, TubeFunnel) or not report_available():
+        return ""
+    from bags.pictures import plots, tubes  # matplotlib only where something is drawn
 
     return plots.svg(tubes.draw_tube(design))
 

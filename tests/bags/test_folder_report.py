@@ -154,7 +154,7 @@ def test_a_funnel_of_equations_shows_picture_widths_equations_and_limits(tmp_pat
     for file in (CORPUS / "continuous_funnel" / "held").iterdir():
         name = designs.PROOF if file.name == "claim.proof.json" else file.name
         shutil.copy(file, tmp_path / name)
-    design = designs.load(tmp_path)
+    design = documents.load(tmp_path)
     page = Page(folder_page(tmp_path, Held()))
     assert page.tags.count("svg") == 1
     shown = [float(number) for number in re.findall(r"± ([\d.e-]+)", page.text)]
