@@ -111,8 +111,7 @@ class Design(Generic[D, P, F, S]):
 
     def decided(self) -> Verdict:
         """What the kernel says of it as it stands; CertificateRejected with the reason."""
-        documents = self.documents()
-        return proofs.decide(documents[PROOF], documents)
+        return proofs.decide(self.certificate, self.documents())
 
     def documents(self) -> dict[str, Json]:
         """The content of its files by name, the proof last."""
