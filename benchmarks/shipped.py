@@ -44,8 +44,9 @@ def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
 def _tracked_pendulum(out: Path) -> Path:
     """The sampled funnel of config/pendulum.yaml, from bags of the robot in MuJoCo."""
     config = load_tracking_config(config_file("pendulum.yaml"))
-    bags = simulate_excitations(config, out / "excitations")
-    fit = tracking_steps.identify_state_bags(bags, config, out)
+    fit = tracking_steps.identify_state_bags(
+        simulate_excitations(config, out / "excitations"), config, out
+    )
     tracking_steps.plan_tracking(fit, config, out)
     runs = simulate_runs(out, config, out / "runs")
     tracking_steps.design_tracking_funnel(out, runs, config, progress=silent)

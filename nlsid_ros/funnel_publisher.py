@@ -135,8 +135,7 @@ class FunnelPublisher(ManagedNode):
         """What to publish, what it is, and what is proved of it."""
         try:
             bundle = Bundle.load(path)
-            verdict = bundle.decided()
-            return bundle, bundle.design(), str(verdict)
+            return bundle, bundle.design(), str(bundle.decided())
         except (NlsidError, OSError) as refusal:
             self._reject(refusal)
             raise

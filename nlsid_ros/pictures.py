@@ -13,7 +13,6 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.tube import TubeFunnel
-from nlsid_core.models import DifferenceEquation
 
 LIFETIME = 3  # s after the publisher last said so
 LINE = 0.005  # m, width of the lines
@@ -48,8 +47,6 @@ def plan_of(design: AnyDesign) -> Plan:
         return Plan(t, names, nominal, half_widths, inputs)
     if isinstance(design.funnel, TubeFunnel):
         model, policy = design.model, design.policy
-        assert isinstance(model, DifferenceEquation)
-        assert policy is not None
         nominal = policy.plan(model).y
         t = np.arange(len(nominal)) * policy.period
         width = np.full((len(t), 1), design.funnel.half_width)

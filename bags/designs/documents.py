@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Any, get_args
 
 from bags.designs.bundle import Bundle
-from nlsid_core import designs
+from nlsid_core import designs, files
 from nlsid_core.designs import AnyDesign, Design, Wiring
 from nlsid_core.documents import load as load_noun
 from nlsid_core.errors import DocumentError
-from nlsid_core.models import StableModel
+from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.running.monitor import refuse_mismatch
 
@@ -62,7 +62,12 @@ def load_unproved(folder: Path | str, *, wiring: Wiring | None = None) -> AnyDes
     return Design(model, policy, None, wiring=wiring)
 
 
-def load_model(path: Path | str) -> StableModel:
+def load_model(path: Path | str) -> DifferenceEquation:
+    """Read the model of one linear equation; DocumentError says what is wrong with the file."""
+    return DifferenceEquation.from_document(files.load_document(Path(path)), source=str(path))
+
+
+def load_stable_model(path: Path | str) -> StableModel:
     """Read a model of any class that tubes are proved for; DocumentError if the file has none."""
     model = load_noun(path)
     if not isinstance(model, get_args(StableModel)):

@@ -242,7 +242,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
-        show.say_catching(console, replace(found, rows=(*found.rows, refused)), None)
+        show.say_catching(console, replace(found, rows=(*found.rows, refused)))
     assert "refused was not tried: no such input" in said.get()
 
 
@@ -336,7 +336,7 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     for caught in (c for r in zero for c in (r.funnel, *r.others.values())):
         assert not caught.after < 0.0
     console = Console(record=True, width=100)
-    show.say_catching(console, found, None)
+    show.say_catching(console, found)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
 
