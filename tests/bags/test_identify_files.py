@@ -386,7 +386,7 @@ def test_a_split_that_no_bag_fits_is_refused_before_a_bag_is_read(tmp_path: Path
     config = load_config(write_config(tmp_path / "robot.yaml", {"model": "linear", "lags": 2}))
     names = config.split.model_copy(update={"test": ["another"]})
     given = config.model_copy(update={"split": names})
-    with pytest.raises(DataError, match="split.test names another; the bags are not_there"):
+    with pytest.raises(DataError, match=r"split\.test names another; the bags are not_there"):
         read_trials([tmp_path / "not_there"], given, progress=silent)
 
 
