@@ -16,6 +16,7 @@ import pytest
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.designs import documents
+from bags.designs.wiring import read_at
 from bags.monitoring.replay import replay_messages
 from bags.samples import f1tenth
 from bags.viewing import scene
@@ -339,7 +340,7 @@ def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_
     proved = documents.load(funnel)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     bad = tmp_path / "bad"
-    write_faulty_copy(trial, bad, str(proved.response), FAULTS["scaled by 0.6"])
+    write_faulty_copy(trial, bad, str(read_at(proved)), FAULTS["scaled by 0.6"])
     readings = replay_messages(proved, bad, centre=Centre.COMMAND)
     shown = Scene("a recording", "replay")
     Recording(proved, bad, centre=Centre.COMMAND).play(shown, 1e6, threading.Event())

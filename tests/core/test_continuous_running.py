@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.designs.wiring import wiring_of
+from bags.designs.wiring import read_at, wiring_of
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
 from nlsid_core import files
@@ -297,9 +297,9 @@ def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
 def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
     design = Design(*stage())
     with pytest.raises(DataError, match="names no signals"):
-        _ = design.response
+        read_at(design)
     wired = replace(design, wiring=wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD))
-    assert str(wired.response) == "/joints:position[0]"
+    assert str(read_at(wired)) == "/joints:position[0]"
     watch = Watch(wired, announced=True)
     said = watch.begin(0)
     for k in range(3):
@@ -314,7 +314,7 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
     """The state in one message, the input in another, on a clock of nanoseconds."""
     field, policy, funnel = stage()
     wiring = wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
-    design = Design(field, policy, funnel, wiring)
+    design = Design(field, policy, funnel, wiring=wiring)
     controller = design.controller(LIMITS, 1.0)
     x: FloatArray = np.array([0.1])
     samples: list[tuple[FloatArray, FloatArray]] = []
