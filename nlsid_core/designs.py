@@ -78,12 +78,7 @@ class Design(Generic[D, P, F, S]):
     ) -> "Design[D, P, F, S]":
         """A design whose proof the kernel has decided; CertificateRejected says why it has not."""
         documents = _documents(model, policy, funnel)
-        about = {
-            name.removesuffix(".json"): proofs.binding(name, document)
-            for name, document in documents.items()
-        }
-        whole = {"kind": claim["kind"], "about": about} | claim | {"about": about}
-        certificate = proofs.proof_document(whole, proof)
+        certificate = _certificate(claim, proof, documents)
         verdict = proofs.decide(certificate, documents)
         return cls(model, policy, funnel, certificate, verdict, found)
 
@@ -100,22 +95,22 @@ class Design(Generic[D, P, F, S]):
     @property
     def claim(self) -> Json:
         """What the proof states: its kind, the files that it is about, and its numbers."""
-        claim: Json = self.certificate.get("claim", {})
-        return claim
+        return dict(self.certificate.get("claim", {}))
 
     @property
     def proof(self) -> Json:
         """The witnesses."""
-        proof: Json = self.certificate["proof"]
-        return proof
+        return dict(self.certificate["proof"])
 
     def decided(self) -> Verdict:
         """What the kernel says of it as it stands; CertificateRejected with the reason."""
-        return proofs.decide(self.certificate, self.documents())
+        documents = self.documents()
+        return proofs.decide(documents[PROOF], documents)
 
     def documents(self) -> dict[str, Json]:
         """The content of its files by name, the proof last."""
-        return _documents(self.model, self.policy, self.funnel) | {PROOF: self.certificate}
+        documents = _documents(self.model, self.policy, self.funnel)
+        return documents | {PROOF: _certificate(self.claim, self.proof, documents)}
 
     def save(self, folder: Path | str) -> tuple[Path, ...]:
         """Write model (or vector field), policy, funnel and proof; the paths, the proof last.
@@ -144,8 +139,9 @@ class Design(Generic[D, P, F, S]):
         """The model's outputs or states, and its inputs; those of equations are by number."""
         model: Any = self.model
         if isinstance(model, VectorField):
-            x = tuple(Signal(f"x{i}") for i in range(model.n))
-            return x, tuple(Signal(f"u{j}") for j in range(model.m))
+            return tuple(Signal(f"x{i}") for i in range(model.n)), tuple(
+                Signal(f"u{j}") for j in range(model.m)
+            )
         measured = model.x if isinstance(model, StateModel | TrapezoidalModel) else model.y
         y, u = ((s,) if isinstance(s, Signal) else s for s in (measured, model.u))
         return y, u
@@ -247,6 +243,16 @@ class Design(Generic[D, P, F, S]):
 
 
 AnyDesign: TypeAlias = Design[Any, Any, Any, Any]
+
+
+def _certificate(claim: Json, proof: Json, documents: dict[str, Json]) -> Json:
+    """The proof's document, about these files."""
+    about = {
+        name.removesuffix(".json"): proofs.binding(name, document)
+        for name, document in documents.items()
+    }
+    stated = {"kind": claim["kind"], "about": about} | claim | {"about": about}
+    return proofs.proof_document(stated, proof)
 
 
 def _documents(model: Any, policy: Any, funnel: Any) -> dict[str, Json]:

@@ -95,7 +95,7 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         taken["more"] = 1
     else:
         raise ValueError(what)
-    return replace(design, proof=proof)
+    return replace(design, certificate=design.certificate | {"proof": proof})
 
 
 # What contradicts what was measured: true claims, under assumptions that nobody should make.

@@ -132,12 +132,12 @@ PatienceOption = Annotated[
 def flat(verb: Callable[..., None]) -> Callable[..., None]:
     """Make a command of a verb: each field of a dataclass that it takes is an option of its own."""
     hints = get_type_hints(verb, include_extras=True)
-    groups = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[Parameter] = []
     for given in signature(verb).parameters.values():
         kind = groups.get(given.name)
         types = hints if kind is None else get_type_hints(kind, include_extras=True)
-        inside = [given] if kind is None else signature(kind).parameters.values()  # type: ignore[arg-type]
+        inside = [given] if kind is None else signature(kind).parameters.values()
         parameters += [
             each.replace(annotation=types[each.name], kind=Parameter.KEYWORD_ONLY)
             for each in inside

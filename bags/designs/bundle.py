@@ -213,10 +213,10 @@ def _design(
         if role != PROOF
     }
     nouns: dict[str, Any] = {role: read(part, source=role) for role, part in parts.items()}
-    model = nouns.pop("vector_field", None) or nouns.pop("model", None)
+    model = nouns.pop("vector_field" if "vector_field" in nouns else "model", None)
     policy, funnel = nouns.pop("policy", None), nouns.pop("funnel", None)
     policies, models = KINDS.get(type(funnel), ((), ()))
-    if nouns or not isinstance(policy, policies) or not isinstance(model, models):
+    if nouns or type(policy) not in policies or type(model) not in models:
         raise DocumentError(f"{', '.join(parts)}: these files are no design of one funnel")
     refuse_mismatch(model, policy, funnel)
     design = Design(model, policy, funnel, proof, decision, None, wiring)

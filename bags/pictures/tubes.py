@@ -147,7 +147,11 @@ def _name(signal: Signal) -> str:
 def _legend(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     named = dict(zip(labels, handles, strict=True))
-    place = "outside lower left"
     figure.legend(
-        list(named.values()), list(named), loc=place, ncols=len(named), fontsize=8, frameon=False
+        list(named.values()),
+        list(named),
+        loc="outside lower left",
+        ncols=len(named),
+        fontsize=8,
+        frameon=False,
     )

@@ -21,7 +21,7 @@ from bags.signals.reader import read_signals
 from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
 from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.designs import Design
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Polynomial, identify
 from nlsid_core.running.comparison import Centre
@@ -442,7 +442,7 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     fit = identify(data, Polynomial(4))
     model = replace(fit.model, training="sha256:0")
     made = design_output_tube(OutputTube(model, data, profile=[(0.0, 0.0), (9.7, 0.5)], inlet=0.1))
-    design = Design(made.model, made.policy, made.funnel)
+    design: AnyDesign = Design(made.model, made.policy, made.funnel)
     said = replay_messages(design, bags[0], centre=Centre.COMMAND)
     trial = data.trajectories[0]
     assert [list(entry.reading.measured) for entry in said] == trial.y.tolist()
@@ -473,7 +473,7 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
     model = replace(identify(data, Polynomial(1)).model, training="sha256:0")
     made = design_output_tube(OutputTube(model, data))
-    design = Design(made.model, made.policy, made.funnel)
+    design: AnyDesign = Design(made.model, made.policy, made.funnel)
     before, after = (replay_messages(design, bag) for bag in (whole, lossy))
     assert len(before) == len(after) == len(u)
     assert [entry.reading for entry in after[:50]] == [entry.reading for entry in before[:50]]

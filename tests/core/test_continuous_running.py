@@ -13,7 +13,7 @@ from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.designs import Design
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.running.controller import Controller, Limits
@@ -295,7 +295,7 @@ def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
 
 
 def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
-    design = Design(*stage())
+    design: AnyDesign = Design(*stage())
     with pytest.raises(DataError, match="names no signals"):
         read_at(design)
     wired = replace(design, wiring=wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD))
@@ -314,7 +314,7 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
     """The state in one message, the input in another, on a clock of nanoseconds."""
     field, policy, funnel = stage()
     wiring = wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
-    design = Design(field, policy, funnel, wiring=wiring)
+    design: AnyDesign = Design(field, policy, funnel, wiring=wiring)
     controller = design.controller(LIMITS, 1.0)
     x: FloatArray = np.array([0.1])
     samples: list[tuple[FloatArray, FloatArray]] = []

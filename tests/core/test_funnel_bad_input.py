@@ -167,7 +167,7 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
     problem, out = tmp_path / "problem.json", tmp_path / "out"
     files.write_document(problem, spoil(fair()))
     with pytest.raises(NlsidError, match=message):
-        FunnelProblem.load(problem)()
+        FunnelProblem.load(problem).design()
     given = ["nlsid", "funnel", str(out), "--problem", str(problem)]
     monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit) as stopped:
@@ -190,11 +190,11 @@ def test_the_same_problem_unspoiled_is_designed(tmp_path: Path) -> None:
 def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -> None:
     problem = {key: fair()[key] for key in ("format", "version", "vector_field", "nominal", "goal")}
     files.write_document(tmp_path / "problem.json", problem | {"hold": 0.01, "error": [0.001, 0.0]})
-    found = FunnelProblem.load(tmp_path / "problem.json")()
+    found = FunnelProblem.load(tmp_path / "problem.json").design()
     assert (found.claim["hold"], found.claim["error"]) == (0.01, [0.001, 0.0])
     files.write_document(tmp_path / "problem.json", problem | {"hold": "longest"})
     with pytest.raises(OptionError, match="hold is 'longest'"):
-        FunnelProblem.load(tmp_path / "problem.json")()
+        FunnelProblem.load(tmp_path / "problem.json").design()
 
 
 # -- where Python takes what a file cannot hold ------------------------------------------------

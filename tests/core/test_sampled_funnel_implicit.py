@@ -114,7 +114,7 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         taken["curvature"] = [0.9 * v for v in taken["curvature"]]
     else:
         raise ValueError(what)
-    return replace(design, proof=proof)
+    return replace(design, certificate=design.certificate | {"proof": proof})
 
 
 def rows_of(entry: Json) -> list[list[int]]:

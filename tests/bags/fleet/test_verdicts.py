@@ -1,6 +1,5 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
-import io
 import math
 import os
 import re
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
+import yaml
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
@@ -96,7 +95,7 @@ def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> N
     """The level is the square of the factor times the most that a calibration trial spent."""
     proved = documents.load(design)
     spent = calibration_spent(design.parent, proved)
-    tube = proved.funnel.tubes[0]  # type: ignore[union-attr]
+    tube = proved.funnel.tubes[0]
     assert len(spent) == len(tube.measured_on) == 16
     assert max(spent) == pytest.approx(1.0 / tube.safety_factor**2, rel=1e-3)
 
@@ -408,22 +407,27 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
     assert re.fullmatch(r"d0 +look +2\S+ \S+ +3 its recorder lost 3 messages *", lines[3])
 
 
+def identified_with(test: list[str], bags: Path, folder: Path, reason: str) -> str:
+    """What `identify` prints of bags read by workers, of which these are test trials."""
+    content = yaml.safe_load(CONFIG.read_text())
+    content["split"] = {"test": test}
+    config = folder / "robot.yaml"
+    config.write_text(yaml.safe_dump(content))
+    given = ["identify", str(folder / "out"), str(bags), "--config", str(config), "--workers", "1"]
+    done = CliRunner().invoke(app, given)
+    assert isinstance(done.exception, DataError)
+    assert re.search(reason, str(done.exception))
+    return done.output
+
+
 def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -> None:
     """The one bag that is no test trial cannot be read, so nothing is left to train on."""
     drive(tmp_path / "bags" / "drive.mcap", samples=60)
     (tmp_path / "bags" / "cut.mcap").write_bytes(b"no bag")
-    config = load_config(CONFIG)
-    split = config.split.model_copy(update={"test": ["drive"], "calibration": []})
-    said = Console(file=io.StringIO(), width=80)
-    with pytest.raises(DataError, match="all of the bags are test trials"):
-        fleet_cli.identify(
-            said,
-            [tmp_path / "bags"],
-            config.model_copy(update={"split": split}),
-            tmp_path / "out",
-            fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )
-    lines = said.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    said = identified_with(
+        ["drive"], tmp_path / "bags", tmp_path, "all of the bags are test trials"
+    )
+    lines = said.splitlines()
     assert lines[0].startswith(
         "2 bags: 1 used, 1 not read, 0 not usable, 0 copies; 0 of them known"
     )
@@ -437,7 +441,7 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("test", "reason"),
     [
-        (["elsewhere"], "none of the bags is a test trial"),
+        (["elsewhere"], "split.test names elsewhere; the bags are drive_1, drive_2"),
         (["drive_?"], "all of the bags are test"),
     ],
 )
@@ -447,18 +451,7 @@ def test_names_that_cannot_be_split_are_refused_before_a_bag_is_read(
     """Neither bag is one, and none is said to be unreadable."""
     for k in (1, 2):
         (tmp_path / f"drive_{k}.mcap").write_bytes(b"no bag")
-    config = load_config(CONFIG)
-    split = config.split.model_copy(update={"test": test, "calibration": []})
-    said = Console(file=io.StringIO(), width=80)
-    with pytest.raises(DataError, match=reason):
-        fleet_cli.identify(
-            said,
-            [tmp_path],
-            config.model_copy(update={"split": split}),
-            tmp_path / "out",
-            fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )
-    assert said.file.getvalue() == ""  # type: ignore[attr-defined]
+    assert identified_with(test, tmp_path, tmp_path, reason) == ""
     assert not (tmp_path / "out" / "fleet.sqlite").exists()
 
 
