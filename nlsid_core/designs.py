@@ -251,8 +251,7 @@ def _certificate(claim: Json, proof: Json, documents: dict[str, Json]) -> Json:
         name.removesuffix(".json"): proofs.binding(name, document)
         for name, document in documents.items()
     }
-    stated = {"kind": claim["kind"], "about": about} | claim | {"about": about}
-    return proofs.proof_document(stated, proof)
+    return proofs.proof_document({"kind": claim["kind"]} | claim | {"about": about}, proof)
 
 
 def _documents(model: Any, policy: Any, funnel: Any) -> dict[str, Json]:

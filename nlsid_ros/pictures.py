@@ -34,8 +34,8 @@ class Plan:
 
 def plan_of(design: AnyDesign) -> Plan:
     """The output of a linear model, y_k = C x_k + D u_k + c; of the others every state."""
+    names, policy = tuple(signal.name for signal in design.signals[0]), design.policy
     if isinstance(design.funnel, ContinuousFunnel):
-        names = tuple(f"x{i}" for i in range(design.funnel.n))
         columns: list[list[FloatArray]] = [[], [], [], []]
         for stage in design.stages:  # a knot where stages change belongs to the later one
             funnel, end = stage.funnel, None if stage is design.stages[-1] else -1
@@ -46,14 +46,12 @@ def plan_of(design: AnyDesign) -> Plan:
         t, nominal, half_widths, inputs = map(np.concatenate, columns)
         return Plan(t, names, nominal, half_widths, inputs)
     if isinstance(design.funnel, TubeFunnel):
-        model, policy = design.model, design.policy
-        nominal = policy.plan(model).y
+        nominal = policy.plan(design.model).y[:, None]
         t = np.arange(len(nominal)) * policy.period
-        width = np.full((len(t), 1), design.funnel.half_width)
-        return Plan(t, (model.y.name,), nominal[:, None], width, policy.u[:, None])
-    t = np.arange(len(design.policy.x)) * design.policy.period
-    names = tuple(signal.name for signal in design.model.x)
-    return Plan(t, names, design.policy.x, design.funnel.half_widths, design.policy.u)
+        width = np.full_like(nominal, design.funnel.half_width)
+        return Plan(t, names, nominal, width, policy.u[:, None])
+    t = np.arange(len(policy.x)) * policy.period
+    return Plan(t, names, policy.x, design.funnel.half_widths, policy.u)
 
 
 def tube_markers(design: AnyDesign, frame: str, stamp: Time) -> MarkerArray:

@@ -401,7 +401,8 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTu
             "the configuration has no section 'funnel'; `funnel: {}` is one, for a tube around the "
             "model's simulation, and with a profile it plans a motion and its policy"
         )
-    model = documents.load_stable_model(model_path)
+    load = documents.load_stable_model if options.profile is None else documents.load_model
+    model: StableModel = load(model_path)
     trials, _ = _trials_beside(model_path, config, model)
     weights = options.policy
     found = design(
