@@ -39,19 +39,19 @@ def plan_of(design: AnyDesign) -> Plan:
         columns: list[list[FloatArray]] = [[], [], [], []]
         for stage in design.stages:  # a knot where stages change belongs to the later one
             funnel, end = stage.funnel, None if stage is design.stages[-1] else -1
-            widths = np.array([funnel.widths(t) for t in funnel.t])
-            parts = (funnel.t - design.funnel.t0, funnel.x.ends(), widths, stage.policy.planned)
+            half = np.array([funnel.widths(t) for t in funnel.t])
+            parts = (funnel.t - design.funnel.t0, funnel.x.ends(), half, stage.policy.planned)
             for column, part in zip(columns, parts, strict=True):
                 column.append(part[:end])
-        t, nominal, half_widths, inputs = map(np.concatenate, columns)
-        return Plan(t, names, nominal, half_widths, inputs)
+        t, *others = map(np.concatenate, columns)
+        return Plan(t, names, *others)
     if isinstance(design.funnel, TubeFunnel):
         nominal = policy.plan(design.model).y[:, None]
-        t = np.arange(len(nominal)) * policy.period
-        width = np.full_like(nominal, design.funnel.half_width)
-        return Plan(t, names, nominal, width, policy.u[:, None])
-    t = np.arange(len(policy.x)) * policy.period
-    return Plan(t, names, policy.x, design.funnel.half_widths, policy.u)
+        times = np.arange(len(nominal)) * policy.period
+        widths = np.full_like(nominal, design.funnel.half_width)
+        return Plan(times, names, nominal, widths, policy.u[:, None])
+    times = np.arange(len(policy.x)) * policy.period
+    return Plan(times, names, policy.x, design.funnel.half_widths, policy.u)
 
 
 def tube_markers(design: AnyDesign, frame: str, stamp: Time) -> MarkerArray:

@@ -32,7 +32,8 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
             for chain in ("tube", "inlet"):
                 entry[chain]["reach"] *= 0.98
         tube = funnel.tube * np.r_[1.0, np.full(len(funnel.tube) - 1, 0.98)]
-        return resigned(design, funnel=replace(funnel, tube=tube), proof=proof)
+        forged = replace(design, certificate=design.certificate | {"proof": proof})
+        return resigned(forged, funnel=replace(funnel, tube=tube))
     if what == "assumption made smaller":
         smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
         return resigned(design, funnel=replace(funnel, assumption=smaller))
