@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from nlsid_core.errors import CertificateRejected
-from nlsid_core.kernel.levels import WORDS
+from nlsid_core.kernel.tube import WORDS
 from tests.core.kernel.sampled_claims import Scalar
 from tests.core.kernel.stability_claims import claim as stable
 from tests.core.kernel.stability_claims import decide as decide_stable
