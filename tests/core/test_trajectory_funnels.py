@@ -238,7 +238,6 @@ def decide_inside(
         inside(
             rational[0][0],
             rational[1],
-            Fraction(1),
             rational[2][0],
             rational[3],
             Fraction(multiplier),

@@ -11,11 +11,12 @@ import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.errors import CertificateRejected
 from nlsid_core.identification import prove_stability
 from nlsid_core.kernel.files import parse
 from nlsid_core.kernel.models import read_model
 from tests.core.kernel import oracle_stability as oracle
+from tests.core.kernel.refusals import refused
 from tests.core.kernel.stability_claims import (
     CONSTANT,
     MODELS,
@@ -29,7 +30,7 @@ from tests.marks import slow_among
 
 NAMES = list(MODELS)
 NO_INPUT = ("cascade", "network", "monotone", "straight", "linear")  # in the increments of these
-MATHEMATICS = ("decrease", "P is not")  # what a proof is refused for though its form is right
+MATHEMATICS = ("not_definite", "not_valid")  # a proof is refused though its form is right
 
 
 def where(name: str, model: Json) -> str:
@@ -189,14 +190,14 @@ def test_a_sum_that_floating_point_loses_is_not_lost() -> None:
 def test_a_repeated_monomial_is_refused() -> None:
     model, proof = claim("quadratic")
     model["G"][0]["exponents"][1] = [0, 0]
-    with pytest.raises(CertificateRejected, match="each once"):
+    with refused("malformed"):
         decide(model, proof)
 
 
 def test_a_whole_number_beyond_two_to_the_53_is_refused() -> None:
     model, proof = claim("linear")
     proof["proof"]["P"][0][0] = 2**53 + 1
-    with pytest.raises(CertificateRejected, match=r"beyond 2\^53"):
+    with refused("malformed"):
         decide(model, proof)
 
 
@@ -244,7 +245,7 @@ def test_the_slopes_are_those_of_the_spline() -> None:
     nu = [[s * C[j][0]] for j in range(m)]
     after = [[sum((f * z[0] for f, z in zip(row, nu + x, strict=True)), Fraction(0))] for row in F]
     assert _V(P, after) > _V(P, x)
-    with pytest.raises(CertificateRejected, match="decrease"):
+    with refused("not_definite"):
         decide(model, proof)
 
 
@@ -252,7 +253,7 @@ def test_a_flat_place_of_e_has_no_next_output() -> None:
     """e' = 0 at v = -1: 3 + 6v + 3v²."""
     model, proof = claim("monotone")
     model["e"] = [3.0, 3.0, 1.0]
-    with pytest.raises(CertificateRejected, match="decrease"):
+    with refused("not_definite"):
         decide(model, proof)
 
 
@@ -260,7 +261,7 @@ def test_a_flat_place_of_e_has_no_next_output() -> None:
 def test_what_is_no_increasing_cubic_is_refused(e: list[float]) -> None:
     model, proof = claim("monotone")
     model["e"] = e
-    with pytest.raises(CertificateRejected, match="not increasing"):
+    with refused("not_valid"):
         decide(model, proof)
 
 
@@ -275,7 +276,7 @@ def test_a_rate_below_the_fastest_is_refused_and_a_slower_one_proved(name: str) 
         if proved:
             decide(model, proof)
         else:
-            with pytest.raises(CertificateRejected, match="decrease"):
+            with refused("not_definite"):
                 decide(model, proof)
 
 
@@ -283,7 +284,7 @@ def test_a_rate_below_the_fastest_is_refused_and_a_slower_one_proved(name: str) 
 def test_a_rate_that_is_no_decay_is_refused(rate: float) -> None:
     model, proof = claim("linear")
     proof["claim"]["rate"] = rate
-    with pytest.raises(CertificateRejected, match="0 < rate < 1"):
+    with refused("not_below"):
         decide(model, proof)
 
 
@@ -291,7 +292,7 @@ def test_a_rate_that_is_no_decay_is_refused(rate: float) -> None:
 def test_a_rate_of_another_type_is_refused(value: object) -> None:
     model, proof = claim("linear")
     proof["claim"]["rate"] = value
-    with pytest.raises(CertificateRejected, match="rate should be a number"):
+    with refused("malformed"):
         decide(model, proof)
 
 
@@ -302,7 +303,7 @@ def test_a_forgery_with_right_digests_is_refused(change: str) -> None:
     made(model, proof["proof"])
     if reason in MATHEMATICS:
         assert not oracle.is_proved(model, proof["claim"], proof["proof"])
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(model, proof)
 
 
@@ -333,7 +334,7 @@ def test_a_changed_digit_in_a_model_is_refused(tmp_path: Path, name: str) -> Non
     digits = [i for i, c in enumerate(original) if c in "12345678"]
     for i in digits[:: max(1, len(digits) // 20)]:
         model.write_text(original[:i] + str(int(original[i]) + 1) + original[i + 1 :])
-        with pytest.raises(CertificateMismatch, match=r"model\.json is not the model"):
+        with refused("mismatch"):
             proofs.check(path)
 
 
@@ -343,7 +344,7 @@ def test_a_file_name_that_leaves_the_folder_is_refused(tmp_path: Path, file: str
     document = json.loads(path.read_text())
     document["claim"]["about"]["model"]["file"] = file
     files.write_document(path, document)
-    with pytest.raises(CertificateRejected, match="not a plain file name"):
+    with refused("malformed"):
         proofs.check(path)
 
 
@@ -356,7 +357,7 @@ def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str,
         inner = inner[key]
     del inner[place[-1]]
     files.write_document(path, document)
-    with pytest.raises(CertificateRejected, match=f"{place[-1]}.*missing|object with a kind"):
+    with refused("malformed"):
         proofs.check(path)
 
 
