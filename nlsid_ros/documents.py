@@ -5,6 +5,7 @@ Of a continuous funnel parameters say where its signals are.
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -52,12 +53,13 @@ def declare_expected(node: Node) -> str:
 
 def declare_limits(node: Node) -> Limits:
     """The parameters that say what the check of a proof may take."""
-    what = "s of processor time that the check of a proof may take"
-    seconds = declare(node, "check_seconds", USUAL.seconds, what, between=(1, 3600))
-    what = "MB of memory that the check of a proof may take"
-    memory = declare(node, "check_memory", USUAL.memory, what, between=(64, 2**20))
-    assert isinstance(seconds, int)
-    assert isinstance(memory, int)
+    what = "that the check of a proof may take"
+    seconds: Any = declare(
+        node, "check_seconds", USUAL.seconds, f"s of processor time {what}", between=(1, 3600)
+    )
+    memory: Any = declare(
+        node, "check_memory", USUAL.memory, f"MB of memory {what}", between=(64, 10**6)
+    )
     return Limits(seconds, memory)
 
 

@@ -213,8 +213,7 @@ def check(
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
             limits = deciding.Limits(seconds, memory)
-            at_work = deciding.Deciding(path, limits, remembered=False)
-            said = str(at_work.wait())
+            said = str(deciding.Deciding(path, limits, remembered=False).wait())
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
             provenance = of_proof(path)

@@ -216,8 +216,8 @@ def decide_rates(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any
     loops = lru_cache(maxsize=1)(partial(ClosedLoop, funnel))
 
     def decide(ring: Ring, piece: Piece) -> None:
-        (k, v, (i, sign, *mode)), (corner, w) = piece.key, vertices[piece.key[1]]
-        loop = loops(ring, piece.part, tuple(mode))
+        (k, v, (i, sign, *mode)), part, members = piece
+        loop, (corner, w) = loops(ring, part, tuple(mode)), vertices[v]
         room = hold.rates[k][i]
         for j in free:
             half = hold.widths[k][j] if j < m else halves[j - m]
@@ -225,9 +225,9 @@ def decide_rates(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any
             room -= half * max(abs(dot(gain[i], column)) for gain in funnel.K[k])
         f = loop.rates(at(field.equations[k], w), corner, hold.widths[k])
         parts = [ring.made(loop.h * room), -sign * loop.turning(i, f)]
-        parts += loop.taken(piece.members["tau"], [loop.gap, *loop.held], stated["sides"])
-        squares = read_squares(piece.members | {"basis": stated["basis"]}, ring)
-        what = f"rate piece {piece.place} (interval {k}, vertex {v}, input {i})"
+        parts += loop.taken(members["tau"], [loop.gap, *loop.held], stated["sides"])
+        squares = read_squares(members | {"basis": stated["basis"]}, ring)
+        what = f"{members['index'].where}, of a rate (interval {k}, vertex {v}, input {i})"
         positive(ring.sum(parts), squares, ring, what)
 
     at_width(field.n, pieces, decide)

@@ -179,8 +179,8 @@ def _decide_pieces(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, A
         return found
 
     def decide_piece(ring: Ring, piece: Piece) -> None:
-        (k, v, mode), members, (corner, w) = piece.key, piece.members, vertices[piece.key[1]]
-        loop = loops(ring, piece.part, mode)
+        (k, v, mode), part, members = piece
+        loop, (corner, w) = loops(ring, part, mode), vertices[v]
         f = loop.rates(at(field.equations[k], w), corner, hold.widths[k])
         mu = read_multiplier(members["mu"], multiplier, ring)
         parts = [loop.drift, -stated["margin"] * loop.h * loop.rho, mu * loop.gap]
@@ -188,7 +188,7 @@ def _decide_pieces(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, A
         if limited:
             parts += loop.taken(members["tau"], loop.held, stated["sides"])
         squares = read_squares(members | {"basis": stated["basis"]}, ring)
-        what = f"piece {piece.place} (interval {k}, vertex {v}, mode {mode})"
+        what = f"{members['mu'].where} (interval {k}, vertex {v}, mode {mode})"
         positive(ring.sum(parts), squares, ring, what)
 
     at_width(field.n, pieces, decide_piece)

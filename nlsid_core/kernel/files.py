@@ -95,7 +95,8 @@ class Node:
     def require(self, checks: Mapping[str, object], reason: str = "malformed") -> None:
         """Raise Rejected with the first text whose condition is false."""
         for wanted, holds in checks.items():
-            refuse_if(not holds, f"{self.where}: {wanted}", reason)
+            joint = " " if wanted.startswith("should ") else ": "
+            refuse_if(not holds, f"{self.where}{joint}{wanted}", reason)
 
     def members(self, required: str, optional: str = "") -> dict[str, "Node"]:
         """An object with exactly these members (names separated by spaces)."""
@@ -192,12 +193,12 @@ class Node:
 
     def _nested(self, value: Any, shape: Sequence[int | None], kinds: tuple[type, ...]) -> Any:
         if type(value) is not list or shape[0] not in (None, len(value)):
-            raise Rejected(f"{self.where}: should have shape {shape}")
+            raise Rejected(f"{self.where} should have shape {shape}")
         if len(shape) > 1:
             return [self._nested(entry, shape[1:], kinds) for entry in value]
         if any(type(entry) not in kinds for entry in value):
             wanted = "numbers" if Fraction in kinds else "whole numbers"
-            raise Rejected(f"{self.where}: should hold {wanted} only")
+            raise Rejected(f"{self.where} should hold {wanted} only")
         return list(map(Fraction, value)) if Fraction in kinds else list(value)
 
     def monomials(
@@ -317,7 +318,7 @@ def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], d
         except OSError as error:
             raise Mismatch(f"{role} file {name} cannot be read: {error.strerror}") from error
         if digest(content) != stated["digest"]:
-            raise Mismatch(f"{name} is not the {role} that this proof is about: its digest differs")
+            raise Mismatch(f"{name} is not the {role} this proof is about: its digest differs")
         documents[role], digests[role] = parse(content, role), digest(content)
     return documents, digests
 

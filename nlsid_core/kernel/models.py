@@ -255,25 +255,37 @@ def _read_box(model: ImplicitModel, bounds: Node, window: list[list[int]], input
 
 def _jacobian(rows: Sequence[Terms], variables: int) -> MatrixTerms:
     """The derivatives of polynomials by their first variables, as a matrix polynomial."""
-    found: dict[bytes, Matrix] = {}
-    for i, row in enumerate(rows):
-        for j in range(variables):
-            for powers, c in derivative(row, j):
-                limit(max(powers, default=0), MAX_POWER, "the power of a variable")
-                entry = found.setdefault(powers, [[Fraction(0)] * variables for _ in rows])
-                entry[i][j] += c
-    refuse_if(not found, "the model's equation does not depend on its output")
-    return sorted(found.items())
+    entries = [
+        (powers, i, j, c)
+        for i, row in enumerate(rows)
+        for j in range(variables)
+        for powers, c in derivative(row, j)
+    ]
+    refuse_if(not entries, "the model's equation does not depend on its output")
+    most = max(power for powers, *_ in entries for power in powers)
+    limit(most, MAX_POWER, "the power of a variable")
+    return _collected(entries, len(rows), variables)
 
 
 def _side_by_side(G: Sequence[MatrixTerms], rows: int) -> MatrixTerms:
     """[G_0 … G_n] as one matrix polynomial."""
+    entries = [
+        (powers, i, k * rows + j, entry)
+        for k, terms in enumerate(G)
+        for powers, block in terms
+        for i, row in enumerate(block)
+        for j, entry in enumerate(row)
+    ]
+    return _collected(entries, rows, rows * len(G))
+
+
+def _collected(
+    entries: Sequence[tuple[bytes, int, int, Fraction]], rows: int, columns: int
+) -> MatrixTerms:
+    """The matrix polynomial with these entries: powers, row, column, coefficient."""
     found: dict[bytes, Matrix] = {}
-    for k, terms in enumerate(G):
-        for powers, block in terms:
-            entry = found.setdefault(powers, [[Fraction(0)] * (rows * len(G)) for _ in range(rows)])
-            for i, row in enumerate(block):
-                entry[i][k * rows : (k + 1) * rows] = row
+    for powers, i, j, c in entries:
+        found.setdefault(powers, [[Fraction(0)] * columns for _ in range(rows)])[i][j] += c
     return sorted(found.items())
 
 

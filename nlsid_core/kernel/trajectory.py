@@ -23,6 +23,7 @@ Curve = list[list[list[Fraction]]]  # by interval, control point, entry
 Mode = tuple[int, ...]  # -1 low, 0 free, 1 high, of each input with limits
 Part = tuple[int, int, int]  # interval k, level, index: [index, index + 1] / 2^level of it
 Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
+Piece = tuple[Key, Part, dict[str, Node]]  # what it is about, and its members
 
 
 @dataclass(frozen=True)
@@ -59,16 +60,6 @@ class Field:
     pushing: set[int]
     affine: bool
     expansion: str
-
-
-@dataclass(frozen=True)
-class Piece:
-    """What a piece is about, its members, and its place in the file."""
-
-    key: Key
-    part: Part
-    members: dict[str, Node]
-    place: int
 
 
 def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
@@ -163,8 +154,9 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
     Raises Rejected unless their parts of time cover [0, 1] for everything that is needed.
     """
     names = f"interval vertex level index columns squares {names}" + " mode" * bool(limited)
-    covered, pieces = dict.fromkeys(needed, Fraction(0)), []
-    for place, entry in enumerate(node.items(1, MAX_PIECES)):
+    pieces: list[Piece] = []
+    covered = dict.fromkeys(needed, Fraction(0))
+    for entry in node.items(1, MAX_PIECES):
         piece = entry.members(names)
         level = piece["level"].whole(0, MAX_LEVEL)
         index = piece["index"].whole(0, 2**level - 1)
@@ -174,9 +166,9 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
         k, v = piece["interval"].whole(0), piece["vertex"].whole(0)
         known = (k, v, mode) in covered
         entry.require({f"no interval {k}, vertex {v}, mode {mode}": known}, "not_covered")
-        pieces.append(Piece((k, v, mode), (k, level, index), piece, place))
-    starts = [(p.key, Fraction(p.part[2], 2 ** p.part[1]), p.part[1]) for p in pieces]
-    for key, start, level in sorted(starts):
+        pieces.append(((k, v, mode), (k, level, index), piece))
+    starts = sorted((key, Fraction(i, 2**level), level) for key, (_, level, i), _ in pieces)
+    for key, start, level in starts:
         if start <= covered[key]:
             covered[key] = max(covered[key], start + Fraction(1, 2**level))
     for (k, v, mode), until in covered.items():

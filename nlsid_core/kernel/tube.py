@@ -187,18 +187,18 @@ def _read_tube(node: Node, model: Model) -> Tube:
     }
     tube = node.read(table)
     rho, energy = tube["rho"], tube["assumption"]["kind"] == "energy"
+    ends = tube["assumption"]["samples"] is not None
+    apart = not tube["follows"] or (rho < 1 and not tube["inlet"])
     node.require(
         {
-            "energy is for a number of samples, fading for ever": energy
-            == (tube["assumption"]["samples"] is not None),
-            "a level that follows the commands is for fading, without an inlet": not tube["follows"]
-            or (rho != 1 and not tube["inlet"]),
+            "energy is for a number of samples, fading for ever": energy == ends,
+            "a level that follows the commands is for fading, without an inlet": apart,
         }
     )
+    rated = 0 < rho <= 1 and energy == (rho == 1)
     node.require(
         {
-            "rho should be 1 for energy, between 0 and 1 for fading": 0 < rho <= 1
-            and energy == (rho == 1),
+            "rho should be 1 for energy, between 0 and 1 for fading": rated,
             "tau and half_widths should be positive": min(tube["tau"] + tube["half_widths"]) > 0,
             "inlet and level should be 0 or more": min(tube["inlet"], tube["level"]) >= 0,
         },
@@ -295,7 +295,8 @@ def read_level(node: Node, inputs: int) -> CommandLevel:
     given = node.read({"terms": each(_term, 1, MAX_TERMS), "weights": (1, None)})
     (weights,), terms = given["weights"], given["terms"]
     known = all(0 <= i < inputs for term in terms for i in term["inputs"])
-    node.require({"one weight for each term": len(weights) == len(terms), "its inputs": known})
+    one = len(weights) == len(terms)
+    node.require({"one weight for each term": one, "inputs should be the model's": known})
     fits = min(weights) >= 0 and sum(weights)
     node.require({"weights should be 0 or more, some positive": fits}, "not_below")
     return list(zip(weights, terms, strict=True))

@@ -194,7 +194,7 @@ def test_only_regular_files_beside_the_proof_are_read(tmp_path: Path) -> None:
     for name in ("fifo", ".", "absent"):
         with pytest.raises(OSError, match=r"\w"):
             read_regular(tmp_path / name)
-    with refused("malformed"):
+    with refused("too_large"):
         kernel.check(tmp_path / "large")
     about = {"model": {"file": "fifo", "digest": digest(b"{}")}}
     (tmp_path / "b.proof.json").write_bytes(proof({"kind": "stable_set", "about": about}, {}))
@@ -215,7 +215,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
     size = len(rows)
     if any(len(row) != size for row in rows):
         for decide in (definite, semidefinite):
-            with refused("malformed"):
+            with refused("too_large"):
                 decide(rows, "M")
         return
     M = [[Fraction(rows[max(i, j)][min(i, j)]) for j in range(size)] for i in range(size)]

@@ -173,6 +173,6 @@ def test_the_same_square_does_not_balance_two_cross_terms() -> None:
 def test_a_whole_number_is_one_without_a_fraction_or_a_text_of_digits(entry: Any) -> None:
     """As in a file: parsed, a float64 is a Fraction."""
     given = Fraction(entry) if type(entry) is float else entry
-    assert Node([1, "2", "-3"], "columns").integers(3, 3) == (1, 2, -3)
+    assert Node([1, "2", "-3"], "columns").integers(3, 3) == [1, 2, -3]
     with pytest.raises(Rejected):
         Node([1, given, -3], "columns").integers(3, 3)
