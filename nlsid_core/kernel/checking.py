@@ -22,11 +22,23 @@ from .files import (
 from .text import Verdict
 
 # Each claim is a module of this package with a function `decide(claim, proof, read) -> Verdict`.
-KINDS = ("stability", "stable_set", "tube", "sampled_funnel", "continuous_funnel")
-KINDS += ("funnel_composition",)
+KINDS = (
+    "stability",
+    "stable_set",
+    "tube",
+    "sampled_funnel",
+    "continuous_funnel",
+    "funnel_composition",
+)
 # Kinds of version 2 that are not decided any more.
-LEFT = ("dissipation", "small_gain", "hybrid_funnel", "polynomial_bound", "falsification")
-LEFT += ("region_of_attraction",)
+LEFT = (
+    "dissipation",
+    "small_gain",
+    "hybrid_funnel",
+    "polynomial_bound",
+    "region_of_attraction",
+    "falsification",
+)
 
 
 def check(path: str | os.PathLike[str]) -> Verdict:

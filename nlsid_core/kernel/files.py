@@ -114,9 +114,10 @@ class Node:
         found: dict[str, Any] = dict.fromkeys(optional)
         for stated, reader in table.items():
             name = stated.rstrip("?")
-            if name in parts:
-                shaped = isinstance(reader, tuple)
-                found[name] = parts[name].array(*reader) if shaped else reader(parts[name])
+            if name in parts and isinstance(reader, tuple):
+                found[name] = parts[name].array(*reader)
+            elif name in parts:
+                found[name] = reader(parts[name])
         return found
 
     def document(

@@ -131,7 +131,7 @@ def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box
 
 def read_recorded(node: Node, kind: str, table: Table) -> dict[str, Any]:
     """The members of a model of recorded signals; what made it is not read."""
-    heads = {"period": (), "training": itself, "bags": itself, "equation?": itself}
+    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": itself}
     given = node.document("model", {**heads, **table}, kind)
     node.require({"the period should be positive": given["period"] > 0})
     return given

@@ -13,7 +13,7 @@ from bags.designs.documents import FUNNEL, FUNNEL_PROOF, MODEL, POLICY
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.design import OutputTubeDesign
-from nlsid_core.errors import CertificateRejected
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from tests.core.kernel import oracle_tube as oracle
 from tests.core.kernel.refusals import refused
 from tests.core.kernel.tube_claims import claim
@@ -281,7 +281,7 @@ def test_a_changed_digit_in_any_number_of_any_file_is_rejected(
 @pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
 def test_a_missing_file_is_rejected_by_name(design_folder: Path, name: str) -> None:
     (design_folder / name).unlink()
-    with refused(name):
+    with pytest.raises(CertificateMismatch, match=name):
         proofs.check(design_folder / FUNNEL_PROOF)
 
 

@@ -266,7 +266,7 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
         (
             "implicit_ray",
             lambda c: c.funnel.update(box={"y": [[-1.0, 1.0]], "u": [[-1.0, 1.0]]}),
-            "malformed",
+            "not_valid",
         ),
         ("implicit_box", lambda c: c.funnel.pop("box"), "not_valid"),
         ("implicit_box", lambda c: c.funnel["box"].update(u=[[1.0, 1.0]]), "not_valid"),
