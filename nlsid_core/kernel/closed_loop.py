@@ -164,7 +164,8 @@ def read_hold(claim: Node, stated: dict[str, Any], field: Field, funnel: Funnel)
     if held:
         period = Node(claim.value["hold"], "hold").number()
         rates = stated["rates"].array(count, field.m)
-        steady = all(p[-1] == q[0] for c in (funnel.u, funnel.K) for p, q in pairwise(c))
+        curves: list[Any] = [funnel.u, funnel.K]
+        steady = all(p[-1] == q[0] for curve in curves for p, q in pairwise(curve))
         fits = period > 0 and all(rate > 0 for row in rates for rate in row)
         claim.require({"hold and rates should be positive": fits}, "not_below")
         claim.require({"the policy jumps at a knot: no rate bounds a hold": steady}, "not_valid")

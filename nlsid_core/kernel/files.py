@@ -32,7 +32,7 @@ VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
 Reader: TypeAlias = "Callable[[Node], Any] | tuple[int | None, ...]"  # of a member, or its shape
-Table = Mapping[str, Reader]  # the members of an object; `name?` may be missing
+Table = dict[str, Reader]  # the members of an object; `name?` may be missing
 # Of a polynomial: exponents and coefficients. Exponents are bytes, whose hash no file can choose.
 Terms = list[tuple[bytes, Fraction]]
 

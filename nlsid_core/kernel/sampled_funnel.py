@@ -106,7 +106,7 @@ def _prove_step(
     at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
-    return Fraction(following - reach - added) / following
+    return Fraction((following - reach - added) / following)
 
 
 def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polynomial:
@@ -132,7 +132,7 @@ def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) 
         return Fraction(bound)
     mu = kappa * stretch(link.curvature, kappa * radius, kappa * bound, least=1)
     if form == "response":
-        return mu * bound
+        return Fraction(mu * bound)
     much = f"{what}: deviations stretch by {above(mu)}, too much for rate and gain"
     at_most(funnel["gain"] * mu**2, (funnel["gain"] - 1) * funnel["rate"], much)
     return Fraction(0)

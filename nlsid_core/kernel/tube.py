@@ -135,7 +135,7 @@ def _decide_tube(
         positive(model, tree, _gaps(model, tube, mode))
 
     used = tube["level"] + tube["rho"] * tube["inlet"]
-    shares = []
+    shares: list[Fraction] = []
     for tau, width, signal in zip(tube["tau"], tube["half_widths"], modes[0][1].y, strict=True):
         shares.append(used / (tau * width**2))
         at_most(shares[-1], 1, f"{signal.name} can leave the stated half-width {text.above(width)}")

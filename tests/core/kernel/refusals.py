@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -15,4 +16,5 @@ def refused(reason: str) -> Iterator[None]:
     assert reason in REASONS
     with pytest.raises((Rejected, CertificateRejected)) as found:
         yield
-    assert found.value.reason == reason, str(found.value)
+    refusal: Any = found.value
+    assert refusal.reason == reason, str(refusal)
