@@ -114,9 +114,11 @@ class Node:
         found: dict[str, Any] = dict.fromkeys(optional)
         for stated, reader in table.items():
             name = stated.rstrip("?")
-            if name in parts and isinstance(reader, tuple):
+            if name not in parts:
+                continue
+            if isinstance(reader, tuple):
                 found[name] = parts[name].array(*reader)
-            elif name in parts:
+            else:
                 found[name] = reader(parts[name])
         return found
 

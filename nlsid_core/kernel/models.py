@@ -196,7 +196,7 @@ def _between(E: MatrixTerms, box: Box, node: Node) -> list[Matrix]:
     node.require({"ends are for one output, constant lags, and degree 2 at most": fits})
     limit(len(box), MAX_ORDER - 1, f"{node.where}: entries of the box")
     weighted = (len(box),)
-    table = {"low": (), "high": (), "low_weights": weighted, "high_weights": weighted}
+    table: Table = {"low": (), "high": (), "low_weights": weighted, "high_weights": weighted}
     given = node.read(table)
     for name, sign in (("low", 1), ("high", -1)):
         weights = given[f"{name}_weights"]
