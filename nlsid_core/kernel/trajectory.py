@@ -197,6 +197,9 @@ def _times(least: int, most: int) -> Reader:
 def _curve(node: Node, count: int, *shape: int | None) -> Any:
     curve = node.array(count, None, *shape)
     for control in curve:
-        fits = 0 < len(control) <= MAX_TIME_DEGREE + 1 and len(control[0]) == len(curve[0][0])
-        node.require({f"should have degree 0 to {MAX_TIME_DEGREE} in time": fits})
+        even = all(len(point) == len(curve[0][0]) for point in control)
+        fits = 0 < len(control) <= MAX_TIME_DEGREE + 1 and even
+        node.require(
+            {f"should have degree 0 to {MAX_TIME_DEGREE} in time, points of one size": fits}
+        )
     return curve
