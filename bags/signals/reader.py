@@ -159,12 +159,6 @@ def bag_origin(bag: Bag | Path | str, *, unfinished: bool = False) -> Json:
         }
 
 
-def bag_metadata(bag: Path | str) -> dict[str, str]:
-    """The bag's own key-value pairs (`custom_data`); empty if it has none. BagError as above."""
-    with Bag(bag) as source:
-        return source.custom
-
-
 def _opened(
     bag: Bag | Path | str,
     unfinished: bool,

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import Writer
 
 from bags.recordings.writer import BagWriter
-from bags.signals.reader import bag_digest, bag_metadata, read_signals
+from bags.signals.reader import bag_digest, bag_origin, read_signals
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
     CMD,
@@ -46,7 +46,7 @@ def refused(bag: Path, *paths: str) -> str:
 
 def test_a_missing_bag(tmp_path: Path) -> None:
     assert "there is no bag" in refused(tmp_path / "nowhere")
-    for read in (bag_digest, bag_metadata):
+    for read in (bag_digest, bag_origin):
         with pytest.raises(BagError, match="there is no bag"):
             read(tmp_path / "nowhere")
 

@@ -23,7 +23,7 @@ from bags.recordings.folders import expand_bags
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.signals.grid import read_dataset
-from bags.signals.reader import bag_metadata, read_signals
+from bags.signals.reader import bag_origin, read_signals
 from bags.tools.fitness import Level, check_fitness
 from bags.tools.importing import import_tables, read_tables
 from bags.tools.info import bag_info
@@ -291,7 +291,7 @@ def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:
     assert [p.name for p in parts] == [f"run_{k:02d}" for k in range(1, 6)]
     for part in parts:
         assert read_signals(part, [COMMAND])[COMMAND].values.tolist() == once.tolist()
-    assert len({bag_metadata(part)["repeat_group"] for part in parts}) == 1
+    assert len({bag_origin(part)["custom"]["repeat_group"] for part in parts}) == 1
     with pytest.raises(BagError, match="does not repeat itself"):
         run("convert", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
 
@@ -494,7 +494,7 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read[SPEED].values, written[:, 1])
     assert np.diff(read[SPEED].stamp_ns).tolist() == [20_000_000] * 49
     assert read[SPEED].stamp_ns[0] == 1000 * 10**9
-    assert bag_metadata(tmp_path / "bag") == {"robot": "car"}
+    assert bag_origin(tmp_path / "bag")["custom"] == {"robot": "car"}
 
 
 def test_mat_files_are_tables_too(tmp_path: Path) -> None:
@@ -656,7 +656,7 @@ def test_the_shipped_arm_is_small_and_documented() -> None:
     assert "CC0 1.0 Universal" in (folder / "LICENSE").read_text()
     assert "Althoff" in (folder / "README.md").read_text()
     for bag in bags:
-        assert bag_metadata(bag)["licence"] == "CC0-1.0"
+        assert bag_origin(bag)["custom"]["licence"] == "CC0-1.0"
         read = read_signals(bag, ["/joint_states:velocity[*]", "/joint_states:effort[*]"])
         assert len(read) == 12
         steps = np.diff(read["/joint_states:effort[0]"].stamp_ns)
@@ -666,7 +666,7 @@ def test_the_shipped_arm_is_small_and_documented() -> None:
 @pytest.mark.skipif(not ROBOT.is_dir(), reason="needs schunk_arm in ../shared/data")
 def test_the_shipped_arm_has_the_published_numbers_bit_for_bit() -> None:
     for bag in schunk():
-        source = ROBOT / bag_metadata(bag)["source_trial"]
+        source = ROBOT / bag_origin(bag)["custom"]["source_trial"]
         torque = np.loadtxt(source / "input.csv", delimiter=",")
         states = np.loadtxt(source / "trajectory.csv", delimiter=",")[:-1]
         for k in range(6):
