@@ -209,7 +209,6 @@ class TrajectoryRecorder(ManagedNode):
         writer = BagWriter(
             path,
             in_place=True,
-            max_chunk_age=self._period,
             compression=self._compression,
             split_bytes=round(self._split_size * 1e6) or None,
             split_seconds=self._split_time or None,

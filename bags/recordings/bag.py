@@ -76,8 +76,10 @@ class Bag:
 
     def _encoded(self, channel: Channel) -> Channel:
         """The channel, with the encoding that the metadata state where its file says CDR."""
-        stated = self._described.encodings.get(channel.topic, "cdr")
-        return replace(channel, encoding=stated) if channel.encoding == "cdr" else channel
+        described = (self._described.topics or {}).get(channel.topic)
+        if described is None or channel.encoding != "cdr":
+            return channel
+        return replace(channel, encoding=described.encoding)
 
     def close(self) -> None:
         """Close the bag's files."""
@@ -124,7 +126,7 @@ class Bag:
     def statements(self) -> tuple[str, ...]:
         """What in the bag says how many messages there should be."""
         said = {
-            METADATA: self._described.counts is not None,
+            METADATA: self._described.topics is not None,
             "the files' statistics and indexes": self._storage.stated is not None,
         }
         return tuple(name for name, there in said.items() if there)
@@ -133,7 +135,7 @@ class Bag:
     def disagreements(self) -> tuple[str, ...]:
         """Where what the bag states and what is there differ, in words."""
         found = [*self._described.notes]
-        said = {METADATA: self._described.counts, "the file": self._storage.stated}
+        said = {METADATA: self._counts, "the file": self._storage.stated}
         for name, counts in said.items():
             for topic in {**counts, **self.topics} if counts is not None else ():
                 stated, there = (counts or {}).get(topic, 0), self._there(topic)
@@ -187,13 +189,21 @@ class Bag:
         metadata.yaml goes before the files, as it does for rosbag2.
         """
         found = [p for c in self.channels if c.topic == topic for p in c.offered]
-        return tuple(dict.fromkeys(self._described.offered.get(topic) or found))
+        described = (self._described.topics or {}).get(topic)
+        return tuple(dict.fromkeys((described and described.offered) or found))
 
     def count(self, topic: str) -> int:
         """How many messages the bag says it has on `topic`."""
-        if self._described.counts is not None and self.ending is None:
-            return self._described.counts.get(topic, 0)
+        if self._counts is not None and self.ending is None:
+            return self._counts.get(topic, 0)
         return self._there(topic)
+
+    @cached_property
+    def _counts(self) -> dict[str, int] | None:
+        """Messages of each topic as metadata.yaml states them."""
+        if self._described.topics is None:
+            return None
+        return {topic: described.count for topic, described in self._described.topics.items()}
 
     def _there(self, topic: str) -> int:
         return sum(channel.count for channel in self.channels if channel.topic == topic)

@@ -34,8 +34,6 @@ from bags.recordings.mcap_records import (
     Block,
     Contents,
     Record,
-    add_channel,
-    add_schema,
     counted,
     index_entries,
     parse,
@@ -95,14 +93,14 @@ def summarised(path: RemotePath) -> Contents | None:
 
 
 def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
-    found = Contents(good_bytes=path.entry.size)
+    found = Contents()
     metadata: list[MetadataIndex] = []
     for opcode, at, record_end in walk_records(summary):
         content = summary[at + RECORD.size : record_end]
         if opcode == Opcode.SCHEMA:
-            add_schema(found.schemas, _declared(Schema.read, content))
+            found.declared.add(_declared(Schema.read, content))
         elif opcode == Opcode.CHANNEL:
-            add_channel(found.channels, _declared(Channel.read, content))
+            found.declared.add(_declared(Channel.read, content))
         elif opcode == Opcode.STATISTICS:
             statistics = parse(Statistics.read, content)
             found.stated = counted(statistics)
@@ -126,11 +124,8 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
                 f"the summary's chunks at bytes {block.offset} and {after.offset} overlap"
             )
     named = {channel for block in found.blocks for channel in block.index or ()}
-    declared = {
-        c.id for c in found.channels.values() if not c.schema_id or c.schema_id in found.schemas
-    }
     filled = {channel for channel, count in found.counts.items() if count}
-    if not named | filled <= declared or not filled <= named:  # some are told elsewhere
+    if not all(map(found.declared.knows, named)) or not filled <= named:  # some stand elsewhere
         return None
     if any(not (len(MAGIC) <= m.offset <= m.offset + m.length <= start) for m in metadata):
         raise BagError("the summary names metadata outside the file")

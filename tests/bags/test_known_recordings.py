@@ -458,9 +458,9 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
         message = made[kind]([marker(**{k: v for k, v in values.items() if k in known})])
     data = bytes(types.serialize_cdr(message, kind))
     bag = sqlite_bag(tmp_path / "a.db3", [("/x", kind, data)] * 3, release=release)
-    assert read_signals(bag, [signal], clock="log time")[signal].values == pytest.approx(wanted)
+    assert read_signals(bag, [signal])[signal].values == pytest.approx(wanted)
     run("convert", bag, "--out", tmp_path / "cut")
-    assert read_signals(tmp_path / "cut", [signal], clock="log time")[signal].values[0] == wanted
+    assert read_signals(tmp_path / "cut", [signal])[signal].values[0] == wanted
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
