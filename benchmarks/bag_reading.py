@@ -65,9 +65,8 @@ def generated_bag(data: Path | None, messages: int) -> Path:
     if not bag.is_dir():
         with BagWriter(bag) as writer:
             for k, (topic, content) in enumerate(islice(_messages(), messages)):
-                log_ns = START_NS + k * PERIOD_NS
-                times = {"log_time_ns": log_ns, "publish_time_ns": log_ns}
-                writer.write(topic, TYPES[topic], content, **times)
+                at = START_NS + k * PERIOD_NS
+                writer.write(topic, TYPES[topic], content, log_time_ns=at, publish_time_ns=at)
     return bag
 
 

@@ -42,8 +42,7 @@ class Drive:
     def washed_out(self) -> Trajectory:
         """`|washout(2 s)` of its position."""
         moved = Expression.parse(f"/car:position|washout({SPAN:g} s)")
-        stamp_ns = np.rint(1e9 * self.t).astype(np.int64)
-        return self.trial(moved.apply(self.position, stamp_ns, "m"))
+        return self.trial(moved.apply(self.position, np.rint(1e9 * self.t).astype(np.int64), "m"))
 
     def velocity(self) -> Trajectory:
         """The differences of its position, the sum of which is the position again."""

@@ -314,7 +314,7 @@ def convert(
 
 @bag_app.command("import")
 def import_command(
-    table: Annotated[Path, typer.Argument(help="A CSV or MAT file.")],
+    table: Annotated[Path, typer.Argument(help="A CSV file.")],
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,

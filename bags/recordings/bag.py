@@ -21,6 +21,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.remote import place
 from bags.recordings.storage import Channel, Raw, Storage, defined
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 RECOVER: Final = "`nlsid bag recover`"
 
@@ -212,18 +213,26 @@ class Bag:
         """Which of its topic's channels it is; sequence numbers are counted in each."""
         return self._storage.strands[channel.key]
 
-    def batches(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch]]:
+    def batches(
+        self, topics: Sequence[str] | None = None, *, progress: Progress = silent
+    ) -> Iterator[tuple[Channel, Batch]]:
         """The messages on `topics` (None: on all), many at once, in the order of the files.
 
         Memory: one batch. Raises BagError where the bag is damaged.
         """
-        for channel, batch, _ in self.parts(topics):
+        for channel, batch, _ in self.parts(topics, progress=progress):
             yield channel, batch
 
-    def parts(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch, int]]:
+    def parts(
+        self, topics: Sequence[str] | None = None, *, progress: Progress = silent
+    ) -> Iterator[tuple[Channel, Batch, int]]:
         """As `batches`, with the log time in ns that no message from here on goes below."""
-        for key, batch, later_ns in self._storage.parts(self._keys(topics)):
+        keys = self._keys(topics)
+        total, done = max(sum(self.channels[key].count for key in keys), 1), 0
+        for key, batch, later_ns in self._storage.parts(keys):
             yield self.channels[key], batch, later_ns
+            done += len(batch)
+            progress("reading", done / total)
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""

@@ -40,7 +40,7 @@ from bags.recordings.mcap_records import (
     walk_declared,
     walk_messages,
 )
-from bags.recordings.mcap_summary import ListedBlock, Prepared, summarised
+from bags.recordings.mcap_summary import Prepared, summarised
 from bags.recordings.remote import RemotePath, place
 from nlsid_core.errors import BagError
 
@@ -120,45 +120,35 @@ class McapFile:
 
         Raises BagError if a block is damaged or not what its index says.
         """
-        if self._prepared is not None:
-            for blocks in self._prepared.groups(channels):
-                yield blocks[-1], self._prepared_batches(blocks, channels)
-            return
-        for block in self.contents.blocks:
-            yield block, self.block_batches(block, channels)
+        alone = ([block] for block in self.contents.blocks)
+        groups = alone if self._prepared is None else self._prepared.groups(channels)
+        for blocks in groups:
+            yield blocks[-1], self._batches(blocks, channels)
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Batches:
         """The messages of one block, one batch per channel that has any."""
-        index = block.index
-        if index is not None and not any(channel in index for channel in channels):
-            return
-        if isinstance(block, ListedBlock):
-            yield from self._prepared_batches([block], channels)
-            return
-        where = f"the message index of the chunk at byte {block.offset}"
-        buffer = self.content(block)
-        if index is None:
-            walked = walk_messages(buffer)
-            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
-            where = f"the block at byte {block.offset}"
-        else:
-            wanted = [c for c in channels if c in index]
-            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
-        for channel in channels:
-            if channel in offsets and len(offsets[channel]):
-                batch = messages_at(buffer, offsets[channel], channel, where)
-                _refuse_earlier(batch, block)
-                yield channel, batch
+        return self._batches([block], channels)
 
-    def _prepared_batches(
-        self, blocks: Sequence[ListedBlock], channels: Collection[int]
-    ) -> Batches:
-        """The messages of blocks that the summary lists, one batch per channel that has any."""
-        assert self._prepared is not None
-        buffer, offsets, edges = self._prepared.records(blocks, channels)
-        where = f"the message index of the chunk at byte {blocks[0].offset}"
+    def _batches(self, blocks: Sequence[Block], channels: Collection[int]) -> Batches:
+        first = blocks[0]
+        index = first.index
+        if index is not None and len(blocks) == 1 and not any(c in index for c in channels):
+            return
+        where = f"the message index of the chunk at byte {first.offset}"
         if len(blocks) > 1:
             where += f", or of one up to byte {blocks[-1].offset},"
+        edges = None
+        if self._prepared is not None:
+            buffer, offsets, edges = self._prepared.records(blocks, channels)
+        elif index is None:
+            where = f"the block at byte {first.offset}"
+            buffer = self.content(first)
+            walked = walk_messages(buffer)
+            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
+        else:
+            buffer = self.content(first)
+            wanted = [c for c in channels if c in index]
+            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
         for channel in channels:
             found = offsets.get(channel)
             if found is not None and len(found):

@@ -187,7 +187,7 @@ class Prepared:
         self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
         self._runs: tuple[IntArray, IntArray] = _sorted(), _sorted()  # first bytes, ends
 
-    def groups(self, channels: Collection[int]) -> Iterator[list[ListedBlock]]:
+    def groups(self, channels: Collection[int]) -> Iterator[Sequence[Block]]:
         """What `records` takes, in the order of the file: the chunks of a window that are not
         compressed together, a compressed one alone.
         """
@@ -200,7 +200,7 @@ class Prepared:
             at = self._place[window[-1].offset] + 1
 
     def records(
-        self, blocks: Sequence[ListedBlock], channels: Collection[int]
+        self, wanted: Sequence[Block], channels: Collection[int]
     ) -> tuple[bytes, dict[int, IntArray], IntArray]:
         """Records of one of the `groups`, or of any one block; where in them each channel's
         messages begin; and where any of them ends at the latest.
@@ -208,6 +208,7 @@ class Prepared:
         They are those of the wanted messages, one behind the other; of a compressed block, all.
         """
         self._want(channels)
+        blocks = [block for block in wanted if isinstance(block, ListedBlock)]
         first, last = blocks[0], blocks[-1]
         if first.offset not in self._ready:
             self._prepare(list(self._window(self._place[first.offset])))

@@ -102,12 +102,8 @@ def read_columns(
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
     growing = {topic: _Growing(topic) for topic in topics}
-    total = sum(c.count for c in bag.channels if c.topic in readers)
-    done = 0
-    for channel, batch in bag.batches(list(readers)):
+    for channel, batch in bag.batches(list(readers), progress=progress):
         growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
-        done += len(batch)
-        progress("reading", done / max(total, 1))
     return {
         topic: growing.pop(topic).columns(list(wanted), stamped=readers[topic].stamped)
         for topic, wanted in topics.items()

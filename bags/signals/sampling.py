@@ -227,10 +227,6 @@ class Sampler:
             self._operate(k, stamp_ns, value)
         return self._release(-math.inf)
 
-    def excite(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
-        """Take every factor of the excitations from one message; the samples certain now."""
-        return self.take(stamp_ns, dict(enumerate(values, start=len(self.responses))))
-
     def feed(self, k: int, stamp_ns: int, value: float) -> list[Sample]:
         """Take a number of signal k (as `numbers` counts), its operations done already."""
         self.add(k, stamp_ns, value)

@@ -145,10 +145,14 @@ def export_grid(
     did = []
     for name, samples in read.items():
         found = resample(samples, at_ns, hold=name in held, max_gap=max_gap)
-        table[name] = found.values
-        off = found.error + _rounding(samples.values)
-        what = "held; from one message to the next it changes" if name in held else "off"
-        did.append(f"{name}: {what} by at most {off:.2g}")
+        title, rounding = name.removesuffix(f"|clock({grid.clock})"), _rounding(samples.values)
+        table[title] = found.values
+        if name not in held:
+            did.append(f"{title}: off by at most {found.error + rounding:.2g}")
+            continue
+        said = f"{title}: held; from one message to the next it changes by at most"
+        off = f"; off by at most {rounding:.2g}, as float64" if rounding else ""
+        did.append(f"{said} {found.error:.2g}{off}")
     with _temporary(out) as file, closing(_WRITERS[form](file)) as writer:
         writer.write(table)
     return did
@@ -242,11 +246,10 @@ def _written(
         topic: _Table(bag, topic, columns, pattern.with_name(names[topic] + pattern.suffix))
         for topic, columns in wanted.items()
     }
-    total, done = sum(c.count for c in bag.channels if c.topic in tables), 0
     with ExitStack() as stack:
         for table in tables.values():
             stack.callback(table.close)
-        for channel, batch, later_ns in bag.parts(list(tables)):
+        for channel, batch, later_ns in bag.parts(list(tables), progress=progress):
             try:
                 if channel.topic in tables:
                     tables[channel.topic].add(batch, later_ns)
@@ -255,8 +258,6 @@ def _written(
                     raise
                 left_out.append(str(error))
                 tables.pop(channel.topic).remove()
-            done += len(batch)
-            progress("reading", done / max(total, 1))
         for table in tables.values():
             table.write_until(NEVER)
     return {table.file.name: table.rows for table in tables.values() if table.rows}

@@ -1,4 +1,4 @@
-"""A table (CSV, MAT) to a bag of standard messages."""
+"""A table (CSV) to a bag of standard messages."""
 
 import csv
 import math
@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
-from scipy.io import loadmat
 
 from bags.recordings.message_types import fields_of, is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
@@ -28,12 +27,10 @@ STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an in
 TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
-MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
+SUFFIXES: Final = (".csv", ".txt", ".dat")
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
 _TITLE: Final = re.compile(r"(?P<name>.+?)(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
-_COLUMN: Final = re.compile(
-    r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
-)
+_COLUMN: Final = re.compile(r"([^\[\]]+)\[(\d{1,6})\]")
 
 
 @dataclass(frozen=True)
@@ -84,53 +81,36 @@ class Imported:
 
 
 def column_of(tables: Mapping[str, FloatArray], text: str) -> FloatArray:
-    """`table`, `table[column]` or `table[row, :]`; DataError lists what there is."""
-    table, row, index = _parsed(text)
-    if table not in tables:
+    """`title`, or `name[column]` of a table without titles; DataError lists what there is."""
+    match = None if text in tables else _COLUMN.fullmatch(text)
+    name, index = (text, "") if match is None else match.groups("")
+    if name not in tables:
         shapes = listed(f"{name} {'x'.join(map(str, t.shape))}" for name, t in tables.items())
-        raise DataError(f"no table '{table}'; there are: {shapes}{did_you_mean(table, tables)}")
-    values = tables[table]
-    if values.ndim == 1 and row is None and index is None:
+        raise DataError(f"no table '{name}'; there are: {shapes}{did_you_mean(name, tables)}")
+    values = tables[name]
+    if values.ndim == 1 and not index:
         return values
-    if values.ndim != 2 or (row is None and index is None):
-        raise DataError(
-            f"'{text}' has shape {values.shape}; name one column, {table}[0], or where time "
-            f"runs along the rows one row, {table}[0, :]"
-        )
-    number, count = (row, values.shape[0]) if index is None else (index, values.shape[1])
-    assert number is not None
-    if number >= count:
-        what = "rows" if index is None else "columns"
-        raise DataError(f"'{text}': the table has {what} 0 to {count - 1}")
-    found: FloatArray = values[number] if index is None else values[:, number]
+    if values.ndim == 1 or not index:
+        raise DataError(f"'{text}' has shape {values.shape}; name one column, as in {name}[0]")
+    if int(index) >= values.shape[1]:
+        raise DataError(f"'{text}': the table has columns 0 to {values.shape[1] - 1}")
+    found: FloatArray = values[:, int(index)]
     return found
 
 
-def _parsed(text: str) -> tuple[str, int | None, int | None]:
-    """(table, row, column) of a column's text."""
-    match = _COLUMN.fullmatch(text)
-    if match is None:
-        return text, None, None
-    row, index = match["row"], match["index"]
-    return match["table"], None if row is None else int(row), None if index is None else int(index)
-
-
 def read_table(file: Path | str) -> dict[str, FloatArray]:
-    """Read every numeric array of a file, (rows,) or (rows, columns), by its name.
+    """Read the numbers of a CSV file, (rows,) or (rows, columns), by name.
 
-    A CSV file without a header is one table by the file's name; with one, each column is a table by
-    its own name, an empty cell is NaN, and a column without a number is left out. In MAT files (up
-    to version 7.2) each numeric array is one, those in a struct by `struct.field`; nothing in them
-    is evaluated. Raises DataError for a file that is none of these or holds no numbers.
+    Without a header it is one table by the file's name; with one, each column is a table by its own
+    name, an empty cell is NaN, and a column without a number is left out. Raises DataError for a
+    file that is no CSV or holds no numbers.
     """
     path = Path(file)
     if path.stat().st_size > MAX_TABLE_BYTES:
         raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
-    readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise DataError(f"{path}: unknown kind; known are {', '.join(readers)}")
-    found = reader(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"{path}: unknown kind; known are {', '.join(SUFFIXES)}")
+    found = _csv(path)
     if not found:
         raise DataError(f"{path} holds no table of numbers")
     return found
@@ -396,44 +376,6 @@ def _csv_by_cells(
             raise DataError(f"{path}: '{texts[0][1]}' in {where} is no number")
         table[:, k] = [float(cell) if cell else np.nan for _, cell in column]
     return table
-
-
-def _mat(path: Path) -> dict[str, FloatArray]:
-    try:
-        content = loadmat(path, squeeze_me=False)
-    except NotImplementedError as error:
-        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
-    except Exception as error:  # scipy raises what the bytes make it raise
-        raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
-    found: dict[str, FloatArray] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):  # what the file format keeps for itself
-            _collect(name, value, found)
-    return found
-
-
-def _collect(name: str, value: Any, found: dict[str, FloatArray], depth: int = 0) -> None:
-    """The numeric arrays in a MATLAB value, those of a struct by `name.field`."""
-    if _is_table(value):
-        found[name] = _column(value)
-    elif isinstance(value, np.ndarray) and value.size == 1 and depth < MAX_STRUCT_DEPTH:
-        for field in value.dtype.names or ():
-            _collect(f"{name}.{field}", value.flat[0][field], found, depth + 1)
-
-
-def _is_table(value: Any) -> bool:
-    return (
-        isinstance(value, np.ndarray)
-        and value.ndim in (1, 2)
-        and value.size > 0
-        and (np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating))
-    )
-
-
-def _column(value: Any) -> FloatArray:
-    """As float64; a matrix of one row or column as that row or column."""
-    table = np.asarray(value, dtype=np.float64)
-    return table.ravel() if table.ndim == 2 and 1 in table.shape else table
 
 
 def _is_number(text: str) -> bool:

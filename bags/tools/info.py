@@ -157,11 +157,8 @@ def bag_info(
             for topic, msgtype in bag.topics.items()
             if topics is None or topic in topics
         }
-        total, done = sum(c.count for c in bag.channels if c.topic in found), 0
-        for channel, batch in bag.batches(list(found)):
+        for channel, batch in bag.batches(list(found), progress=progress):
             found[channel.topic].add(batch, bag.strand(channel))
-            done += len(batch)
-            progress("reading", done / max(total, 1))
         return BagInfo(
             path=bag.path,
             files=len(bag.files),

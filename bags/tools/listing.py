@@ -46,11 +46,8 @@ def bag_signals(bag: Bag, *, progress: Progress = silent) -> list[Listed]:
     """Every number of every topic, in the order of the topics; reads the whole bag once."""
     topics = {topic: _Topic(bag, topic) for topic in bag.topics}
     wanted = [topic for topic, listing in topics.items() if listing.names]
-    total, done = sum(c.count for c in bag.channels if c.topic in wanted), 0
-    for channel, batch in bag.batches(wanted):
+    for channel, batch in bag.batches(wanted, progress=progress):
         topics[channel.topic].read(batch)
-        done += len(batch)
-        progress("reading", done / max(total, 1))
     return [listed for listing in topics.values() for listed in listing.listed()]
 
 

@@ -25,7 +25,7 @@ from bags.samples import f1tenth, schunk
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
 from bags.tools.fitness import Level, check_fitness
-from bags.tools.importing import Rows, column_of, import_table, read_table
+from bags.tools.importing import Rows, import_table, read_table
 from bags.tools.info import bag_info
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.identification import Polynomial, identify
@@ -509,19 +509,6 @@ def import_speed(tmp_path: Path, text: str, rows: Rows) -> str:
     return import_table(tmp_path / "log.csv", out, [f"{SPEED}=speed"], types=types, rows=rows).times
 
 
-def test_mat_files_are_tables_too(tmp_path: Path) -> None:
-    from scipy.io import savemat
-
-    t, q = np.arange(20) * 0.1, np.sin(np.arange(20.0))
-    savemat(tmp_path / "a.mat", {"t": t, "q": np.column_stack([q, 2 * q]), "note": "text"})
-    assert set(read_table(tmp_path / "a.mat")) == {"t", "q"}
-    out, types = tmp_path / "bag", {"/arm": JOINT_TYPE}
-    assignments = ["/arm:position[name=a.b]=q[1]"]
-    import_table(tmp_path / "a.mat", out, assignments, types=types, rows=Rows(time="t"))
-    found = read_signals(out, ["/arm:position[name=a.b]"])["/arm:position[name=a.b]"]
-    np.testing.assert_array_equal(found.values, 2 * q)
-
-
 @pytest.mark.parametrize(
     ("title", "asked", "first", "scale", "said"),
     [
@@ -613,25 +600,6 @@ def test_times_that_no_stamp_can_say_are_refused(
     with pytest.raises(DataError, match=message):
         import_speed(tmp_path, text, rows)
     assert not (tmp_path / "bag").exists()
-
-
-def test_tables_in_matlab_structs_are_offered_and_its_own_workspace_is_not(tmp_path: Path) -> None:
-    from scipy.io import savemat
-
-    inner = {"angle": np.arange(12.0).reshape(2, 6), "name": "arm"}
-    savemat(tmp_path / "a.mat", {"rec": {"arm": inner, "t": 0.1 * np.arange(6)}, "n": 3.0})
-    tables = read_table(tmp_path / "a.mat")
-    assert set(tables) == {"rec.arm.angle", "rec.t", "n"}
-    row = column_of(tables, "rec.arm.angle[1, :]")
-    assert row.tolist() == [6.0, 7.0, 8.0, 9.0, 10.0, 11.0]
-    assert column_of(tables, "rec.arm.angle[:, 1]").tolist() == [1.0, 7.0]
-    with pytest.raises(DataError, match=r"has rows 0 to 1"):
-        column_of(tables, "rec.arm.angle[2, :]")
-    kuka = sorted((SHARED / "kuka_kr300").glob("*.mat"))
-    if kuka:
-        tables = read_table(kuka[0])
-        assert len(column_of(tables, "rec.act_pos_mot_deg[5, :]")) == 2501
-        assert not [name for name in tables if name.startswith("__")]
 
 
 @pytest.mark.parametrize(
