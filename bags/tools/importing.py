@@ -12,12 +12,13 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import fields_of, is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.reader import stamp_text
-from bags.signals.signal import SignalPath, Step
+from bags.signals.signal import SignalPath
 from bags.signals.units import UNITS
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError

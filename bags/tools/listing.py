@@ -12,9 +12,10 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import decode, fields_of
 from bags.signals.columns import TopicReader
-from bags.signals.signal import ANGLES, QUATERNION, SignalPath, Step, numeric_paths
+from bags.signals.signal import ANGLES, QUATERNION, SignalPath, numeric_paths
 from bags.signals.units import implied_unit
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
