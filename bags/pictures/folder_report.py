@@ -269,9 +269,9 @@ def _recorded(alike: Sequence[tuple[BagInfo, TopicInfo]]) -> str:
         f"{info.path.name} and {len(others)} more" if others else info.path.name,
         topic.topic,
         _between([each.count for each in topics]),
-        _between([each.rate for each in topics], " Hz"),
+        _between([each.times.rate for each in topics], " Hz"),
         str(topic.times.gaps),
-        _between([max(each.longest for each in topics)], " s"),
+        _between([max(each.times.longest for each in topics)], " s"),
         "not counted" if None in lost else _between([of for of in lost if of is not None]),
         "; ".join(_remarks(info, topic)) or "none",
     ]

@@ -204,7 +204,7 @@ class Bag:
         """Messages of each topic as metadata.yaml states them."""
         if self._described.topics is None:
             return None
-        return {topic: described.count for topic, described in self._described.topics.items()}
+        return {topic: described.messages for topic, described in self._described.topics.items()}
 
     def _there(self, topic: str) -> int:
         return sum(channel.count for channel in self.channels if channel.topic == topic)

@@ -31,7 +31,7 @@ _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class DescribedTopic(NamedTuple):
     """What metadata.yaml says of a topic: messages, how they are serialised, what was offered."""
 
-    count: int
+    messages: int
     encoding: str
     offered: tuple[Profile, ...]
 
@@ -211,7 +211,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
             topic = str(entry["topic_metadata"]["name"])
             before = topics.get(topic, DescribedTopic(0, "", ()))
             topics[topic] = DescribedTopic(
-                before.count + int(entry["message_count"]),
+                before.messages + int(entry["message_count"]),
                 str(entry["topic_metadata"].get("serialization_format", "cdr")),
                 (*before.offered, *offered(entry["topic_metadata"].get(KEY))),
             )
