@@ -6,7 +6,7 @@ together. Memory: one chunk and its index, and what is returned.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -24,7 +24,7 @@ STAMP: Final = (
     (Step("header"), Step("stamp"), Step("sec")),
     (Step("header"), Step("stamp"), Step("nanosec")),
 )
-LOG, PUBLISH, STAMPS, SEQUENCE = "log", "publish", "stamps", "sequence"  # no signal's names
+MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +101,10 @@ def read_columns(
     for name, signal in signals.items():
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
-    growing = {topic: _Growing(topic) for topic in topics}
+    growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
     for channel, batch in bag.batches(list(readers), progress=progress):
         growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
-    return {
-        topic: growing.pop(topic).columns(list(wanted), stamped=readers[topic].stamped)
-        for topic, wanted in topics.items()
-    }
+    return {topic: growing.pop(topic).columns() for topic in topics}
 
 
 def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
@@ -139,11 +136,11 @@ class TopicReader:
         self._where = f"{bag.path}: {topic}"
         self._topic = topic
         self._signals = signals
-        self.stamped = is_stamped(msgtype, types)
+        self._stamped = is_stamped(msgtype, types)
         self._done = 0
         self._kind = msgtype, types
         self._targets = {n: s.targets(msgtype, types) for n, s in signals.items() if not s.framed}
-        targets: list[tuple[Step, ...]] = list(STAMP) if self.stamped else []
+        targets: list[tuple[Step, ...]] = list(STAMP) if self._stamped else []
         targets += [target for group in self._targets.values() for target in group]
         self._gatherer = Gatherer(msgtype, types, targets)
 
@@ -156,9 +153,9 @@ class TopicReader:
                 f"{self._where}: message {self._done + error.row} cannot be read: {error}"
             ) from error
         self._done += len(batch)
-        at = len(STAMP) if self.stamped else 0
+        at = len(STAMP) if self._stamped else 0
         stamp_ns = None
-        if self.stamped:
+        if self._stamped:
             stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
         values: dict[str, Numbers] = {}
         values |= {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
@@ -187,36 +184,47 @@ def _check(bag: Bag, path: SignalPath) -> None:
 
 
 class _Growing:
-    """One topic's columns while they are read, in parts that are let go of as they are joined."""
+    """One topic's columns while they are read: memory for what the bag announces, within reason."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, bag: Bag, topic: str, names: Sequence[str]) -> None:
+        announced = sum(channel.count for channel in bag.channels if channel.topic == topic)
+        capacity = min(announced, MAX_ANNOUNCED)
         self._topic = topic
-        self._parts: dict[str, list[Numbers]] = {}
+        self._names = names
+        self._stamped = is_stamped(*bag.types_on(topic))
+        self._times = np.empty((4 if self._stamped else 3, capacity), dtype=np.int64)
+        self._values = np.empty((len(names), capacity))
+        self._length = 0
         self._order = LogOrder()
 
     def append(self, channel: int, part: Columns) -> None:
         self._order.add(channel, part.log_ns)
-        times = {LOG: part.log_ns, PUBLISH: part.publish_ns, SEQUENCE: part.sequence}
+        start, self._length = self._length, self._length + len(part)
+        if self._length > self._times.shape[1]:
+            more = max(self._length, 2 * self._times.shape[1]) - start
+            self._times = np.pad(self._times[:, :start], ((0, 0), (0, more)))
+            self._values = np.pad(self._values[:, :start], ((0, 0), (0, more)))
+        here = slice(start, self._length)
+        self._times[0, here] = part.log_ns
+        self._times[1, here] = part.publish_ns
+        self._times[2, here] = part.sequence
         if part.stamp_ns is not None:
-            times[STAMPS] = part.stamp_ns
-        for name, array in {**times, **part.values}.items():
-            self._parts.setdefault(name, []).append(array)
+            self._times[3, here] = part.stamp_ns
+        for row, name in enumerate(self._names):
+            self._values[row, here] = part.values[name]
 
-    def columns(self, names: Sequence[str], *, stamped: bool) -> Columns:
+    def columns(self) -> Columns:
         """By log time; the sort is stable, so equal log times stay as recorded."""
-        values = {name: self._whole(name, np.float64) for name in names}
-        found = Columns(
+        times, values = self._times[:, : self._length], self._values[:, : self._length]
+        if (np.diff(times[0]) < 0).any():
+            order = np.argsort(times[0], kind="stable")
+            times, values = times[:, order], values[:, order]
+        return Columns(
             self._topic,
-            self._whole(LOG, np.int64),
-            self._whole(PUBLISH, np.int64),
-            self._whole(STAMPS, np.int64) if stamped else None,
-            values,
-            self._whole(SEQUENCE, np.int64),
+            times[0],
+            times[1],
+            times[3] if self._stamped else None,
+            dict(zip(self._names, values, strict=True)),
+            times[2],
             self._order.back,
         )
-        if (np.diff(found.log_ns) < 0).any():
-            return found.select(np.argsort(found.log_ns, kind="stable"))
-        return found
-
-    def _whole(self, name: str, kind: type) -> Any:
-        return np.concatenate([*self._parts.pop(name, []), np.empty(0, kind)])

@@ -124,14 +124,7 @@ def to_trajectories(
         runs = [run for run in _whole_runs(runs[0], gap_ns) if len(run) >= MIN_STRETCH]
         if not runs:
             raise DataError(f"{name}: no stretch of {MIN_STRETCH} samples without a gap")
-    labels = {
-        "y_names": tuple(samples.path for samples in responses),
-        "u_names": tuple(product(samples.path for samples in part) for part in parts),
-        "y_units": tuple(samples.unit for samples in responses),
-        "u_units": tuple(part[0].unit if len(part) == 1 else "" for part in parts),
-        "y_paths": tuple(samples.path for samples in responses),
-        "u_paths": tuple(held),
-    }
+    y_paths = tuple(samples.path for samples in responses)
     trials = []
     for k, run in enumerate(runs, start=1):
         _refuse_incomplete(run, name)
@@ -145,7 +138,12 @@ def to_trajectories(
                 u=u,
                 name=name if len(runs) == 1 else f"{name}.{k}",
                 provenance=canonical(said).decode() if said else "",
-                **labels,
+                y_names=y_paths,
+                u_names=tuple(product(samples.path for samples in part) for part in parts),
+                y_units=tuple(samples.unit for samples in responses),
+                u_units=tuple(part[0].unit if len(part) == 1 else "" for part in parts),
+                y_paths=y_paths,
+                u_paths=tuple(held),
             )
         )
     return trials
