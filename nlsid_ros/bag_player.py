@@ -46,7 +46,7 @@ class BagPlayer(ManagedNode):
         self._opened = ExitStack()
         bag = self._opened.enter_context(Bag(self.values.bag))
         topics = [topic for topic in self.values.topics if topic] or list(bag.topics)
-        self._publishers: dict[str, Publisher] = {
+        self._players: dict[str, Publisher] = {
             topic: self.create_publisher(
                 message_class(bag.types_on(topic)[0]), topic, qos.playing_of(bag.offered(topic))
             )
@@ -65,7 +65,7 @@ class BagPlayer(ManagedNode):
     def _await_listeners(self) -> None:
         """Have it played once every topic is listened to."""
         wanted, most = self.values.wait_for, self.values.wait_timeout
-        missing = [t for t, p in self._publishers.items() if p.get_subscription_count() < wanted]
+        missing = [t for t, p in self._players.items() if p.get_subscription_count() < wanted]
         if missing and time.monotonic() - self._began > most:
             self.end(
                 DataError(
@@ -85,7 +85,7 @@ class BagPlayer(ManagedNode):
         now_ns = time.monotonic_ns() - self._later_ns
         try:
             while self._message is not None and self._message.log_time_ns <= now_ns:
-                self._publishers[self._message.topic].publish(self._message.data)
+                self._players[self._message.topic].publish(self._message.data)
                 self._message = next(self._messages, None)
         except NlsidError as error:
             self.end(error)
@@ -93,7 +93,7 @@ class BagPlayer(ManagedNode):
         if self._message is not None:
             arm(self._playing, self._message.log_time_ns - now_ns)
             return
-        for publisher in self._publishers.values():
+        for publisher in self._players.values():
             publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE))
         self.get_logger().info(f"played {self.values.bag}")
         self.end()

@@ -1,9 +1,8 @@
 """Node `funnel_publisher`: checks a funnel's proof, then publishes the design, latched.
 
 Publishes ~/design (std_msgs/String, transient local): the files of model, policy, funnel and proof
-as one bundle, which whoever uses it has decided again; ~/tube (visualization_msgs/MarkerArray) and
-~/nominal (trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses
-what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
+as one bundle, which whoever uses it has decided again. Publishes again when the files change.
+Refuses what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
 from pathlib import Path
@@ -12,19 +11,15 @@ from types import SimpleNamespace
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
-from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
 from bags.designs.bundle import Bundle, Check
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.pictures import nominal_trajectory, tube_markers
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
 LOOK = 0.2  # s between looks at the files, and at a check that is on
-REDRAW = 1.0  # s between pictures, which last three
 
 
 class FunnelPublisher(ManagedNode):
@@ -38,18 +33,17 @@ class FunnelPublisher(ManagedNode):
             "funnel.json, with its proof beside it, or composition.proof.json with its stages",
             tunable=True,
         ),
-        Parameter("frame", "map", "frame the tube is drawn in and moves with"),
     )
 
     def read_parameters(self) -> None:
         """Begin with nothing published."""
-        self._latched: dict[str, Publisher] = {}
+        self._latched: Publisher | None = None
         self._check: Check | None = None
 
     def tune(self, values: SimpleNamespace) -> None:
         """Publish another funnel, if it is proved."""
         path = Path(values.funnel)
-        if self._latched:
+        if self._latched is not None:
             self._publish(*self._load(path))
             self._call_off()
             self._seen = self._files(path)
@@ -63,23 +57,15 @@ class FunnelPublisher(ManagedNode):
     def start(self) -> None:
         """Check, publish latched, and say what was proved."""
         self.keep_reporting(self._report)
-        self._latched = {
-            name: self.create_publisher(kind, f"~/{name}", qos.DOCUMENT)
-            for name, kind in (
-                ("design", String),
-                ("tube", MarkerArray),
-                ("nominal", JointTrajectory),
-            )
-        }
+        self._latched = self.create_publisher(String, "~/design", qos.DOCUMENT)
         self._seen = self._files(self._path)
         self._publish(*self._load(self._path))
-        self.every(REDRAW, self._draw)
         self.every(LOOK, self._look)
 
     def stop(self) -> None:
         """Publish no more."""
         self._call_off()
-        self._latched = {}
+        self._latched = None
 
     def _files(self, path: Path) -> list[tuple[int, int]]:
         """When each file last changed, and its size."""
@@ -134,20 +120,11 @@ class FunnelPublisher(ManagedNode):
         self.get_logger().fatal(f"not published, not proved: {refusal}")
 
     def _publish(self, bundle: Bundle, verdict: str) -> None:
-        design = bundle.design()
-        self._latched["design"].publish(String(data=bundle.text()))
-        self._drawn = design
-        self._draw()
-        if design.policy is not None:
-            self._latched["nominal"].publish(nominal_trajectory(design))
+        assert self._latched is not None
+        bundle.design()  # it can be used
+        self._latched.publish(String(data=bundle.text()))
         self._say(DiagnosticStatus.OK, verdict)
         self.get_logger().info(verdict)
-
-    def _draw(self) -> None:
-        """Again and again: the picture goes when the publisher does."""
-        if self._drawn.policy is not None:  # without a plan there is nothing to draw
-            now = self.get_clock().now().to_msg()
-            self._latched["tube"].publish(tube_markers(self._drawn, self.values.frame, now))
 
     def _say(self, level: bytes, message: str) -> None:
         self._said = level, message
