@@ -43,17 +43,18 @@ class BagPlayer(ManagedNode):
 
         Raises BagError if the bag cannot be read, DataError if a type is not installed.
         """
-        self._opened = ExitStack()
-        bag = self._opened.enter_context(Bag(self.values.bag))
-        topics = [topic for topic in self.values.topics if topic] or list(bag.topics)
-        self._players: dict[str, Publisher] = {
-            topic: self.create_publisher(
-                message_class(bag.types_on(topic)[0]), topic, qos.playing_of(bag.offered(topic))
-            )
-            for topic in topics
-        }
-        self._messages = bag.messages(topics)
-        self._message = next(self._messages, None)
+        with ExitStack() as opened:
+            bag = opened.enter_context(Bag(self.values.bag))
+            topics = [topic for topic in self.values.topics if topic] or list(bag.topics)
+            self._players: dict[str, Publisher] = {
+                topic: self.create_publisher(
+                    message_class(bag.types_on(topic)[0]), topic, qos.playing_of(bag.offered(topic))
+                )
+                for topic in topics
+            }
+            self._messages = bag.messages(topics)
+            self._message = next(self._messages, None)
+            self._opened = opened.pop_all()
         self._began = time.monotonic()
         self._playing = self.later(self._play)
         self._waiting = self.every(LOOK, self._await_listeners)

@@ -78,7 +78,8 @@ class Excitation(ManagedNode):
         """Find the signal and the limits; DataError if there are none."""
         values = self.values
         self._command = SignalMessage(self._signal(), values.command_type, values.others)
-        self._period, self._recorder = values.period, values.recorder.rstrip("/")
+        self._period: float = values.period
+        self._recorder: str = values.recorder.rstrip("/")
         self._shape = Shape(
             lowest=values.lowest,
             highest=values.highest,

@@ -414,7 +414,7 @@ class FunnelMonitor(ManagedNode):
         if found is None or not len(found[1].t) or found[0] == self._foreseen_ns:
             return
         self._foreseen_ns, (_, (t, low, high, _)) = found[0], found
-        numbers = {}
+        numbers: dict[str, float] = {}
         for i in range(low.shape[1]):
             index = f"[{i}]" if low.shape[1] > 1 else ""
             numbers |= {f"low{index}": float(low[-1, i]), f"high{index}": float(high[-1, i])}

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import rclpy
 
 from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.designs.design import AnyDesign
 from bags.designs.documents import Proved, load_proved
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
@@ -152,7 +153,7 @@ def _decoded(recording: Path, topic: str) -> Iterator[tuple[int, bytes, Any]]:
             yield message.log_time_ns, message.data, decode(message.data, msgtype, types)
 
 
-def _replayed(proved: Proved, bag: Path) -> Replay:
+def _replayed(proved: Proved[AnyDesign], bag: Path) -> Replay:
     return replay_bag(proved, bag, centre=Centre.COMMAND)
 
 
