@@ -1,5 +1,6 @@
 """Nodes as real processes, over real DDS."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -27,7 +28,8 @@ from nlsid_ros import qos
 
 SpinUntil = Callable[[Callable[[], bool]], None]
 ROOT = Path(__file__).parents[2]
-STARTED = 60.0  # s: patience with a process or with discovery on a busy machine
+LOAD = os.getloadavg()[0] / (os.cpu_count() or 1)  # processes that want each processor
+STARTED = 60.0 * min(max(1.0, LOAD), 4.0)  # s: patience with a process or with discovery
 
 ros_test = [
     pytest.mark.ros,
@@ -162,7 +164,8 @@ class Bench:
 
     def __init__(self, stack: ExitStack, name: str = "test_robot") -> None:
         self.stack = stack
-        self.node, self.spin_until = stack.enter_context(node_here(name))
+        self.node, self._spin_until = stack.enter_context(node_here(name))
+        self._started: list[subprocess.Popen[str]] = []
         self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
         self.levels: dict[str, bytes] = {}
         self.listen(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
@@ -175,13 +178,25 @@ class Bench:
 
     def start(self, name: str, **parameters: object) -> subprocess.Popen[str]:
         """Start a node of nlsid."""
-        return self.stack.enter_context(process(f"nlsid_ros.{name}", **parameters))
+        self._started.append(self.stack.enter_context(process(f"nlsid_ros.{name}", **parameters)))
+        return self._started[-1]
+
+    def spin_until(self, condition: Callable[[], bool]) -> None:
+        """Wait until it holds; fails with what a node printed that ended with status 1."""
+
+        def holds() -> bool:
+            for each in self._started:
+                if each.poll() == 1 and each.stdout is not None:
+                    raise AssertionError(each.stdout.read())
+            return condition()
+
+        self._spin_until(holds)
 
     def listen(
         self,
         kind: type,
         topic: str,
-        callback: Callable[[Any], object],
+        callback: Callable[[Any], None],
         profile: QoSProfile = qos.STREAM,
     ) -> None:
         """Subscribe."""

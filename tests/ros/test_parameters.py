@@ -19,10 +19,10 @@ from tests.ros.processes import Bench, refusal, ros_test
 
 pytestmark = ros_test
 TRIAL = str(f1tenth()[4])
-MOVED = {"highest": 0.4, "slew": 1.0}
-RECORDED = {"topics": "[/x]"}
-IDENTIFIED = {"bags": f"['{TRIAL}']", "config": str(config_file("f1tenth.yaml"))}
-NOTHING = {  # by which a node refuses to start
+MOVED: dict[str, object] = {"highest": 0.4, "slew": 1.0}
+RECORDED: dict[str, object] = {"topics": "[/x]"}
+IDENTIFIED: dict[str, object] = {"bags": f"['{TRIAL}']", "config": str(config_file("f1tenth.yaml"))}
+NOTHING: dict[str, tuple[dict[str, object], str]] = {  # by which a node refuses to start
     "excitation": ({}, "to what the robot may do"),
     "trajectory_recorder": ({}, "no topics to record; set the parameter topics"),
     "model_identifier": ({}, "set the parameters bags and out"),
