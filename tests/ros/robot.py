@@ -35,7 +35,7 @@ class Robot(Bench):
         self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
         self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
 
-    def watched(self, says: str = "no speed yet", **settings: object) -> None:
+    def watched(self, says: str = "no speed yet", /, **settings: object) -> None:
         """Start a monitor, which takes parameters, and wait until it says something."""
         self.start("funnel_monitor", **settings)
         self.hears(says)

@@ -106,7 +106,7 @@ class Joints(Bench):
         super().__init__(stack)
         self.period_ns = round(period * 1e9)
         self.period = self.period_ns / 1e9
-        self.x = np.zeros(n)  # the newest state
+        self.x: FloatArray = np.zeros(n)  # the newest state
         self.commands: dict[int, FloatArray] = {}
         self.margins: dict[int, float] = {}
         self.states = self.node.create_publisher(JointState, "/joints", qos.STREAM)

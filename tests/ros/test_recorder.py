@@ -55,7 +55,7 @@ class Joints(Bench):
         self.joints = self.node.create_publisher(JointState, "/joints", qos.STREAM)
 
     def records(
-        self, publisher: Publisher | None = None, **settings: object
+        self, publisher: Publisher | None = None, /, **settings: object
     ) -> "subprocess.Popen[str]":
         """Start a recorder, and wait until it hears the publisher."""
         recorder = self.start(RECORDER, **settings)
