@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,10 +81,11 @@ class Driven(Robot):
         *,
         ahead: float = 0.0,
         frame: str = "",
+        speed: float = 0.0,
         margin_at: float | None = None,
         judging: str = "",
     ) -> list[int]:
-        """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
+        """Responses in real time; their stamps (ns), `ahead` s of now at the first.
 
         margin_at: a monitor's verdict comes with each, stamped so many s from it. judging: of which
         funnel and run it says to be; empty: of the controller's.
@@ -94,6 +96,7 @@ class Driven(Robot):
         for k, stamp_ns in enumerate(stamps):
             message = Odometry()
             message.header.stamp, message.header.frame_id = stamp_of(stamp_ns), frame
+            message.twist.twist.linear.x = speed
             self.odom.publish(message)
             if margin_at is not None:
                 of_ns = stamp_ns + round(margin_at * 1e9)
@@ -128,17 +131,22 @@ def test_every_sample_has_its_command_even_if_stamps_lead_the_clock(
     robot.spin_until(lambda: set(heard) <= robot.commands.keys())
 
 
-@pytest.mark.parametrize(("ahead", "way"), [(3600.0, "after"), (-3600.0, "before")])
-def test_stamps_of_another_hour_stop_it_by_name(robot: Driven, ahead: float, way: str) -> None:
-    robot.begins()
-    robot.feed(3, ahead=ahead)
-    robot.expect_stop(f"a response is stamped 3.6e+03 s {way} this node's clock")
-
-
-def test_another_frame_stops_it_by_name(robot: Driven) -> None:
+@pytest.mark.parametrize(
+    ("fed", "because"),
+    [
+        ({"frame": "odom", "ahead": 3600.0}, "a response is stamped 3.6e+03 s after this node's"),
+        ({"frame": "odom", "ahead": -3600.0}, "a response is stamped 3.6e+03 s before this node's"),
+        ({"frame": "map"}, "the response is in frame 'map', not in 'odom'"),
+        ({"frame": "odom", "speed": math.nan}, "speed is nan"),
+    ],
+    ids=["ahead", "old", "another frame", "no number"],
+)
+def test_a_response_that_is_none_stops_it_by_name(
+    robot: Driven, fed: dict[str, Any], because: str
+) -> None:
     robot.begins(response_frame="odom")
-    robot.feed(3, frame="map")
-    robot.expect_stop("the response is in frame 'map', not in 'odom'")
+    robot.feed(3, **fed)
+    robot.expect_stop(because)
 
 
 def test_a_slow_stop_rate_does_not_keep_it_moving(robot: Driven) -> None:
@@ -327,21 +335,6 @@ def test_a_robot_that_falls_silent_is_stopped(stage: Callable[..., Stage]) -> No
     robot.track()
     robot.plant.kill()
     robot.expect_ramp_down("the response stopped coming")
-
-
-def test_a_state_that_is_no_number_stops_it(stage: Callable[..., Stage]) -> None:
-    robot = stage()
-    robot.track()
-    second = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
-    message = Odometry()
-    message.twist.twist.linear.x = math.nan
-
-    def heard() -> bool:
-        second.publish(message)  # a reader that is just being matched does not get the first one
-        return robot.has_said("idle; stopped", NAME)
-
-    robot.spin_until(heard)
-    robot.expect_ramp_down("speed is nan")
 
 
 def test_the_same_design_again_in_mid_run_does_not_stop_it(

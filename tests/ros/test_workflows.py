@@ -503,12 +503,12 @@ def test_a_running_robot_is_looked_at_for_a_first_configuration(
     assert settings.grid.period == pytest.approx(0.05, rel=0.05)
     assert settings.split.share is not None
     assert "topics:=[/command, /motion]" in done.stdout
-    assert "nlsid identify TRIALS" in done.stdout
+    assert f"nlsid identify {tmp_path} TRIALS" in done.stdout
 
 
 def test_where_nothing_runs_this_is_said(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     done = init_live(config, "1")
     assert done.returncode == 2
-    assert "nothing was heard" in done.stderr or "no number varies" in done.stderr
+    assert "nothing was heard" in done.stderr
     assert not config.exists()
