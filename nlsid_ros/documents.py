@@ -11,6 +11,7 @@ from std_msgs.msg import String
 
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
 from bags.designs.design import AnyDesign, Wiring
+from nlsid_core.deciding import USUAL, Limits
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.running import ManagedNode, Parameter
@@ -22,7 +23,22 @@ OF_A_CONTINUOUS = (
     "of a continuous funnel: topic:field paths separated by commas, all on one topic; empty: the "
     "model says it"
 )
+CHECK = (
+    Parameter(
+        "check_seconds",
+        USUAL.seconds,
+        "s of processor time that the check of a proof may take",
+        (1, 3600),
+    ),
+    Parameter(
+        "check_memory",
+        USUAL.memory,
+        "MB of memory that the check of a proof may take",
+        (64, 10**6),
+    ),
+)
 DESIGN = (
+    *CHECK,
     Parameter("source", "funnel_publisher", "node that publishes the funnel"),
     Parameter("response", "", f"the state {OF_A_CONTINUOUS}"),
     Parameter("command", "", f"the inputs {OF_A_CONTINUOUS}"),
@@ -58,6 +74,11 @@ def expected_of(values: SimpleNamespace) -> str:
     return "sha256:" + expected.removeprefix("sha256:") if expected else ""
 
 
+def limits_of(values: SimpleNamespace) -> Limits:
+    """What the check of a proof may take, by the parameters of CHECK."""
+    return Limits(values.check_seconds, values.check_memory)
+
+
 class Unproved:
     """In the place of a `DesignSubscription`: a policy from files, of which nothing is proved."""
 
@@ -85,6 +106,7 @@ class DesignSubscription:
     ) -> None:
         self._node, self._taken, self._changed = node, taken, changed
         self._wiring, self._expected = wiring_of(node.values), expected_of(node.values)
+        self._limits = limits_of(node.values)
         self._check: Check | None = None
         self._waiting: str | None = None
         self._used = ""  # the text of the design in use
@@ -165,7 +187,7 @@ class DesignSubscription:
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:
-                self._check = Check(text)
+                self._check = Check(text, self._limits)
             except OSError as error:
                 self._refuse(f"it cannot be checked: {error}")
                 return
