@@ -72,7 +72,7 @@ class Cascade:
         """a1, b1, a2, b2 and the coefficients of f."""
         return [self.theta[at] for at in self.places]
 
-    def moved(self, **numbers: FloatArray) -> "Cascade":
+    def moved(self, numbers: dict[str, FloatArray]) -> "Cascade":
         """With other numbers, called as in `places`; their sizes may change."""
         names = ("a1", "b1", "a2", "b2", "c")
         known = dict(zip(names, self.numbers, strict=True)) | numbers
@@ -243,7 +243,7 @@ def _random_start(
     flat = Cascade(made.orders, 1, made.begin == "measured", f, np.concatenate(parts))
     x = flat.inner(trials)
     gain = 1.0 / float(np.std(x))
-    flat = replace(flat.moved(b1=gain * b1), f=_knots(gain * x, START_INTERVALS))
+    flat = replace(flat.moved({"b1": gain * b1}), f=_knots(gain * x, START_INTERVALS))
     problem = replace(flat.problem(trials, np.inf), bend=None)
     return replace(flat, theta=best_for(problem, flat.theta, flat.places[4], RIDGE))
 
@@ -266,7 +266,7 @@ def _with_intervals(cascade: Cascade, trials: tuple[Trial, ...], intervals: int)
     x = np.linspace(f.low, f.low + f.spacing * intervals, FINE * intervals)
     basis = f.moves(np.zeros(intervals + 3), x).T
     fitted = np.linalg.lstsq(basis, cascade.f.values(c, x), rcond=None)[0]
-    return replace(cascade.moved(c=fitted), f=f)
+    return replace(cascade.moved({"c": fitted}), f=f)
 
 
 def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
@@ -284,7 +284,7 @@ def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
         targets.append(np.stack([_late(x, j / phases)[inside] for j in range(1, phases)], axis=1))
     shifted = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
     b1 = np.concatenate([cascade.theta[b1_at], shifted.T])
-    wide = cascade.moved(b1=b1, b2=np.zeros((phases, b2_at.shape[1])))
+    wide = cascade.moved({"b1": b1, "b2": np.zeros((phases, b2_at.shape[1]))})
     problem = replace(wide.problem(search.known, np.inf), bend=None)
     return replace(wide, theta=best_for(problem, wide.theta, wide.places[3].ravel()))
 
