@@ -182,8 +182,9 @@ def set_constraints(
         shift = np.array(variables(names.x)[: len(names.x) - n_v], dtype=object)
         inside = domain + _domain(rows, names.v)
         part = conditions.implicit_derivatives(
-            e - f, shift, storage, (names.v, names.x), delta=0, rate=rate, domain=inside
+            e - f, shift, storage, (names.v, names.x), delta=0, rate=rate
         )
+        part = replace(part, domain=inside)
         of_set = [_minus(part, _diagonal(S, rows.weight)), Inequality(storage)]
     else:
         E = conditions.slopes([_renamed(p, names) for p in e], names.x)

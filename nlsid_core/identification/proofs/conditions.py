@@ -94,7 +94,6 @@ def implicit_derivatives(
     *,
     delta: Number = 1,
     rate: Number = 1,
-    domain: Domain = (),
 ) -> Inequality:
     """2ν'(H₁ν + H₂Δ) + |Δ|²_{ρ²M - δI} - |[ν; ÃΔ]|²_M ≥ 0 for every ν, Δ, as a matrix.
 
@@ -108,7 +107,7 @@ def implicit_derivatives(
     side = H2 - _product(M[:n_v, n_v:], A)
     kept = _product(A.T, _product(M[n_v:, n_v:], A))
     corner = rate**2 * M - delta * _identity(len(x)) - kept
-    return Inequality(filled(np.block([[top, side], [side.T, corner]])), domain)
+    return Inequality(filled(np.block([[top, side], [side.T, corner]])))
 
 
 def monotone(h: Polynomials, v: Sequence[str], m: Number, *, domain: Domain = ()) -> Inequality:

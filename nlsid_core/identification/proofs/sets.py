@@ -9,7 +9,7 @@ In each, V falls by δ|x - x̂|² or more a sample. What the kernel decides is s
 Source: thesis Lemmas 2.11 and 2.13, (2.19), Theorem 2.5.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +67,8 @@ def inequalities(
         assert storage is not None
         shift = exact_polynomials(model.shift, (*names.x, *names.w))
         inside = known + _domain(names.v, ends[: len(names.v)])
-        found["stable"] = conditions.implicit_derivatives(
-            h, shift, storage, (names.v, names.x), delta=delta, domain=inside
-        )
+        part = conditions.implicit_derivatives(h, shift, storage, (names.v, names.x), delta=delta)
+        found["stable"] = replace(part, domain=inside)
         found["storage"] = Inequality(storage)
     else:
         e, f = _separated(model, names)
