@@ -88,15 +88,15 @@ class Top:
 
     def values(self, p: FloatArray, x: FloatArray) -> FloatArray:
         """f(x)."""
-        return np.minimum(x, p[0])
+        return np.asarray(np.minimum(x, p[0]))
 
     def slopes(self, p: FloatArray, x: FloatArray) -> FloatArray:
         """f'(x)."""
-        return (x <= p[0]).astype(np.float64)
+        return np.asarray((x <= p[0]).astype(np.float64))
 
     def moves(self, p: FloatArray, x: FloatArray) -> FloatArray:
         """∂f/∂top."""
-        return (x > p[0]).astype(np.float64)[None]
+        return np.asarray((x > p[0]).astype(np.float64)[None])
 
     def knots(self, p: FloatArray) -> FloatArray:
         """The top."""
@@ -104,7 +104,7 @@ class Top:
 
     def before(self, p: FloatArray, after: FloatArray) -> FloatArray:
         """Points below the top."""
-        return after[after < p[0]]
+        return np.asarray(after[after < p[0]])
 
 
 class DeadZone:
@@ -116,7 +116,7 @@ class DeadZone:
 
     def slopes(self, p: FloatArray, x: FloatArray) -> FloatArray:
         """f'(x)."""
-        return (np.abs(x) > p[0]).astype(np.float64)
+        return np.asarray((np.abs(x) > p[0]).astype(np.float64))
 
     def moves(self, p: FloatArray, x: FloatArray) -> FloatArray:
         """∂f/∂[half, rest]."""

@@ -91,6 +91,18 @@ class Signals:
         """How many samples are given, of all signals."""
         return sum(node.given for node in self.nodes if isinstance(node, Signal))
 
+    @cached_property
+    def chained(self) -> set[int]:
+        """The numbers whose derivatives another one needs, and that of y."""
+        later = {
+            part.source
+            for number, node in enumerate(self.nodes, self.inputs + 1)
+            if isinstance(node, Signal)
+            for part in node.taps
+            if part.source < number
+        }
+        return later | {self.output}
+
     def own_maps(self, number: int) -> list[tuple[Taps, Mapped]]:
         """The taps of a signal that are of maps of it."""
         node, first = self.nodes[number - self.inputs - 1], self.inputs + 1
@@ -146,8 +158,9 @@ class Signals:
             direct = np.zeros((G + len(theta), N))
             if isinstance(node, Mapped):
                 p, x, rows = theta[node.at], sources[node.source], live[node.source]
-                direct[rows] = node.function.slopes(p, x) * moved[node.source][rows]
-                direct[G + node.at] += node.function.moves(p, x)
+                if number in self.chained:
+                    direct[rows] = node.function.slopes(p, x) * moved[node.source][rows]
+                    direct[G + node.at] += node.function.moves(p, x)
                 moved.append(direct)
                 live.append(sorted({*rows, *(G + node.at).tolist()}))
                 continue
@@ -241,7 +254,7 @@ def _compiled(function: Bent, p: FloatArray) -> Callable[[float], float]:
 
     def at(x: float) -> float:
         i = bisect_right(inner, x)
-        return float(values[i] + slopes[i] * (x - knots[i]))
+        return values[i] + slopes[i] * (x - knots[i])  # type: ignore[no-any-return]
 
     return at
 
