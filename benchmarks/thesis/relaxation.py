@@ -45,7 +45,6 @@ def sample_funnel(
     samples: int = 4,
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
-    gain: str = "constant",
     progress: Progress = silent,
 ) -> Sampled:
     """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
@@ -55,9 +54,7 @@ def sample_funnel(
     """
     if samples < 2:
         raise DataError(f"{samples} samples an interval: its two ends are the least")
-    setting = prepare(
-        ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
-    )
+    setting = prepare(ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R))
     steps, policy = setting.steps, setting.policy
     instants = sections(steps, policy, setting.P, count=samples)
     margin = setting.margin(setting.rho_final)

@@ -127,7 +127,7 @@ def diagnosed(
         for case, solution in enumerate(found):
             left = solution.upper + growth / rho
             if worst is None or left < worst[0]:
-                worst = (left, section, rho, case, steps.weights(solution))
+                worst = (left, section, rho, case, solution.y)
     if worst is None:  # no program was solved: the mean over the boundary is all there is
         y = np.full(len(steps.program.points), 1 / len(steps.program.points))
         worst = (0.0, sections[0], rhos[0], 0, y)

@@ -106,8 +106,8 @@ class Hold:
             )
         if self.period and not (policy.u.is_continuous() and policy.K.is_continuous()):
             raise DataError(
-                "a hold needs a policy that does not jump at knots: take gain='linear', and inputs "
-                "of the nominal that are continuous"
+                "a hold needs a policy that does not jump at knots: neither its gain nor its "
+                "motion's inputs"
             )
 
     def widths(self, policy: ContinuousPolicy, rates: FloatArray) -> FloatArray:

@@ -111,10 +111,8 @@ class LSteps:
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
     field's `is_pushed`). kappa: (intervals, n_w), if it is bounded; tightness: the same over
     1/max|x̄'Pg| (None: 1). local: what the dynamics are on an interval, where a search expands them
-    anew; else they are the field. carries: whether a dual of one section bounds φ at others.
+    anew; else they are the field.
     """
-
-    carries = True
 
     def __init__(
         self,
@@ -206,10 +204,6 @@ class LSteps:
     def cases(self) -> int:
         """Vertices times corners times modes."""
         return len(self.vertices) * len(self.corners) * len(self.modes)
-
-    def weights(self, solution: SphereSolution) -> FloatArray:
-        """(N,) of the program's points in the dual bound."""
-        return np.asarray(solution.y)
 
     def split(self, case: int) -> tuple[int, int, IntArray]:
         """The vertex, the corner and the mode of a case."""

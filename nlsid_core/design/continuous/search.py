@@ -13,7 +13,6 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.finer import Unproved
@@ -30,7 +29,7 @@ from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import validity_caps
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.dynamics.taylor import field_of
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
@@ -182,11 +181,6 @@ def _unheld(setting: Setting, progress: Progress) -> Found:
     if setting.expansion is not None:
         return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
     caps = validity_caps(setting.steps.field, setting.policy, setting.P)
-    cliques = CliqueSteps.of(setting.steps)
-    if cliques is not None:
-        with suppress(Infeasible, SolverError):  # then with every product
-            _, funnel, proved, margin = _swept(replace(setting, steps=cliques), caps, progress)
-            return Found(setting, funnel, proved, margin)
     return _swept(setting, caps, progress)
 
 

@@ -104,7 +104,7 @@ def _largest(
 
     feasible, infeasible = 0.0, np.inf
     best: list[SphereSolution] | None = None
-    limited, exact = len(steps.limits) > 0, steps.carries
+    limited = len(steps.limits) > 0
     for _ in range(MAX_TRIES + steps.cases):  # one that fails is solved for one case
         if cap <= LOWEST * after:
             break
@@ -124,7 +124,7 @@ def _largest(
         found = steps.solve(section, here(rho), duals, least=least, enough=enough)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
-            if (exact and not limited) or rho >= cap:  # else `predicted` may be too low
+            if not limited or rho >= cap:  # else `predicted` may be too low
                 return rho, found
             done = rho <= NEAR * feasible
             feasible, best = rho, found
@@ -132,7 +132,7 @@ def _largest(
                 break
         else:
             infeasible = min(infeasible, rho)
-        duals, exact = found, True
+        duals = found
     if best is None:
         kept = steps.as_it_is()
 
