@@ -16,6 +16,7 @@ Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Tod
 
 from dataclasses import dataclass, field, replace
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -37,8 +38,18 @@ REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; 
 REFINEMENTS = 1  # a second one was never seen to change the number of iterations
 CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
 CERTIFY_FROM = 1e-6  # of the spread; from here rounding may undo what an iteration gains
-WARM_GAP = 0.03  # of the spread: closer to the optimum an iterate is no good start for another g
+WARM_GAP = 0.03  # of the spread: what an iterate for another g has where that differs much
+WARM_ROOM = 3.0  # times what g differs by: closer to the optimum an iterate is no good start
 WARM_CLEARANCE = 0.5  # of the distance to the boundary that a warm start has to keep
+
+
+class Iterate(NamedTuple):
+    """X, y and m of the normalised problem on the way to its solution, and upper - m there."""
+
+    X: FloatArray
+    y: FloatArray
+    m: float
+    gap: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +57,9 @@ class SphereSolution:
     """m ≤ max m ≤ upper, and the multipliers that show it.
 
     m: shown up to rounding by X (k, k); upper: the dual bound, from y (N,). Both in the unit of g.
-    gap: (upper - m) relative to the spread of g. centred: an earlier iterate (X, y, m) of the
-    normalised problem, far enough from the boundary to start a similar problem from. tau: (L, n+1,
-    n+1) Gram matrices of multipliers chosen before, whose products are in g.
+    gap: (upper - m) relative to the spread of g. path: the iterates before it, from any of which a
+    similar problem can be started. tau: (L, n+1, n+1) Gram matrices of multipliers chosen before,
+    whose products are in g.
     """
 
     m: float
@@ -57,7 +68,7 @@ class SphereSolution:
     y: FloatArray
     gap: float
     iterations: int
-    centred: tuple[FloatArray, FloatArray, float]
+    path: tuple[Iterate, ...]
     tau: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
 
@@ -156,10 +167,8 @@ class SphereProgram:
             raise DataError("g is not finite on the sphere")
         middle, spread = float(values.mean()), float(np.ptp(values))
         if spread <= 1e-15 * abs(middle):
-            middle_point = (self._unit, self._centre, -1.0)
-            return SphereSolution(
-                middle, middle, 0 * self._unit, self._centre, 0.0, 0, middle_point
-            )
+            path = (Iterate(self._unit, self._centre, -1.0, 1.0),)
+            return SphereSolution(middle, middle, 0 * self._unit, self._centre, 0.0, 0, path)
         wanted = (enough - middle) / spread
         found = _solved(self, (values - middle) / spread, tolerance, start, wanted)
         return SphereSolution(
@@ -169,7 +178,7 @@ class SphereProgram:
             y=found.y,
             gap=found.gap,
             iterations=found.iterations,
-            centred=found.centred,
+            path=found.path,
         )
 
     def gram(self, solution: SphereSolution) -> FloatArray:
@@ -210,10 +219,10 @@ def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> S
         ),
         tolerance=tolerance,
     )
-    centred = _first_iterate(program, g, None)
+    first = Iterate(*_first_iterate(program, g, None), gap=1.0)
     y, m = found.z[: len(g)] / found.z[: len(g)].sum(), float(found.x[0])
     X, upper = conic.smat(found.x[1:]), float(g @ y)
-    return _certified(program, g, SphereSolution(m, upper, X, y, upper - m, 0, centred))
+    return _certified(program, g, SphereSolution(m, upper, X, y, upper - m, 0, (first,)))
 
 
 def _interior_point(
@@ -228,14 +237,14 @@ def _interior_point(
     k = V.shape[1]
     X, y, m = _first_iterate(program, g, start)
     best: SphereSolution | None = None
+    path: tuple[Iterate, ...] = ()
     M, work = (np.zeros((len(g), len(g)), order="F") for _ in range(2))  # lower triangles, reused
     for iteration in range(MAX_ITERATIONS + 1):
         Z = (V.T * y) @ V
         upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
-        if upper - m >= WARM_GAP or iteration == 0:
-            centred = (X, y, m)
+        path += (Iterate(X, y, m, upper - m),)
         if upper - m <= max(tolerance, CERTIFY_FROM, m - enough):
-            found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
+            found = SphereSolution(m, upper, X, y, upper - m, iteration, path)
             found = _certified(program, g, found)
             if best is not None and found.gap >= best.gap:
                 return best
@@ -290,11 +299,25 @@ def _first_iterate(
         clearance = 1.0
     else:
         # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.
-        X, y, m = start.centred
+        X, y, m = _nearby(program, g, start.path)
         clearance = WARM_CLEARANCE * _lowest(program, X)
     X = _corrected(program, X, g - m)
     shift = max(0.0, clearance - _lowest(program, X)) if start else clearance - _lowest(program, X)
     return X + shift * program._unit, y, m - shift
+
+
+def _nearby(
+    program: SphereProgram, g: FloatArray, path: tuple[Iterate, ...]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Of another g's iterates the last that is as far from its boundary as the two g differ."""
+    V, (X, y, m, _) = program._V, path[0]
+    differ = float(np.ptp(g - m - np.einsum("ij,ij->i", V @ X, V)))
+    least = min(WARM_GAP, WARM_ROOM * differ)
+    for iterate in path:
+        if iterate.gap < least:
+            break
+        X, y, m, _ = iterate
+    return X, y, m
 
 
 def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> SphereSolution:

@@ -27,7 +27,7 @@ from nlsid_core.design.continuous.lstep import sections
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import Ends, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -165,14 +165,8 @@ def _free(setting: Setting, progress: Progress) -> FloatArray:
     steps, policy, P = setting.steps, setting.policy, setting.P
     caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
-    rho, _ = sweep_rho(
-        steps,
-        sections(steps, policy, P),
-        margin=setting.margin(rho_final),
-        rho_final=rho_final,
-        caps=caps,
-        progress=progress,
-    )
+    wanted = Wanted(setting.margin(rho_final), rho_final, caps)
+    rho, _ = sweep_rho(steps, sections(steps, policy, P), wanted, progress)
     return rho
 
 
@@ -193,16 +187,8 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
     expected = setting.hold is not None and setting.hold.rates is not None
 
     def search(margin: float) -> Swept:
-        found = sweep_rho(
-            steps,
-            pairs,
-            margin=margin,
-            rho_final=rho_final,
-            caps=caps,
-            expected=expected,
-            progress=progress,
-        )
-        return Swept(setting, *found)
+        wanted = Wanted(margin, rho_final, caps, expected)
+        return Swept(setting, *sweep_rho(steps, pairs, wanted, progress))
 
     return proved_for(setting, rho_final, search)
 

@@ -17,7 +17,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_basis, prove_pieces, unsolved
-from nlsid_core.design.continuous.sweep import Ends, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
 from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, Infeasible, SolverError
@@ -150,13 +150,8 @@ def _normalised(
     """
     P, final = funnel.P, float(funnel.rho[-1])
     for _ in range(SWEEPS):
-        rho, _ = sweep_rho(
-            steps,
-            sections(steps, policy, P),
-            margin=margin,
-            rho_final=final,
-            caps=INSIDE * validity_caps(steps.field, policy, P),
-        )
+        caps = INSIDE * validity_caps(steps.field, policy, P)
+        rho, _ = sweep_rho(steps, sections(steps, policy, P), Wanted(margin, final, caps))
         P, final = P / rho[:, None, None], 1.0
         if np.abs(rho - 1).max() < NEAR:
             break
