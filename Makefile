@@ -73,7 +73,7 @@ $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report)
 
 $(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
-	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)view$(COMMA)fleet$(COMMA)test)
+	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)fleet$(COMMA)test)
 
 $(VENV)/.docs: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report$(COMMA)docs)
