@@ -449,13 +449,8 @@ def _witnessed(
         rho = funnel.rho[k] + _ends(pieces)[end] * (funnel.rho[k + 1] - funnel.rho[k])
         tau[:, end, 0, 0, 0] = constant / rho
         tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * (bent.swapaxes(1, 2) @ bent)
-        maps: dict[bytes, FloatArray] = {}  # of a part of time: the same for all of its rates
-        for b, A in enumerate(frames.inverse):
-            key = A.tobytes()
-            if key not in maps:
-                maps[key] = substitution(pieces.basis, A)
-            M = maps[key]
-            gram[b, end] = M.T @ found[b] @ M
+        M = substitution(pieces.basis, frames.inverse)
+        gram[:, end] = M.swapaxes(1, 2) @ found @ M
     return replace(batch, pieces=stated_multipliers(replace(pieces, tau=tau, gram=gram)))
 
 

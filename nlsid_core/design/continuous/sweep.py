@@ -6,7 +6,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -168,10 +168,10 @@ class _Instant:
 
 def _root(slack: Callable[[float], float], low: float, high: float) -> float:
     """The largest r in [low, high] with slack(r) ≥ 0, nearly, after a coarse look from above."""
+    slack = cache(slack)  # a search between two values asks for them again
     if slack(high) >= 0:
         return high
-    step = 0.9
-    inside = high
+    step, inside = 0.99, high
     while inside > low and slack(inside) < 0:
         high, inside = inside, inside * step
         step *= step
