@@ -73,6 +73,37 @@ class SphereSolution:
 
 
 @dataclass(frozen=True, eq=False)
+class _AtPoints:
+    """V (N, k): at the points v = root⁻¹·weight·monomials, which is orthonormal on the sphere.
+
+    whiten: (k, k), v by the monomials. unit: (k, k), v'(unit)v = 1 on the sphere, and unit_root its
+    inverse Cholesky factor. centre: (N,) weights of the mean on the sphere. normal: (N, N) Cholesky
+    factor of (VV')².
+    """
+
+    V: FloatArray
+    whiten: FloatArray
+    unit: FloatArray
+    unit_root: FloatArray
+    centre: FloatArray
+    normal: FloatArray
+
+    @classmethod
+    def of(cls, basis: IntArray, weight: FloatArray, points: FloatArray) -> "_AtPoints":
+        """Raises SolverError if the points do not determine every product."""
+        moments = _sphere_moments(basis) * np.outer(weight, weight)
+        values, vectors = np.linalg.eigh(moments)
+        whiten = (vectors / np.sqrt(values)) @ vectors.T * weight
+        V = monomial_values(basis, points) @ whiten.T
+        factor, info = lapack.dpotrf((V @ V.T) ** 2, lower=1, clean=1)
+        if info:
+            raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
+        root = np.linalg.inv(np.linalg.cholesky(moments))
+        centre = _sphere_means(factor, V)
+        return cls(V, whiten, moments, root, centre, np.asfortranarray(factor))
+
+
+@dataclass(frozen=True, eq=False)
 class SphereProgram:
     """Everything that depends on the number of variables only; build it once and solve often.
 
@@ -81,7 +112,7 @@ class SphereProgram:
     takes all variables as nonlinear. constant: whether v has the 1, with which g may have terms of
     degree 1 in the others; where all are nonlinear, the sphere has it as the sum of squares.
     basis: (k, n) exponents of v, lower degree first; weight:
-    (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
+    (k,), Σ (weight·monomial)² = 1 on the sphere.
     points: (N, n) where g has to be evaluated.
 
     Raises DataError if there is no nonlinear variable, n < 2, or half is neither 2 nor 3.
@@ -91,19 +122,13 @@ class SphereProgram:
     nonlinear: tuple[int, ...] | None = None
     half: int = 2
     constant: bool = False
-    chosen: tuple[int, ...] = field(init=False)
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
     points: FloatArray = field(init=False)
-    _V: FloatArray = field(init=False)
-    _whiten: FloatArray = field(init=False)
-    _unit: FloatArray = field(init=False)
-    _unit_root: FloatArray = field(init=False)
-    _centre: FloatArray = field(init=False)
-    _normal: FloatArray = field(init=False)
+    _at: "_AtPoints" = field(init=False)
 
     def __post_init__(self) -> None:
-        chosen = tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
+        chosen = self.chosen
         if self.n < 2 or not chosen or not set(chosen) <= set(range(self.n)):
             raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n, n >= 2")
         if self.half not in (2, 3) or (self.half == 3 and len(chosen) < self.n):
@@ -118,31 +143,13 @@ class SphereProgram:
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis, self.half)
         weight = weights_of(basis, np.isin(np.arange(self.n), chosen))
-        moments = _sphere_moments(basis) * np.outer(weight, weight)
-        values, vectors = np.linalg.eigh(moments)
-        # v = root⁻¹·weight·monomials is orthonormal on the sphere, and v'(moments)v = 1 there.
-        whiten = (vectors / np.sqrt(values)) @ vectors.T * weight
-        V = monomial_values(basis, points) @ whiten.T
-        normal = (V @ V.T) ** 2
-        factor, info = lapack.dpotrf(normal, lower=1, clean=1)
-        if info:
-            raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
-        centre = _sphere_means(factor, V)
-        object.__setattr__(self, "chosen", chosen)
-        keep(
-            self,
-            {
-                "basis": basis,
-                "weight": weight,
-                "points": points,
-                "_V": V,
-                "_whiten": whiten,
-                "_unit": moments,
-                "_unit_root": np.linalg.inv(np.linalg.cholesky(moments)),
-                "_centre": centre,
-                "_normal": np.asfortranarray(factor),
-            },
-        )
+        keep(self, {"basis": basis, "weight": weight, "points": points})
+        object.__setattr__(self, "_at", _AtPoints.of(basis, weight, points))
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The nonlinear variables, or all."""
+        return tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
 
     def solve(
         self,
@@ -167,8 +174,8 @@ class SphereProgram:
             raise DataError("g is not finite on the sphere")
         middle, spread = float(values.mean()), float(np.ptp(values))
         if spread <= 1e-15 * abs(middle):
-            path = (Iterate(self._unit, self._centre, -1.0, 1.0),)
-            return SphereSolution(middle, middle, 0 * self._unit, self._centre, 0.0, 0, path)
+            path = (Iterate(self._at.unit, self._at.centre, -1.0, 1.0),)
+            return SphereSolution(middle, middle, 0 * self._at.unit, self._at.centre, 0.0, 0, path)
         wanted = (enough - middle) / spread
         found = _solved(self, (values - middle) / spread, tolerance, start, wanted)
         return SphereSolution(
@@ -183,7 +190,7 @@ class SphereProgram:
 
     def gram(self, solution: SphereSolution) -> FloatArray:
         """(k, k) Gram matrix of the solution in the monomials `basis`."""
-        Q = self._whiten.T @ solution.X @ self._whiten
+        Q = self._at.whiten.T @ solution.X @ self._at.whiten
         return np.asarray((Q + Q.T) / 2)
 
 
@@ -205,9 +212,9 @@ def _solved(
 
 def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> SphereSolution:
     """The same program as cone data, x = [m, svec X]."""
-    k = program._V.shape[1]
+    k = program._at.V.shape[1]
     i, j = conic.triangle(k)
-    rows = program._V[:, i] * program._V[:, j] * np.where(i == j, 1.0, conic.SQRT2)
+    rows = program._at.V[:, i] * program._at.V[:, j] * np.where(i == j, 1.0, conic.SQRT2)
     size = 1 + len(i)
     found = conic.solve(
         ConeProgram(
@@ -233,7 +240,7 @@ def _interior_point(
     enough: float,
 ) -> SphereSolution:
     """Predictor-corrector along the HKM direction, for g of spread 1."""
-    V, ones = program._V, np.ones(len(g))
+    V, ones = program._at.V, np.ones(len(g))
     k = V.shape[1]
     X, y, m = _first_iterate(program, g, start)
     best: SphereSolution | None = None
@@ -295,7 +302,7 @@ def _first_iterate(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Strictly feasible X, y, m: the least-norm X that meets the equalities, shifted."""
     if start is None:
-        X, y, m = 0 * program._unit, program._centre, float(np.min(g))
+        X, y, m = 0 * program._at.unit, program._at.centre, float(np.min(g))
         clearance = 1.0
     else:
         # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.
@@ -303,14 +310,14 @@ def _first_iterate(
         clearance = WARM_CLEARANCE * _lowest(program, X)
     X = _corrected(program, X, g - m)
     shift = max(0.0, clearance - _lowest(program, X)) if start else clearance - _lowest(program, X)
-    return X + shift * program._unit, y, m - shift
+    return X + shift * program._at.unit, y, m - shift
 
 
 def _nearby(
     program: SphereProgram, g: FloatArray, path: tuple[Iterate, ...]
 ) -> tuple[FloatArray, FloatArray, float]:
     """Of another g's iterates the last that is as far from its boundary as the two g differ."""
-    V, (X, y, m, _) = program._V, path[0]
+    V, (X, y, m, _) = program._at.V, path[0]
     differ = float(np.ptp(g - m - np.einsum("ij,ij->i", V @ X, V)))
     least = min(WARM_GAP, WARM_ROOM * differ)
     for iterate in path:
@@ -325,20 +332,20 @@ def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> 
     X = _corrected(program, found.X, g - found.m)
     shift = max(0.0, -_lowest(program, X)) * (1 + 1e-6)
     m = found.m - shift
-    return replace(found, X=X + shift * program._unit, m=m, gap=found.upper - m)
+    return replace(found, X=X + shift * program._at.unit, m=m, gap=found.upper - m)
 
 
 def _lowest(program: SphereProgram, X: FloatArray) -> float:
     """The largest t with X - t·unit ⪰ 0; v'(unit)v = 1 on the sphere, so m moves by t."""
-    relative = program._unit_root @ X @ program._unit_root.T
+    relative = program._at.unit_root @ X @ program._at.unit_root.T
     return float(np.linalg.eigvalsh(_symmetric(relative))[0])
 
 
 def _corrected(program: SphereProgram, X: FloatArray, values: FloatArray) -> FloatArray:
     """X plus the least-norm matrix that makes v_i'Xv_i equal the values."""
-    V = program._V
+    V = program._at.V
     residual = values - np.einsum("ij,ij->i", V @ X, V)
-    w = lapack.dpotrs(program._normal, residual, lower=1)[0]
+    w = lapack.dpotrs(program._at.normal, residual, lower=1)[0]
     X = X + (V.T * w) @ V
     return np.asarray((X + X.T) / 2)
 

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, Section, sections
 from nlsid_core.design.continuous.setting import Setting
@@ -137,17 +138,9 @@ def held_sweep(
     margin = setting.margin(rho_final)
     if expansion is not None:
         steps.field = expansion.linear()
-        found = sweep_expanded(
-            expansion,
-            steps,
-            policy,
-            P,
-            margin=margin,
-            rho_final=rho_final,
-            caps=caps,
-            most_back=MOST_BACK,
-            progress=progress,
-        )
+        expanded = replace(setting, steps=steps, expansion=expansion)
+        wanted = Wanted(margin, rho_final, caps)
+        found = sweep_expanded(expanded, wanted, most_back=MOST_BACK, progress=progress)
         return found.rho, field_of(found.cubics, policy.t)
     caps = np.minimum(validity_caps(steps.field, policy, P), caps)
     rho_final = min(rho_final, float(caps[-1]))

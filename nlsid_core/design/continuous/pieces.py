@@ -142,7 +142,7 @@ def _pieces(
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
             section = section_at(steps, policy, funnel.P, i, s)
-            T += [np.sqrt(rho_here) * section.base] * steps.cases
+            T += [np.sqrt(rho_here) * section.shape.base] * steps.cases
             rho += [rho_here] * steps.cases
             rows += known[i, s]
         blank = draft(steps, parts, np.array(T))

@@ -14,7 +14,8 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.held_sweep import (
@@ -195,17 +196,8 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
 
 def _expanded(setting: Setting, progress: Progress, margin: float) -> Swept:
     """The sweep that expands the dynamics around what it finds; the setting has their field."""
-    assert setting.expansion is not None
     steps, policy = setting.steps, setting.policy
-    found = sweep_expanded(
-        setting.expansion,
-        steps,
-        policy,
-        setting.P,
-        margin=margin,
-        rho_final=setting.rho_final,
-        progress=progress,
-    )
+    found = sweep_expanded(setting, Wanted(margin, setting.rho_final), progress=progress)
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)

@@ -98,7 +98,6 @@ def enlarge_shape(
     funnel: ContinuousFunnel,
     *,
     margin: float,
-    iterations: int = MAX_ITERATIONS,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> tuple[ContinuousFunnel, Proved, list[tuple[str, float]]]:
@@ -114,7 +113,7 @@ def enlarge_shape(
     present = _normalised(steps, policy, funnel, ROOM * margin)
     found = [_Kept(present, steps.kappa)]
     ends = solve_ends(steps, policy, present, executor=executor)
-    for iteration in range(iterations):
+    for iteration in range(MAX_ITERATIONS):
         enlarged = _enlarged(steps, policy, present, ends, margin, executor)
         if enlarged is None:
             break
@@ -213,11 +212,8 @@ def _enlarged(
     try:
         D = improve(
             forms.samples,
-            forms.pairs,
-            len(weights),
             proof_basis(steps.program),
             weights=weights,
-            margins=forms.margins,
             trust=TRUST,
             bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)],
         )
