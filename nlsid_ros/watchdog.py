@@ -7,8 +7,8 @@ that waits for ever, no other thread of Python runs.
 
 A node that works wakes ten times a second. It stands still if its first thread has been asleep
 all the time without waking once. That is not so while it computes, reads or writes a disk, or is
-stopped by a signal. On a machine that gives it no time it is not asleep either; and what waits for
-another thread, or a watchdog that is itself not given any time, counts nothing.
+stopped by a signal. On a machine that gives it no time it is not asleep either. Time in which a
+thread waits to run, or in which the watchdog itself is given none, counts nothing.
 """
 
 import os
@@ -21,6 +21,7 @@ from pathlib import Path
 TICK = 0.1  # s between looks
 PATIENCE = 2.0  # s
 WANTS_TO_RUN = "RD"  # states of a thread that is ready to run, or waits for a disk
+Threads = dict[str, tuple[str, int]]  # by number: state, and how often it went to sleep
 
 
 def thread(folder: Path) -> tuple[str, int]:
@@ -30,7 +31,7 @@ def thread(folder: Path) -> tuple[str, int]:
     return said["State"].split()[0], sum(map(int, switches))
 
 
-def threads(pid: int) -> dict[str, tuple[str, int]]:
+def threads(pid: int) -> Threads:
     """Return state and switches of each thread of a process; none of one that is gone."""
     found = {}
     for folder in Path(f"/proc/{pid}/task").glob("*"):
@@ -39,14 +40,15 @@ def threads(pid: int) -> dict[str, tuple[str, int]]:
     return found
 
 
-def stands_still(
-    pid: int, before: dict[str, tuple[str, int]], now: dict[str, tuple[str, int]]
-) -> bool:
-    """Return whether the first thread slept since `before`, and no thread was kept from running."""
+def slept(pid: int, before: Threads, now: Threads) -> bool:
+    """Return whether the first thread has been asleep since `before` without waking."""
     first = now.get(str(pid), ("", 0))
-    if first[0] != "S" or before.get(str(pid)) != first:
-        return False
-    return not any(
+    return first[0] == "S" and before.get(str(pid)) == first
+
+
+def is_starved(before: Threads, now: Threads) -> bool:
+    """Return whether a thread has wanted to run since `before` and could not."""
+    return any(
         state in WANTS_TO_RUN and before.get(tid) == (state, switches)
         for tid, (state, switches) in now.items()
     )
@@ -54,14 +56,16 @@ def stands_still(
 
 def watch(pid: int, name: str) -> None:
     """End the process `pid`, whose child this is, once it stands still; return when it is gone."""
-    still, has_woken, before = 0, False, threads(pid)
+    still, before = 0, threads(pid)
     while os.getppid() == pid:
         began = time.monotonic()
         time.sleep(TICK)
         in_time = time.monotonic() - began < 2.0 * TICK
         now = threads(pid)
-        has_woken |= before.get(str(pid), ("", 0))[1] != now.get(str(pid), ("", 0))[1]
-        still = still + 1 if has_woken and in_time and stands_still(pid, before, now) else 0
+        if not slept(pid, before, now):
+            still = 0
+        elif in_time and not is_starved(before, now):
+            still += 1
         before = now
         if still * TICK >= PATIENCE:
             say(f"{name}: the executor has stood still for {PATIENCE:g} s: ended by its watchdog\n")

@@ -12,6 +12,7 @@ from bags.recordings.bag import Bag
 from nlsid_core.errors import BagError, DataError
 
 RECORDER: Final = "nlsid_ros.trajectory_recorder"  # a process: bags knows nothing of ROS
+OWN: Final = ("/diagnostics", "/trajectory_recorder/")  # what the recorder itself publishes
 FOUND_WITHIN: Final = 5.0  # s for discovery, which are recorded too
 PATIENCE: Final = 30.0  # s for the recorder to come up, and to close its bag
 
@@ -50,7 +51,8 @@ def listen(bag: Path, seconds: float) -> Path:
     if recorder.returncode or not bag.is_dir():
         raise DataError(f"the recorder ended with status {recorder.returncode}: {said[-500:]}")
     with Bag(bag) as recorded:
-        if not any(recorded.count(topic) for topic in recorded.topics):
+        others = [topic for topic in recorded.topics if not topic.startswith(OWN)]
+        if not any(recorded.count(topic) for topic in others):
             raise BagError(
                 f"nothing was heard in {seconds:g} s; is the robot running, and is this its "
                 "ROS_DOMAIN_ID?"

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -71,10 +72,11 @@ class Driven(Robot):
         *,
         ahead: float = 0.0,
         frame: str = "",
+        speed: float = 0.0,
         margin_at: float | None = None,
         judging: str = "",
     ) -> list[int]:
-        """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
+        """Responses in real time; their stamps (ns), `ahead` s of now at the first.
 
         margin_at: a monitor's verdict comes with each, stamped so many s from it. judging: of which
         funnel and run it says to be; empty: of the controller's.
@@ -86,6 +88,7 @@ class Driven(Robot):
             message = Odometry()
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             message.header.frame_id = frame
+            message.twist.twist.linear.x = speed
             self.odom.publish(message)
             if margin_at is not None:
                 said = JointState(name=["margin", "assumption"], position=[0.5, math.nan])
@@ -124,21 +127,29 @@ def test_every_sample_has_its_command_even_if_stamps_lead_the_clock(
     robot.spin_until(lambda: set(heard) <= robot.commands.keys())
 
 
-@pytest.mark.parametrize(("ahead", "way"), [(3600.0, "after"), (-3600.0, "before")])
-def test_stamps_of_another_hour_stop_it_by_name(
-    stack: ExitStack, funnel: Path, ahead: float, way: str
+@pytest.mark.parametrize(
+    ("fed", "because"),
+    [
+        (
+            {"frame": "odom", "ahead": 3600.0},
+            "a response is stamped 3.6e+03 s after this node's clock",
+        ),
+        (
+            {"frame": "odom", "ahead": -3600.0},
+            "a response is stamped 3.6e+03 s before this node's clock",
+        ),
+        ({"frame": "map"}, "the response is in frame 'map', not in 'odom'"),
+        ({"frame": "odom", "speed": math.nan}, "speed is nan"),
+    ],
+    ids=["ahead", "old", "another frame", "no number"],
+)
+def test_a_response_that_is_none_stops_it_by_name(
+    stack: ExitStack, funnel: Path, fed: dict[str, Any], because: str
 ) -> None:
-    robot = Driven(stack, funnel)
-    assert robot.call("start").success
-    robot.feed(3, ahead=ahead)
-    robot.expect_stop(f"a response is stamped 3.6e+03 s {way} this node's clock")
-
-
-def test_another_frame_stops_it_by_name(stack: ExitStack, funnel: Path) -> None:
     robot = Driven(stack, funnel, response_frame="odom")
     assert robot.call("start").success
-    robot.feed(3, frame="map")
-    robot.expect_stop("the response is in frame 'map', not in 'odom'")
+    robot.feed(3, **fed)
+    robot.expect_stop(because)
 
 
 def test_a_slow_stop_rate_does_not_keep_it_moving(stack: ExitStack, funnel: Path) -> None:

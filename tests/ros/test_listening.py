@@ -29,7 +29,7 @@ def test_a_running_robot_is_looked_at_for_a_first_configuration(tmp_path: Path) 
     """A real car's drive, played in real time to whoever listens."""
     drive = next(bag for bag in dart() if bag.name == "rubbery_20240916_151759")
     player = [sys.executable, "-m", "nlsid_ros.bag_player", "--ros-args", "-p", f"bag:={drive}"]
-    topics = ["-p", "topics:=['/command', '/motion']", "-p", "wait_for:=1"]
+    topics = ["-p", "topics:=['/command', '/motion']", "-p", "wait_timeout:=120.0"]
     config = tmp_path / "robot.yaml"
     with subprocess.Popen([*player, *topics]) as robot:
         try:
@@ -43,12 +43,12 @@ def test_a_running_robot_is_looked_at_for_a_first_configuration(tmp_path: Path) 
     assert settings.grid.period == pytest.approx(0.05, rel=0.05)
     assert settings.split.share is not None
     assert "topics:=[/command, /motion]" in done.stdout
-    assert "nlsid identify TRIALS" in done.stdout
+    assert f"nlsid identify {tmp_path} TRIALS" in done.stdout
 
 
 def test_where_nothing_runs_this_is_said(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     done = init_live(config, "--seconds", "1")
     assert done.returncode == 2
-    assert "nothing was heard" in done.stderr or "no number varies" in done.stderr
+    assert "nothing was heard" in done.stderr
     assert not config.exists()

@@ -94,7 +94,7 @@ def test_outside_stays_outside_until_a_restart_whatever_is_published_meanwhile(
     [
         ({"ahead": -3600.0}, "unknown: a response is stamped 3.6e+03 s before this node's clock"),
         ({"ahead": 3600.0}, "unknown: a response is stamped 3.6e+03 s after this node's clock"),
-        ({"period_ns": 30_303_030}, "of a new run: the sample at t ="),
+        ({"period_ns": 30_303_030}, "unknown: the sample at t ="),
     ],
     ids=["an hour old", "an hour ahead", "33 Hz"],
 )
@@ -103,8 +103,8 @@ def test_samples_that_are_not_of_now_or_not_of_the_models_rate_are_not_inside(
 ) -> None:
     robot = watched(stale_after=LATE)
     robot.ready()
-    feed(robot, 10, **given)  # type: ignore[arg-type]
-    robot.spin_until(lambda: robot.has_said(says))
+    while not robot.has_said(says):  # on a busy machine a command may be late for its sample
+        feed(robot, 10, **given)  # type: ignore[arg-type]
     robot.said.clear()
     feed(robot, 10, **given)  # type: ignore[arg-type]
     assert not robot.has_said("inside")
