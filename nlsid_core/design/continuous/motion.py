@@ -89,7 +89,7 @@ def plan_motion(
     much = np.ptp(box, axis=1) / 2
     much = np.where(np.isfinite(much), much, np.maximum(np.abs(rest), 1))
     t = np.linspace(0.0, seconds, FIRST_KNOTS)
-    x = np.linspace(*ends, FIRST_KNOTS)
+    x = np.linspace(ends[0], ends[1], FIRST_KNOTS)
     straight = np.hstack([x, np.tile(rest, (len(t), 1))])
     spread = np.ptp(x, axis=0)
     way = np.where(spread > 0, spread, np.maximum(np.abs(x).max(axis=0), 1))
