@@ -17,6 +17,7 @@ from std_msgs.msg import String
 
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin
+from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import VECTOR_FIELD
@@ -219,9 +220,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         trials,
         responses=[RESPONSE],
         excitations=[COMMAND],
-        period=0.01,
-        max_gap=0.5,
-        resample="linear",
+        grid=Grid(0.01, max_gap=0.5, resample="linear"),
     )
     [(group, members)] = data.repeats().items()
     assert group.startswith("/joint_commands:effort[0], multisine, sha256:")
