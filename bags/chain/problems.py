@@ -30,7 +30,6 @@ MEMBERS = (
     "format",
     "version",
     "shape",
-    "gain",
     "vector_field",
     "nominal",
     "goal",
@@ -58,7 +57,6 @@ class FunnelProblem:
     R: FloatArray | None = None
     goal: Goal | None = None
     shape: str = "rho"
-    gain: str = "constant"
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
@@ -71,7 +69,6 @@ class FunnelProblem:
             "format": FORMAT,
             "version": files.VERSION,
             "shape": self.shape,
-            "gain": self.gain,
             "vector_field": self.field.document(),
             "nominal": {
                 "t": self.nominal.t.tolist(),
@@ -111,11 +108,7 @@ class FunnelProblem:
         hold = document.get("hold")
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
-        usual = {
-            "shape": "rho",
-            "gain": "constant",
-        }
-        words = usual | document
+        words = {"shape": "rho"} | document
         return cls(
             field,
             Nominal(*parts),
@@ -123,7 +116,6 @@ class FunnelProblem:
             _array(document, "R", (field.m, field.m), source),
             _goal(document, field.n, source),
             files.member(words, "shape", str, source=source),
-            files.member(words, "gain", str, source=source),
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
@@ -141,7 +133,6 @@ class FunnelProblem:
             shape=self.shape,  # type: ignore[arg-type]  # checked by the problem
             Q=self.Q,
             R=self.R,
-            gain=self.gain,
             limits=self.limits if len(self.limits) else None,
             hold=self.hold,
             error=self.error,
