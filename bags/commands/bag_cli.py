@@ -27,6 +27,7 @@ from nlsid_core.errors import BagError, DataError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from bags.recordings.bag import Bag
     from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
@@ -48,14 +49,6 @@ class Format(StrEnum):
     CSV = "csv"
     NPZ = "npz"
     PARQUET = "parquet"
-
-
-class Resampling(StrEnum):
-    """How a signal is put on a grid."""
-
-    LINEAR = "linear"
-    CUBIC = "cubic"
-    HOLD = "hold"
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
@@ -138,21 +131,19 @@ def plot(
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
     from bags.signals.reader import read_signals
+    from bags.signals.sampling import Grid
 
     if not report_available():
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
     drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
-    with progress_bar("reading", after=PROGRESS_AFTER) as progress:
-        samples = read_signals(
-            bag,
-            drawn,
-            clock=_clock(source.clock),
-            unfinished=source.unfinished,
-            definitions=_definitions(source.definitions),
-            progress=progress,
-        )
+    texts = [Grid(clock=source.clock.value).path(text, response=True) for text in drawn]
+    with (
+        _opened(bag, source) as opened,
+        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+    ):
+        samples = read_signals(opened, texts, progress=progress)
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
 
@@ -234,9 +225,6 @@ class CommonGrid:
     hold: Annotated[
         list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
     ] = None
-    method: Annotated[Resampling, typer.Option(help="Of the other signals, on the grid.")] = (
-        Resampling.LINEAR
-    )
     max_gap: Annotated[
         float | None, typer.Option(help="s without a sample; default 1.5 periods.")
     ] = None
@@ -258,44 +246,35 @@ def export_command(
 
     By default in the folder BAG_tables, or as the file BAG.csv.
     """
+    from bags.signals.sampling import Grid
     from bags.tools import export
 
     named = Path(f"{bag.stem}.{form.value}") if grid.period is not None else _beside(bag, "tables")
     target = target or named
-    if grid.period is None:
-        with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
-            rows = export.export_topics(
-                bag,
-                target,
-                form=form.value,
-                signals=signals,
-                unfinished=source.unfinished,
-                definitions=_definitions(source.definitions),
-                progress=progress,
-            )
-        for file, count in rows.counts.items():
-            out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
-        for what in rows.left_out:
-            out.print(f"left out: {what}", soft_wrap=True, markup=False)
-        _say_notes(rows.notes)
-        return
-    if not signals:
-        raise BagError("a common grid needs to know which signals: --signal")
-    errors = export.export_grid(
-        bag,
-        target,
-        form=form.value,
-        signals=signals,
-        period=grid.period,
-        method=grid.method.value,
-        hold=grid.hold or (),
-        max_gap=1.5 * grid.period if grid.max_gap is None else grid.max_gap,
-        clock=source.clock.value,
-        unfinished=source.unfinished,
-        definitions=_definitions(source.definitions),
-    )
-    for name, error in errors.items():
-        out.print(f"{name}: off by at most {error:.2g}", soft_wrap=True, markup=False)
+    with _opened(bag, source) as opened:
+        if grid.period is None:
+            with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
+                rows = export.export_topics(
+                    opened, target, form=form.value, signals=signals or (), progress=progress
+                )
+            for file, count in rows.counts.items():
+                out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+            for what in rows.left_out:
+                out.print(f"left out: {what}", soft_wrap=True, markup=False)
+            _say_notes(rows.notes)
+            return
+        if not signals:
+            raise BagError("a common grid needs to know which signals: --signal")
+        did = export.export_grid(
+            opened,
+            target,
+            form=form.value,
+            signals=signals,
+            hold=grid.hold or (),
+            grid=Grid(period=grid.period, max_gap=grid.max_gap, clock=source.clock.value),
+        )
+    for what in did:
+        out.print(what, soft_wrap=True, markup=False)
     out.print(f"wrote {target}", soft_wrap=True, markup=False)
 
 
@@ -325,7 +304,7 @@ class Parts:
 def convert(
     bags: BagsArgument,
     stretch: Stretch,
-    parts: Parts,
+    cuts: Parts,
     source: Source,
     bag_out: OutOption = None,
 ) -> None:
@@ -334,44 +313,36 @@ def convert(
     Several are merged by log time. Parts are OUT_01, OUT_02, ... The default of --out is
     BAG_converted.
     """
+    from contextlib import ExitStack
+
     from bags.recordings.folders import expand_bags
     from bags.tools import edit
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    is_part, is_split = stretch != Stretch(), parts != Parts()
-    if is_part + is_split + (len(folders) > 1) > 1:
-        raise DataError(
-            "one at a time: merge several bags, or take a stretch of one (--start, --end, "
-            "--topic), or cut one into parts (--every or --repeats)"
-        )
-    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        if is_split:
-            copied = edit.split(
-                folders[0], target, repeats=parts.repeats, every=parts.every, progress=progress
-            )
-        elif len(folders) > 1:
-            copied = edit.merge(folders, target, progress=progress)
+    every, repeats = cuts.every, cuts.repeats
+    if every is not None and repeats is not None:
+        raise DataError("parts begin every so many seconds or at repeats: --every or --repeats")
+    if (every is not None or repeats is not None) and (stretch.start or stretch.end is not None):
+        raise DataError("take the stretch first (--start, --end), then cut that into parts")
+    with ExitStack() as stack:
+        opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
+        if every is not None:
+            parts = edit.parts_every(opened, target, every)
+        elif repeats is not None:
+            parts = edit.parts_at_repeats(opened[0], target, repeats)
         else:
-            copied = edit.cut(
-                folders[0],
-                target,
-                start=stretch.start,
-                end=stretch.end,
-                topics=stretch.topics or None,
-                unfinished=source.unfinished,
-                definitions=_definitions(source.definitions),
-                progress=progress,
-            )
+            parts = [edit.stretch(opened, target, stretch.start, stretch.end)]
+        progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
+        copied = edit.convert(opened, parts, topics=stretch.topics or (), progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
-    if not copied.parts:
-        out.print(f"wrote {target}, {copied.messages} messages", soft_wrap=True, markup=False)
+    out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
     _say_notes(copied.notes)
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """When the rows of tables were."""
 
     period: Annotated[float | None, typer.Option(help="s between rows.")] = None
@@ -387,8 +358,8 @@ class Rows:
 @bag_app.command("import")
 @flat
 def import_command(
-    tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
-    rows: Rows,
+    table: Annotated[Path, typer.Argument(help="A CSV file.")],
+    given: TableRows,
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
@@ -407,28 +378,26 @@ def import_command(
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
 ) -> None:
-    """Write columns of tables as a bag of standard messages, named as the first table."""
-    from bags.tools.importing import every_column, import_tables, said_units
+    """Write columns of a table as a bag of standard messages, named as the table."""
+    from bags.tools.importing import Rows, every_column, import_table, said_units
 
     kinds = _pairs(types or (), "--type")
-    bag_out = bag_out or Path(tables[0].stem)
-    time_column = rows.time_column
+    bag_out = bag_out or Path(table.stem)
+    rows = Rows(given.period, given.time_column, given.drop_repeats, round(given.start * 1e9))
     if not assignments:
-        time_column, assignments, numbers = every_column(tables, time_column, rows.period)
+        rows, assignments, numbers = every_column(table, rows)
         kinds = numbers | kinds
-    counts = import_tables(
-        tables,
+    imported = import_table(
+        table,
         bag_out,
         assignments,
         types=kinds,
-        period=rows.period,
-        time=time_column,
-        drop_repeats=rows.drop_repeats,
-        start_ns=round(rows.start * 1e9),
+        rows=rows,
         custom=_pairs(custom or (), "--custom"),
     )
-    listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())
+    listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
+    out.print(imported.times, soft_wrap=True, markup=False)
     if units := said_units(assignments, kinds):
         out.print(
             f"units by the message types, not by the table: {units}; where a column is in another, "
@@ -463,6 +432,13 @@ def _likeliest(
     return choose(look(bags, definitions=_definitions(definitions)), responses, excitations)
 
 
+def _opened(bag: Path, source: Source) -> "Bag":
+    """The recording, to be read as the options say."""
+    from bags.recordings.bag import Bag
+
+    return Bag(bag, unfinished=source.unfinished, definitions=_definitions(source.definitions))
+
+
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":
     from bags.recordings.definitions import read_definitions
 
@@ -477,9 +453,3 @@ def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
             raise DataError(f"{option} {text}: expected key=value")
         pairs[key] = value
     return pairs
-
-
-def _clock(clock: Clock) -> str:
-    from bags.signals.reader import CLOCKS
-
-    return next(name for name in CLOCKS if name.startswith(clock.value))

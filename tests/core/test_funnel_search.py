@@ -187,11 +187,8 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     for trust in (0.05, 0.2):
         D = improve(
             forms.samples,
-            forms.pairs,
-            8,
             proof_basis(setting.steps.program),
             weights=np.ones(8),
-            margins=forms.margins,
             trust=trust,
         )
         largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()
