@@ -23,7 +23,6 @@ from bags.designs.wiring import sampler_of
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns
-from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import NlsidError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
@@ -50,7 +49,7 @@ def run_live(funnel: Path, bag: Path, out: Path) -> list[Outcome]:
     faulty = out / f"{bag.name}, {FAULT}"
     response = sampler_of(design).responses[0].path
     write_faulty_copy(bag, faulty, str(response), FAULTS[FAULT])
-    bad = _replayed(design, faulty)
+    bad = replay_bag(design, faulty, centre=Centre.COMMAND)
     if bad.first_bad is None:
         raise NlsidError(
             f"{bag.name} with its sensor {FAULT} is not flagged: {bad.reason or bad.verdict}. The "
@@ -60,7 +59,7 @@ def run_live(funnel: Path, bag: Path, out: Path) -> list[Outcome]:
     first, second = (play(funnel, each, topics, out) for each in (bag, faulty))
     return [
         recorded(bag, first, topics),
-        monitored(first, _replayed(design, bag)),
+        monitored(first, replay_bag(design, bag, centre=Centre.COMMAND)),
         alarmed(second, response.topic, bad),
     ]
 
@@ -152,10 +151,6 @@ def _decoded(recording: Path, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         msgtype, types = bag.types_on(topic)
         for message in bag.messages([topic]):
             yield message.log_time_ns, message.data, decode(message.data, msgtype, types)
-
-
-def _replayed(design: AnyDesign, bag: Path) -> Replay:
-    return replay_bag(design, bag, centre=Centre.COMMAND)
 
 
 def main(args: list[str] | None = None) -> None:
