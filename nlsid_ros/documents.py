@@ -11,6 +11,7 @@ from std_msgs.msg import String
 
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
 from bags.designs.design import AnyDesign, Wiring
+from nlsid_core.deciding import USUAL, Limits
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.running import ManagedNode, Parameter
@@ -22,7 +23,19 @@ OF_A_CONTINUOUS = (
     "of a continuous funnel: topic:field paths separated by commas, all on one topic; empty: the "
     "model says it"
 )
+LIMITS = (
+    Parameter(
+        "check_seconds",
+        USUAL.seconds,
+        "s of processor time that the check of a proof may take",
+        (1, 3600),
+    ),
+    Parameter(
+        "check_memory", USUAL.memory, "MB of memory that the check of a proof may take", (64, 10**6)
+    ),
+)
 DESIGN = (
+    *LIMITS,
     Parameter("source", "funnel_publisher", "node that publishes the funnel"),
     Parameter("response", "", f"the state {OF_A_CONTINUOUS}"),
     Parameter("command", "", f"the inputs {OF_A_CONTINUOUS}"),
@@ -56,6 +69,11 @@ def expected_of(values: SimpleNamespace) -> str:
     if expected and not _DIGEST.fullmatch(expected):
         raise DataError(f"expected_digest is '{expected}'; it should have 64 hexadecimal digits")
     return "sha256:" + expected.removeprefix("sha256:") if expected else ""
+
+
+def limits_of(values: SimpleNamespace) -> Limits:
+    """What the check of a proof may take, by the parameters of LIMITS."""
+    return Limits(values.check_seconds, values.check_memory)
 
 
 class Unproved:
@@ -165,7 +183,7 @@ class DesignSubscription:
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:
-                self._check = Check(text)
+                self._check = Check(text, limits_of(self._node.values))
             except OSError as error:
                 self._refuse(f"it cannot be checked: {error}")
                 return

@@ -16,6 +16,7 @@ from bags.designs import documents
 from bags.designs.bundle import Bundle, Check
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError
 from nlsid_ros import qos
+from nlsid_ros.documents import LIMITS, limits_of
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
@@ -33,6 +34,7 @@ class FunnelPublisher(ManagedNode):
             "funnel.json, with its proof beside it, or composition.proof.json with its stages",
             tunable=True,
         ),
+        *LIMITS,
     )
 
     def read_parameters(self) -> None:
@@ -90,7 +92,7 @@ class FunnelPublisher(ManagedNode):
                 self._seen = files
                 self._call_off()
                 self._changed = Bundle.load(self._path)
-                self._check = Check(self._changed.text())
+                self._check = Check(self._changed.text(), limits_of(self.values))
             answer = self._check.poll() if self._check is not None else None
             if answer is None:
                 return
@@ -110,7 +112,7 @@ class FunnelPublisher(ManagedNode):
         """What to publish, and what is proved of it."""
         try:
             bundle = Bundle.load(path)
-            return bundle, str(bundle.decided())
+            return bundle, str(bundle.decided(limits_of(self.values)))
         except (NlsidError, OSError) as refusal:
             self._reject(refusal)
             raise
