@@ -23,7 +23,7 @@ OF_A_CONTINUOUS = (
     "of a continuous funnel: topic:field paths separated by commas, all on one topic; empty: the "
     "model says it"
 )
-LIMITS = (
+CHECK = (
     Parameter(
         "check_seconds",
         USUAL.seconds,
@@ -31,11 +31,14 @@ LIMITS = (
         (1, 3600),
     ),
     Parameter(
-        "check_memory", USUAL.memory, "MB of memory that the check of a proof may take", (64, 10**6)
+        "check_memory",
+        USUAL.memory,
+        "MB of memory that the check of a proof may take",
+        (64, 10**6),
     ),
 )
 DESIGN = (
-    *LIMITS,
+    *CHECK,
     Parameter("source", "funnel_publisher", "node that publishes the funnel"),
     Parameter("response", "", f"the state {OF_A_CONTINUOUS}"),
     Parameter("command", "", f"the inputs {OF_A_CONTINUOUS}"),
@@ -72,7 +75,7 @@ def expected_of(values: SimpleNamespace) -> str:
 
 
 def limits_of(values: SimpleNamespace) -> Limits:
-    """What the check of a proof may take, by the parameters of LIMITS."""
+    """What the check of a proof may take, by the parameters of CHECK."""
     return Limits(values.check_seconds, values.check_memory)
 
 
@@ -103,6 +106,7 @@ class DesignSubscription:
     ) -> None:
         self._node, self._taken, self._changed = node, taken, changed
         self._wiring, self._expected = wiring_of(node.values), expected_of(node.values)
+        self._limits = limits_of(node.values)
         self._check: Check | None = None
         self._waiting: str | None = None
         self._used = ""  # the text of the design in use
@@ -183,7 +187,7 @@ class DesignSubscription:
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:
-                self._check = Check(text, limits_of(self._node.values))
+                self._check = Check(text, self._limits)
             except OSError as error:
                 self._refuse(f"it cannot be checked: {error}")
                 return

@@ -16,7 +16,7 @@ from bags.designs import documents
 from bags.designs.bundle import Bundle, Check
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.documents import LIMITS, limits_of
+from nlsid_ros.documents import CHECK, limits_of
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
@@ -28,13 +28,13 @@ class FunnelPublisher(ManagedNode):
 
     name = "funnel_publisher"
     parameters = (
+        *CHECK,
         Parameter(
             "funnel",
             "",
             "funnel.json, with its proof beside it, or composition.proof.json with its stages",
             tunable=True,
         ),
-        *LIMITS,
     )
 
     def read_parameters(self) -> None:

@@ -158,7 +158,6 @@ class TrajectoryRecorder(ManagedNode):
         writer = BagWriter(
             path,
             in_place=True,
-            max_chunk_age=values.chunk_period,
             compression=values.compression,
             split_bytes=round(values.split_size * 1e6) or None,
             split_seconds=values.split_time or None,

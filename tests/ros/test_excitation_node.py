@@ -16,7 +16,8 @@ from geometry_msgs.msg import TwistStamped
 from std_msgs.msg import String
 
 from bags.signals.grid import read_dataset
-from bags.signals.reader import bag_metadata
+from bags.signals.reader import bag_origin
+from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import VECTOR_FIELD
@@ -211,7 +212,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
     trials = [bags / name for name in ("trial", "trial_2", "trial_3")]
     assert sorted(bags.iterdir()) == trials
     for number, trial in enumerate(trials, start=1):
-        custom = bag_metadata(trial)
+        custom = bag_origin(trial)["custom"]
         assert json.loads(custom["experiment"])["repeat"] == number
         assert int(custom["/joint_commands received"]) >= 230
         assert custom["/joint_commands lost"] == "0"
@@ -219,9 +220,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         trials,
         responses=[RESPONSE],
         excitations=[COMMAND],
-        period=0.01,
-        max_gap=0.5,
-        resample="linear",
+        grid=Grid(0.01, max_gap=0.5, resample="linear"),
     )
     [(group, members)] = data.repeats().items()
     assert group.startswith("/joint_commands:effort[0], multisine, sha256:")
