@@ -5,6 +5,7 @@ Of a continuous funnel parameters say where its signals are.
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -13,9 +14,10 @@ from std_msgs.msg import String
 
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
 from bags.designs.design import AnyDesign, Wiring
+from nlsid_core.deciding import USUAL, Limits
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
-from nlsid_ros.running import declare_number, declare_text
+from nlsid_ros.running import declare, declare_number, declare_text
 
 LOOK = 0.2  # s between looks at who publishes, and at a check that is on
 CHECKING = "checking the proof"
@@ -49,6 +51,18 @@ def declare_expected(node: Node) -> str:
     return "sha256:" + expected.removeprefix("sha256:") if expected else ""
 
 
+def declare_limits(node: Node) -> Limits:
+    """The parameters that say what the check of a proof may take."""
+    what = "that the check of a proof may take"
+    seconds: Any = declare(
+        node, "check_seconds", USUAL.seconds, f"s of processor time {what}", between=(1, 3600)
+    )
+    memory: Any = declare(
+        node, "check_memory", USUAL.memory, f"MB of memory {what}", between=(64, 10**6)
+    )
+    return Limits(seconds, memory)
+
+
 class Unproved:
     """In the place of a `DesignSubscription`: a policy from files, of which nothing is proved."""
 
@@ -79,7 +93,7 @@ class DesignSubscription:
         expected: str = "",
     ) -> None:
         self._node, self._taken, self._changed = node, taken, changed
-        self._wiring, self._expected = wiring, expected
+        self._wiring, self._expected, self._limits = wiring, expected, declare_limits(node)
         self._check: Check | None = None
         self._waiting: str | None = None
         self._used = ""  # the text of the design in use
@@ -161,7 +175,7 @@ class DesignSubscription:
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:
-                self._check = Check(text)
+                self._check = Check(text, self._limits)
             except OSError as error:
                 self._refuse(f"it cannot be checked: {error}")
                 return

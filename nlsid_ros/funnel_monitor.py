@@ -45,7 +45,12 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import graph, qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
+from nlsid_ros.documents import (
+    DesignSubscription,
+    declare_expected,
+    declare_limits,
+    declare_wiring,
+)
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
@@ -94,6 +99,7 @@ class FunnelMonitor(ManagedNode):
         self._centre = Centre(nominal)
         self._wiring = declare_wiring(self)
         self._expected = declare_expected(self)
+        declare_limits(self)  # which the subscription reads
         number = partial(declare_number, self, tunable=True)
         what = (
             "s without a response, or from its stamp to this node's clock: unknown; "

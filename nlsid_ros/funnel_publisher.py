@@ -25,6 +25,7 @@ from bags.designs.design import AnyDesign
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
+from nlsid_ros.documents import declare_limits
 from nlsid_ros.pictures import nominal_trajectory, tube_markers
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
 
@@ -48,6 +49,7 @@ class FunnelPublisher(ManagedNode):
         self._frame = declare_text(
             self, "frame", "map", "frame the tube is drawn in and moves with"
         )
+        self._limits = declare_limits(self)
         self._watch = bool(declare(self, "watch", True, "publish again when the files change"))
         self._latched: dict[str, Publisher] = {}
         self._check: Check | None = None
@@ -107,7 +109,7 @@ class FunnelPublisher(ManagedNode):
         self._call_off()
         try:
             bundle = Bundle.load(self._path)
-            self._check, self._changed = Check(bundle.text()), bundle
+            self._check, self._changed = Check(bundle.text(), self._limits), bundle
         except (NlsidError, OSError) as refusal:
             self._reject(refusal)
 
@@ -135,7 +137,7 @@ class FunnelPublisher(ManagedNode):
         """What to publish, what it is, and what is proved of it."""
         try:
             bundle = Bundle.load(path)
-            return bundle, bundle.design(), str(bundle.decided())
+            return bundle, bundle.design(), str(bundle.decided(self._limits))
         except (NlsidError, OSError) as refusal:
             self._reject(refusal)
             raise

@@ -45,6 +45,7 @@ from nlsid_ros.documents import (
     DesignSubscription,
     Unproved,
     declare_expected,
+    declare_limits,
     declare_wiring,
 )
 from nlsid_ros.message_classes import installed_types, message_class
@@ -129,6 +130,7 @@ class TrackingController(ManagedNode):
         self._frame = declare_text(self, "response_frame", "", what)
         self._wiring = declare_wiring(self)
         self._expected = declare_expected(self)
+        declare_limits(self)  # which the subscription reads
         self._controller: Controller | None = None
         self._stopping = ""
         self.tune(self.tunable())

@@ -196,7 +196,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     assert run.violations == 0
     forged = saved(design, tmp_path)
     forged["vector_field.json"]["valid"] = [[0, -0.1, 0.1]]
-    with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
+    with pytest.raises(CertificateRejected, match="where its dynamics are valid"):
         check(write(forged, tmp_path))
     forged = saved(design, tmp_path)
     forged["funnel.proof.json"]["proof"]["kappa"][1][1] = -1.0
@@ -231,7 +231,6 @@ def decide_inside(
         inside(
             rational[0][0],
             rational[1],
-            Fraction(1),
             rational[2][0],
             rational[3],
             Fraction(multiplier),

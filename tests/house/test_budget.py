@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 20_483,
+    ("nlsid_core",): 20_381,
     ("bags",): 13_979,
-    ("nlsid_ros",): 3_172,
-    ("tests",): 26_423,
+    ("nlsid_ros",): 3_186,
+    ("tests",): 26_410,
     ("benchmarks", "examples"): 3_841,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -161,6 +161,7 @@ def test_every_node_ends_cleanly_when_asked_to(
         ("tracking_controller", {"lowest": 0.2, "highest": 0.4}, "limits: 0.0 should be in"),
         ("funnel_publisher", {"funnel": "/nowhere/funnel.json"}, "nowhere"),
         ("funnel_publisher", {"watch": 3}, "parameter watch"),
+        ("funnel_monitor", {"check_seconds": 0}, "parameter check_seconds"),
         (
             "funnel_monitor",
             {"stale_after": -0.1},
