@@ -11,6 +11,7 @@ import numpy as np
 
 from bags.monitoring.catching import Breaking, breaking
 from bags.signals.grid import read_dataset
+from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
@@ -156,9 +157,8 @@ def measured(
     `read_dataset`, whose errors pass through.
     """
     problem = FunnelProblem.load(path)
-    trials = read_dataset(
-        bags, responses=responses, excitations=excitations, period=period, resample=resample
-    )
+    grid = Grid(period=period, resample=resample)
+    trials = read_dataset(bags, responses=responses, excitations=excitations, grid=grid)
     push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
     found = breaking(trials, lambda trial: push.used(problem.field, trial))
     return dataclasses.replace(problem, push=push), found

@@ -42,12 +42,7 @@ def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
         bags,
         responses=[signal.path for signal in signals.states],
         excitations=[signal.path for signal in signals.inputs],
-        period=config.grid.period,
-        max_gap=config.grid.max_gap,
-        clock=config.clock,
-        resample=config.grid.resample,
-        hold=config.grid.hold,
-        split_gaps=config.grid.split_gaps,
+        grid=config.grid.rules(config.clock),
     )
     labelled = [
         replace(
