@@ -85,11 +85,10 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
     u = _curve(policy["u"], count, None)
     m, rows = len(u[0][0]), policy["limits"]
     limits = {int(i): (low, high) for i, low, high in rows if i in range(m)}
+    single = len(limits) == len(rows) <= MAX_LIMITED
     documents["policy"].require(
         {
-            f"at most {MAX_LIMITED} limits, of one input each": len(limits)
-            == len(rows)
-            <= MAX_LIMITED,
+            f"at most {MAX_LIMITED} limits, each of another input": single,
             "limits should have low < high": all(low < high for low, high in limits.values()),
         }
     )
@@ -199,7 +198,5 @@ def _curve(node: Node, count: int, *shape: int | None) -> Any:
     for control in curve:
         even = all(len(point) == len(curve[0][0]) for point in control)
         fits = 0 < len(control) <= MAX_TIME_DEGREE + 1 and even
-        node.require(
-            {f"should have degree 0 to {MAX_TIME_DEGREE} in time, points of one size": fits}
-        )
+        node.require({f"should have curves of degree 0 to {MAX_TIME_DEGREE} in time": fits})
     return curve
