@@ -212,10 +212,7 @@ def _halves(width: int, count: int) -> int:
 
 
 def at_width(
-    count: int,
-    cases: Iterable[Case],
-    decide: Callable[[Ring, Case], None],
-    least: int = WIDTHS[0],
+    count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], None], least: int = WIDTHS[0]
 ) -> None:
     """Decide each case in a ring of `count` variables, wider from the first that needs it on."""
     widths = [width for width in WIDTHS if width >= least]
