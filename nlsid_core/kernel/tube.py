@@ -24,8 +24,8 @@ from .exact import Matrix, Rows, at_most, definite, unit
 from .files import (
     Node,
     Read,
-    Table,
     Rejected,
+    Table,
     bound_files,
     each,
     itself,
