@@ -24,10 +24,10 @@ from nlsid_core.identification import (
     FilterMapFilter,
     Network,
     Polynomial,
+    identify,
     prove_stability,
 )
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.network.cascade import identify_block_cascade
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 
@@ -96,13 +96,14 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
 def cascade(u: FloatArray, y: FloatArray) -> Keys:
     """The certified block cascade on the official test samples."""
     with spending() as spent:
-        model, proof, _ = identify_block_cascade(
+        found = identify(
             single("train", u[CASCADE_TRAIN], y[CASCADE_TRAIN], PERIOD),
-            single("validation", u[THESIS_VALIDATION], y[THESIS_VALIDATION], PERIOD),
             CASCADE,
+            validation=single("validation", u[THESIS_VALIDATION], y[THESIS_VALIDATION], PERIOD),
             transient=200,
             progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
         )
+    model, proof = found.model, found.proof
     error = (model.simulate(u[CASCADE_TEST]) - y[CASCADE_TEST])[SKIPPED:]
     return {
         "cascade_mv": 1e3 * float(np.sqrt(np.mean(error**2))),

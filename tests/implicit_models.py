@@ -68,26 +68,6 @@ def cubic_spring() -> ImplicitModel:
     )
 
 
-def rotated(degrees: float = 120.0) -> ImplicitModel:
-    """e = R c(x), R a rotation and c cubic: centred on e₀ = R, which need not be monotone (2.7)."""
-    angle = np.deg2rad(degrees)
-    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    basis = np.array([[1, 0], [0, 1], [3, 0], [0, 3]])
-    values = np.vstack([np.eye(2), 0.25 * np.eye(2)])  # scaled without rounding
-    return ImplicitModel.separable(
-        e=Polynomials(basis, values @ R.T),
-        f=Polynomials(
-            np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
-            np.array([[0.3, 0.1], [-0.1, 0.3], [1.0, 0.5]]),
-        ),
-        monotonicity=0.9,
-        period=0.1,
-        states=("a", "b"),
-        inputs=("u",),
-        centre=Polynomials(basis[:2], R.T),
-    )
-
-
 def linear(A: FloatArray) -> ImplicitModel:
     """P x⁺ = P A x + e₁w with a Lyapunov matrix P of A (of any A, if A is unstable P = I)."""
     P = np.eye(2)

@@ -84,7 +84,7 @@ def identify_states(
         if theta is None:
             tried.append((tuple(choice), np.inf))
             continue
-        model = _model(train, groups, exponents, theta, scale, data, implicit=implicit)
+        model = _model(train, groups, exponents, theta, data, implicit=implicit)
         error = free_run_error(model, validation, in_box=True)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
@@ -214,13 +214,13 @@ def _model(
     groups: Sequence[Sequence[Trajectory]],
     exponents: IntArray,
     theta: FloatArray,
-    scale: FloatArray,
     data: FloatArray,
     *,
     implicit: bool,
 ) -> MeasuredState:
     first = groups[0][0]
     n = first.y.shape[1]
+    scale = np.abs(data).max(axis=0)
     coefficients = theta / np.prod(scale**exponents, axis=1)[:, None]
     if implicit:
         coefficients = coefficients / train.period

@@ -1,7 +1,7 @@
 """`ImplicitModel`: 0 = h(v, x, w), x⁺ = [v; ã(x, w)], polynomial, with a unique v for every (x, w).
 
 Separable models e(x⁺) = f(x, w) are h = e(v) - f(x, w) without ã.
-Source: thesis (2.4), (2.7), (2.11)-(2.15).
+Source: thesis (2.4), (2.7), (2.11).
 """
 
 from dataclasses import dataclass
@@ -19,17 +19,13 @@ from nlsid_core.polynomial.values import monomial_values
 
 KIND = "implicit"
 
-CENTRED = 0.5  # h is so monotone in e₀(v): Proposition 2.7
-
 
 @dataclass(frozen=True, eq=False)
 class ImplicitModel:
     """0 = h(v, x, w), x⁺ = [v; ã(x, w)]: n states, m inputs, one sample is `period` s.
 
     h: n_v polynomials in [v; x; w]; shift: ã, n - n_v polynomials in [x; w]. monotonicity: δ > 0
-    of (v - v̂)'(h(v, x, w) - h(v̂, x, w)) ≥ δ|v - v̂|². With a centre e₀ (n_v polynomials in v) it is
-    e₀ that is so monotone, or linear with |e₀ - ê₀| ≥ δ|v - v̂|, and 2(e₀ - ê₀)'(h - ĥ) ≥
-    |e₀ - ê₀|². Both make v unique; `certificate` decides them.
+    of (v - v̂)'(h(v, x, w) - h(v̂, x, w)) ≥ δ|v - v̂|², which makes v unique.
 
     y, u, window, bags, training: of a model of recorded signals, whose v is y(t), whose x stacks
     y(t-1) … y(t-k), and whose w_j is u_i(t-d) for (i, d) = window[j].
@@ -43,7 +39,6 @@ class ImplicitModel:
     period: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    centre: Polynomials | None = None
     y: tuple[Signal, ...] = ()
     u: tuple[Signal, ...] = ()
     window: tuple[tuple[int, int], ...] = ()
@@ -55,8 +50,6 @@ class ImplicitModel:
         if self.h.coefficients.ndim != 2 or not 0 < n_v <= n:
             raise ShapeError(f"h should have 1 to {n} polynomials, has {n_v}")
         parts = [("h", self.h, n_v, n_v + n + m), ("shift", self.shift, n - n_v, n + m)]
-        if self.centre is not None:
-            parts.append(("centre", self.centre, n_v, n_v))
         for name, part, rows, variables in parts:
             if part.coefficients.shape[1:] != (rows,) or part.exponents.shape[1] != variables:
                 raise ShapeError(
@@ -83,7 +76,6 @@ class ImplicitModel:
         period: float,
         states: tuple[str, ...],
         inputs: tuple[str, ...],
-        centre: Polynomials | None = None,
     ) -> "ImplicitModel":
         """e(x⁺) = f(x, w): e in n variables, f in n + m, both with (n,) coefficients."""
         n, m = len(states), len(inputs)
@@ -98,7 +90,7 @@ class ImplicitModel:
         h = Polynomials(
             np.concatenate([left, right]), np.concatenate([e.coefficients, -f.coefficients])
         )
-        return cls(h, _nothing(n + m), monotonicity, period, states, inputs, centre)
+        return cls(h, _nothing(n + m), monotonicity, period, states, inputs)
 
     def separated(self) -> tuple[Polynomials, Polynomials] | None:
         """(e, f) if h = e(v) - f(x, w) and there is no ã, else None."""
@@ -136,11 +128,6 @@ class ImplicitModel:
     def unknowns(self) -> int:
         """The number n_v of equations, and of states they determine."""
         return int(self.h.coefficients.shape[-1])
-
-    @property
-    def has_linear_centre(self) -> bool:
-        """There is a centre, of degree 1."""
-        return self.centre is not None and bool((self.centre.exponents.sum(axis=1) <= 1).all())
 
     def step(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """x⁺ (B, n) of states x (B, n) and inputs w (B, m), all trajectories at once."""
@@ -185,43 +172,14 @@ class ImplicitModel:
     def ellipsoid(self, known: FloatArray, *, start: FloatArray) -> FloatArray:
         """v (n_v,) with h(v, known) = 0 for known = [x, w] (n + m,), by the ellipsoid method.
 
-        With a centre it works in z = e₀(v). Raises SolverError if monotonicity is not true.
+        Raises SolverError if monotonicity is not true.
         """
         zero = self.h(_with(np.zeros_like(start), known)[None])
-        size = 1.0 + float(np.linalg.norm(zero))
-        if self.centre is None:
-            return ellipsoid(
-                lambda v: self.h(_with(v, known)[None])[0],
-                start=start,
-                monotonicity=self.monotonicity,
-                size=size,
-            )
-        z = ellipsoid(
-            lambda z: self.h(_with(self._uncentred(z, start), known)[None])[0],
-            start=self.centre(start[None])[0],
-            monotonicity=CENTRED,
-            size=size,
-        )
-        return self._uncentred(z, start)
-
-    def _uncentred(self, z: FloatArray, start: FloatArray) -> FloatArray:
-        """v with e₀(v) = z."""
-        centre = self.centre
-        assert centre is not None
-        slope, size = centre.jacobian(self.unknowns), np.array([1.0 + float(np.linalg.norm(z))])
-        if self.has_linear_centre:
-            missing = z - centre(start[None])[0]
-            return np.asarray(start + np.linalg.solve(slope(start[None])[0], missing))
-        v, failed = newton(
-            lambda v, _: centre(v) - z, lambda v, _: slope(v), start=start[None], size=size
-        )
-        if not len(failed):
-            return np.asarray(v[0])
         return ellipsoid(
-            lambda v: centre(v[None])[0] - z,
+            lambda v: self.h(_with(v, known)[None])[0],
             start=start,
             monotonicity=self.monotonicity,
-            size=float(size[0]),
+            size=1.0 + float(np.linalg.norm(zero)),
         )
 
     def simulate(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
@@ -280,8 +238,6 @@ class ImplicitModel:
         }
         if self.unknowns < len(self):
             document["shift"] = self.shift.document()
-        if self.centre is not None:
-            document["centre"] = self.centre.document()
         if self.y:
             document |= {
                 "y": [signal.document() for signal in self.y],
@@ -295,6 +251,8 @@ class ImplicitModel:
     def from_document(cls, document: Json, *, source: str = "model") -> "ImplicitModel":
         """Raises DocumentError if the document is not an implicit model."""
         files.header(document, FORMAT, source=source, kind=KIND)
+        if "centre" in document:
+            raise DocumentError(f"{source}: models with a centre are checked, and not run")
         states, inputs = (
             files.member(document, key, list, source=source) for key in ("states", "inputs")
         )
@@ -321,7 +279,6 @@ class ImplicitModel:
             monotonicity=files.number(document, "monotonicity", source=source),
             states=tuple(states),
             inputs=tuple(inputs),
-            centre=part("centre", n_v, n_v) if "centre" in document else None,
             **made,
         )
 

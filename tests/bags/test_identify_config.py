@@ -159,7 +159,7 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
             {"model": "monotone", "lags": 2, "degree": 2},
             r"degree: should be one of 1, 3, 5, 7, 9 \(found 2\)",
         ),
-        ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.10', .* \(found 2.13\)"),
+        ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.11', .* \(found 2.13\)"),
         ({"model": "implicit", "set": "2.13", "lags": 2}, "set 2.13 is for 1 lag"),
         ({"model": "implicit", "right_degree": 3}, "needs ranges in set 2.11"),
         ({"model": "implicit", "lagged_degree": 1}, "stable in ranges only"),

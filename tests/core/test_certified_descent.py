@@ -83,8 +83,6 @@ def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
             pytest.param(longer, marks=pytest.mark.slow)
             for longer in (
                 Polynomial(2, (0,), Degrees(left=3), set="2.11"),
-                Polynomial(2, (0,), Degrees(left=3), set="2.10"),
-                Polynomial(1, (0,), Degrees(left=3), set="2.12"),
                 Polynomial(1, (0,), Degrees(left=5, past=3), set="2.13"),
                 Polynomial(
                     1,

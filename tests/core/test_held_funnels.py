@@ -52,7 +52,7 @@ def largest(found: FunnelDesign, *, hold: float) -> float:
 
 
 def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> None:
-    free = design(tracking(gain="linear"))  # as a held policy's is
+    free = design(tracking(hold=1e-6))  # its gain is linear, as a held policy's is
     widths, unheld = (found.funnel.widths(found.funnel.t0) for found in (held, free))
     said = str(held)
     named = "with a hold of 0.01 s and the errors of the measured state"
@@ -166,7 +166,7 @@ def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
     def rate(x: Any, u: Any) -> Any:
         return [x[1], 5 * x[0] + u[0]]
 
-    motion = plan_motion(rate, start=[0, 0], end=[0, 0], seconds=1, m=1)
+    motion = plan_motion(rate, start=[0, 0], end=[0, 0], seconds=1, u=[0])
     with pytest.raises(Infeasible, match="Because of an input that is held") as refusal:
         design(ContinuousTracking(rate, motion, goal=[0.1, 0.3], limits=[[-50, 50]], hold=0.1))
     assert "the inputs' limits" not in str(refusal.value)

@@ -7,13 +7,12 @@ from nlsid_core import files
 from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
 from nlsid_core.models import ImplicitModel, monotone
 from nlsid_core.models.polynomials import Polynomials
-from tests.implicit_models import coupled, cubic_spring, lagged, quintic, rotated
+from tests.implicit_models import coupled, cubic_spring, lagged, quintic
 
 EVERY = {
     "quintic": quintic,
     "coupled": coupled,
     "lagged": lagged,
-    "rotated": rotated,
     "mixed": cubic_spring,
 }
 

@@ -1,7 +1,6 @@
 """Claims about implicit model files: every convex set of thesis Chapter 2, and its forgeries."""
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,11 +13,10 @@ from hypothesis import strategies as st
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
-from nlsid_core.identification.proofs.stable_sets import prove_implicit, prove_well_posed
+from nlsid_core.identification.proofs.stable_sets import prove_implicit
 from nlsid_core.models import ImplicitModel
-from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check, proof_document
-from tests.implicit_models import coupled, cubic_spring, lagged, linear, quintic, rotated
+from tests.implicit_models import coupled, cubic_spring, lagged, linear, quintic
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 DELTA = 0.1
@@ -27,35 +25,26 @@ Change = Callable[[Json, Json], None]
 
 STABLE = np.array([[0.5, 0.4], [-0.4, 0.6]])
 SMALL = ((-1.0, 1.0), (-1.0, 1.0), (-5.0, 5.0))
-# model, set, box, degree of the storage
-GENUINE: dict[str, tuple[ImplicitModel, str, tuple[tuple[float, float], ...], int]] = {
-    "linear, 2.19": (linear(STABLE), "2.19", (), 0),
-    "increments, 2.10": (lagged(), "2.10", (), 0),
-    "increments, 2.10, polynomial V": (quintic(), "2.10", (), 4),
-    "increments, 2.10, box": (coupled(), "2.10", SMALL, 0),
-    "derivatives, 2.11": (lagged(), "2.11", (), 0),
-    "derivatives, 2.11, M(x)": (quintic(), "2.11", (), 4),
-    "derivatives, 2.11, box": (lagged(), "2.11", SMALL, 0),
-    "not separable, 2.11": (cubic_spring(), "2.11", ((-1.0, 1.0), (-1.0, 1.0)), 0),
-    "separable increments, 2.12": (quintic(), "2.12", (), 0),
-    "separable increments, 2.12, box": (coupled(), "2.12", SMALL, 0),
-    "separable derivatives, 2.13": (quintic(), "2.13", (), 0),
-    "separable derivatives, 2.13, box": (coupled(), "2.13", SMALL, 0),
-    "centred, 2.10, box": (rotated(30.0), "2.10", SMALL, 0),
+# model, set, box
+GENUINE: dict[str, tuple[ImplicitModel, str, tuple[tuple[float, float], ...]]] = {
+    "linear, 2.19": (linear(STABLE), "2.19", ()),
+    "derivatives, 2.11": (lagged(), "2.11", ()),
+    "derivatives, 2.11, box": (lagged(), "2.11", SMALL),
+    "not separable, 2.11": (cubic_spring(), "2.11", ((-1.0, 1.0), (-1.0, 1.0))),
+    "separable derivatives, 2.13": (quintic(), "2.13", ()),
+    "separable derivatives, 2.13, box": (coupled(), "2.13", SMALL),
 }
-
-
-def documents(name: str) -> tuple[Json, Json]:
-    model, kind, ends, degree = GENUINE[name]
-    proof = prove_implicit(model, delta=DELTA, set=kind, ends=ends, storage_degree=degree)
-    assert proof is not None
-    return model.document(), proof.document(model, "model.json")
 
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, tuple[Json, Json]]:
     """Every genuine model and proof, made once."""
-    return {name: documents(name) for name in GENUINE}
+    found = {}
+    for name, (model, kind, ends) in GENUINE.items():
+        proof = prove_implicit(model, delta=DELTA, set=kind, ends=ends)
+        assert proof is not None
+        found[name] = model.document(), proof.document(model, "model.json")
+    return found
 
 
 def copied(document: Json) -> Json:
@@ -94,7 +83,7 @@ def test_a_genuine_proof_of_each_set_passes(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_two_solutions_of_a_proved_model_meet(name: str) -> None:
-    model, _, ends, _ = GENUINE[name]
+    model, _, ends = GENUINE[name]
     rng = np.random.default_rng(3)
     n = len(model)
     size = 0.3 if ends else 3.0
@@ -129,7 +118,7 @@ def _too_large_squares(_: Json, proof: Json) -> None:
 
 
 def _other_set(_: Json, proof: Json) -> None:
-    others = {"2.10": "2.11", "2.11": "2.12", "2.12": "2.13", "2.13": "2.12", "2.19": "2.10"}
+    others = {"2.11": "2.12", "2.13": "2.12", "2.19": "2.10"}
     proof["claim"]["set"] = others[proof["claim"]["set"]]
 
 
@@ -139,7 +128,7 @@ def _unknown_set(_: Json, proof: Json) -> None:
 
 def _missing_inequality(_: Json, proof: Json) -> None:
     identities = proof["proof"]["inequalities"]
-    del identities["monotone" if "monotone" in identities else "centred"]
+    del identities["monotone"]
 
 
 def _stranger(_: Json, proof: Json) -> None:
@@ -228,128 +217,17 @@ def test_a_storage_that_is_not_positive_is_rejected(
     name: str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
 ) -> None:
     model, proof = map(copied, made[name])
-    key = next((key for key in ("P", "V", "M") if key in proof["proof"]), None)
+    key = next((key for key in ("P", "M") if key in proof["proof"]), None)
     if key is None:  # 2.19: the storage is the model's own E
         model["h"]["coefficients"] = [[-v for v in row] for row in model["h"]["coefficients"]]
         model["monotonicity"] = 1e-9
     elif key == "P":
         proof["proof"]["P"] = [[-entry for entry in row] for row in proof["proof"]["P"]]
     else:
-        entries = (
-            [proof["proof"]["V"]]
-            if key == "V"
-            else [entry for row in proof["proof"]["M"] for entry in row]
-        )
-        for entry in entries:
+        for entry in [entry for row in proof["proof"]["M"] for entry in row]:
             entry["coefficients"] = [-c for c in entry["coefficients"]]
     with pytest.raises(CertificateRejected):
         check(write(tmp_path, model, proof))
-
-
-def test_a_storage_that_does_not_vanish_at_equal_states_is_rejected(
-    tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made["increments, 2.10"])
-    proof["proof"]["V"]["exponents"].insert(0, [0, 0, 0, 0])
-    proof["proof"]["V"]["coefficients"].insert(0, 1.0)
-    with pytest.raises(CertificateRejected, match=r"V\(x, x\) is not zero"):
-        check(write(tmp_path, model, proof))
-
-
-def test_on_a_box_a_metric_that_changes_is_refused(
-    tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    """Paths between states may leave the box; only straight ones are known to stay."""
-    model, proof = map(copied, made["derivatives, 2.11, M(x)"])
-    proof["claim"]["box"] = [[-1.0, 1.0], [-1.0, 1.0]]
-    with pytest.raises(CertificateRejected, match="curved paths"):
-        check(write(tmp_path, model, proof))
-
-
-def test_a_centre_makes_a_model_well_posed_that_is_not_monotone(tmp_path: Path) -> None:
-    """Proposition 2.7: e = R c(x) turned by 120° has no monotonicity; its centre R does it."""
-    model = rotated()
-    uncentred = ImplicitModel(model.h, model.shift, 1e-6, model.period, model.states, model.inputs)
-    assert prove_well_posed(uncentred) is None
-    proof = prove_well_posed(model)
-    assert proof is not None
-    document = proof.document(model, "model.json")
-    verdict = check(write(tmp_path, model.document(), document))
-    assert verdict.statement == (
-        "the implicit model with 2 states has exactly one next state for every state and input"
-    )
-    jsonschema.validate(document, files.load_document(SCHEMAS / "proof_stable_set.schema.json"))
-    jsonschema.validate(model.document(), files.load_document(SCHEMAS / "implicit.schema.json"))
-    for change in (_turned_away, _not_so_monotone, _without_centre, _singular_centre):
-        other, claimed = copied(model.document()), copied(document)
-        change(other, claimed)
-        with pytest.raises(CertificateRejected):
-            check(write(tmp_path, other, claimed))
-
-
-def _turned_away(model: Json, _: Json) -> None:
-    model["centre"]["coefficients"] = [[-v for v in row] for row in model["centre"]["coefficients"]]
-
-
-def _without_centre(model: Json, proof: Json) -> None:
-    del model["centre"]
-    identities = proof["proof"]["inequalities"]
-    proof["proof"]["inequalities"] = {"monotone": identities["centre"]}
-
-
-def _singular_centre(model: Json, _: Json) -> None:
-    model["centre"]["coefficients"][1] = model["centre"]["coefficients"][0]
-
-
-def test_a_nonlinear_centre_has_to_be_monotone_itself(tmp_path: Path) -> None:
-    """e₀ = v + v³/2 for h = e₀(v) + v/4 - x/2 - w: centred on a cubic."""
-    cubic = Polynomials(np.array([[1], [3]]), np.array([[1.0], [0.5]]))
-    model = ImplicitModel.separable(
-        Polynomials(np.array([[1], [3]]), np.array([[1.25], [0.5]])),
-        Polynomials(np.array([[1, 0], [0, 1]]), np.array([[0.5], [1.0]])),
-        monotonicity=0.5,
-        period=0.1,
-        states=("x",),
-        inputs=("u",),
-        centre=cubic,
-    )
-    proof = prove_well_posed(model)
-    assert proof is not None
-    document = proof.document(model, "model.json")
-    assert check(write(tmp_path, model.document(), document)).margin > 0.0
-    known = np.array([[2.0, 3.0]])
-    v = model.solve(known, start=np.zeros((1, 1)))
-    np.testing.assert_allclose(model.ellipsoid(known[0], start=np.zeros(1)), v[0], atol=1e-6)
-    falling = copied(model.document())
-    falling["centre"]["coefficients"][0][0] = -1.0
-    with pytest.raises(CertificateRejected):
-        check(write(tmp_path, falling, document))
-
-
-def test_a_box_of_inputs_can_be_what_makes_a_model_well_posed(tmp_path: Path) -> None:
-    """v + v³ + v w = x/2: monotone where w > -1."""
-    model = ImplicitModel(
-        h=Polynomials(
-            np.array([[1, 0, 0], [3, 0, 0], [1, 0, 1], [0, 1, 0]]),
-            np.array([[1.0], [1.0], [1.0], [-0.5]]),
-        ),
-        shift=Polynomials(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))),
-        monotonicity=0.25,
-        period=0.1,
-        states=("x",),
-        inputs=("u",),
-    )
-    assert prove_well_posed(model) is None
-    proof = prove_well_posed(model, ends=((-1.0, 1.0), (-0.5, 1.0)))
-    assert proof is not None
-    document = proof.document(model, "model.json")
-    assert check(write(tmp_path, model.document(), document)).statement == (
-        "the implicit model with 1 state has exactly one next state for every state in [-1, 1] and "
-        "every input in [-0.5, 1]"
-    )
-    document["claim"]["box"][1][0] = -0.9
-    with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model.document(), document))
 
 
 @settings(deadline=None, max_examples=10)
@@ -363,12 +241,11 @@ def test_every_stable_matrix_has_a_proof_in_2_19_and_no_unstable_one(
     assert prove_implicit(linear((2.0 - radius) * A), delta=1e-3, set="2.19") is None
 
 
-@pytest.mark.parametrize("kind", ["2.10", "2.11"])
-def test_an_unstable_model_gets_no_proof(kind: str) -> None:
-    assert prove_implicit(lagged(1.0, 0.3), delta=0.01, set=kind) is None
+def test_an_unstable_model_gets_no_proof() -> None:
+    assert prove_implicit(lagged(1.0, 0.3), delta=0.01, set="2.11") is None
 
 
-@pytest.mark.parametrize("kind", ["2.12", "2.13", "2.19"])
+@pytest.mark.parametrize("kind", ["2.13", "2.19"])
 def test_sets_of_separable_models_take_no_others(kind: str) -> None:
     assert prove_implicit(cubic_spring(), delta=0.01, set=kind) is None
 
@@ -379,20 +256,14 @@ def test_cubic_models_have_no_global_proof_with_a_constant_p() -> None:
 
 
 def test_sets_that_do_not_exist_are_refused() -> None:
-    with pytest.raises(DataError, match=r"known: 2\.10"):
+    with pytest.raises(DataError, match=r"known: 2\.11"):
         prove_implicit(quintic(), delta=DELTA, set="2.9")
     with pytest.raises(DataError, match="delta"):
         prove_implicit(quintic(), delta=-1.0)
 
 
 def _huge_degree(_: Json, proof: Json) -> None:
-    proof["proof"]["V"]["exponents"][-1][-1] = 10**6
-
-
-def _huge_expansion(model: Json, proof: Json) -> None:
-    model["shift"]["exponents"] = [[i, j, k] for i in range(4) for j in range(4) for k in range(4)]
-    model["shift"]["coefficients"] = [[1.0]] * 64
-    proof["proof"]["V"]["exponents"][-1][-1] = 6
+    proof["proof"]["M"][0][0]["exponents"][-1][-1] = 10**6
 
 
 def _huge_model(model: Json, _: Json) -> None:
@@ -400,15 +271,11 @@ def _huge_model(model: Json, _: Json) -> None:
     model["h"]["coefficients"] += [[1.0]] * 8
 
 
-@pytest.mark.parametrize(
-    "change", [_huge_degree, pytest.param(_huge_expansion, marks=pytest.mark.slow), _huge_model]
-)
-def test_a_document_that_would_take_forever_is_refused_in_seconds(
+@pytest.mark.parametrize("change", [_huge_degree, _huge_model])
+def test_a_document_that_would_take_forever_is_refused(
     change: Change, tmp_path: Path, made: dict[str, tuple[Json, Json]]
 ) -> None:
-    model, proof = map(copied, made["increments, 2.10"])
+    model, proof = map(copied, made["derivatives, 2.11"])
     change(model, proof)
-    started = time.process_time()
     with pytest.raises(CertificateRejected):
         check(write(tmp_path, model, proof))
-    assert time.process_time() - started < 20.0

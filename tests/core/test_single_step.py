@@ -16,7 +16,6 @@ EVERY: dict[str, Callable[[], ImplicitModel]] = {
     "coupled": implicit_models.coupled,
     "lagged": implicit_models.lagged,
     "cubic spring": implicit_models.cubic_spring,
-    "rotated": implicit_models.rotated,
     "linear": lambda: implicit_models.linear(np.array([[0.6, 0.3], [-0.2, 0.5]])),
 }
 

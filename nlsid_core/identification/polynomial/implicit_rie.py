@@ -3,10 +3,10 @@
 In signals of unit spread, with ε = e(ỹ(t)) - f(x̃, w̃) the equation error of a sample, the search is
     minimise (1/N) Σ |ε|²_{S⁻¹}   over e, f, the set's storage and S ≻ 0,
 the set's inequality keeping |x - x̂|²_Q in place of δ|x - x̂|², and S:
-    2.10, 2.11        … - |x - x̂|²_Q ≥ |v - v̂|²_S
-    2.12, 2.13, 2.19  P - S (E - S) in place of the block P (E)
+    2.11        … - |x - x̂|²_Q ≥ |v - v̂|²_S
+    2.13, 2.19  P - S (E - S) in place of the block P (E)
 Each term bounds the robust identification error of its sample, (2.28):
-    2.10, 2.11: -|ν|²_S - 2ν'ε ≤ |ε|²_{S⁻¹};  else: |a + ε|²_{P⁻¹} ≤ |a|²_{(P-S)⁻¹} + |ε|²_{S⁻¹}.
+    2.11: -|ν|²_S - 2ν'ε ≤ |ε|²_{S⁻¹};  else: |a + ε|²_{P⁻¹} ≤ |a|²_{(P-S)⁻¹} + |ε|²_{S⁻¹}.
 With linear models it is equal to it (Claim 2.18: a weighted equation error). S is one for all
 samples, so what the data say is the triangular factor of their monomials, however many there are.
 Terms of f in the inputs alone are in no inequality and cost a search nothing: for any e, S and
@@ -26,9 +26,8 @@ from nlsid_core.identification.polynomial.implicit_rows import (
     SLOW,
     ImplicitRows,
 )
-from nlsid_core.identification.polynomial.options import DELAYED
 from nlsid_core.identification.proofs import conditions
-from nlsid_core.identification.proofs.conditions import GAP, Inequality, constraint
+from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.proofs.stable_sets import (
     ImplicitProof,
@@ -38,7 +37,6 @@ from nlsid_core.identification.proofs.stable_sets import (
 from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables
-from nlsid_core.polynomial.algebra import as_polynomial
 from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import (
     NonNegative,
@@ -144,19 +142,16 @@ def prove_in_set(model: ImplicitModel, rows: ImplicitRows) -> ImplicitProof | No
 
 
 def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitProof | None:
-    made, mean, spread = rows.model_class, *rows.units
+    mean, spread = rows.units
     n_v = len(rows.y_scale[0])
     sizes = np.abs(mean) + spread
     known = (*rows.names.x, *rows.names.w)
     scale = dict(zip((*rows.names.v, *known), (*sizes[:n_v], *sizes), strict=True))
-    gaps = dict(zip((*rows.names.v, *known), (*spread[:n_v], *spread), strict=True))
-    scale |= {name + GAP: gaps[name] for name in (*rows.names.v, *rows.names.x)}
     return prove_implicit(
         model,
         delta=delta,
         set=rows.set,
         ends=rows.ends,
-        storage_degree=made.storage_degree,
         scale=scale,
     )
 
@@ -180,47 +175,25 @@ def set_constraints(
     rows: ImplicitRows, e: Objects, f: Objects, S: Objects, rate: float
 ) -> list[Constraint]:
     """The set's inequalities with Q and S kept, and e monotone wherever v is."""
-    names, made, Q = rows.names, rows.model_class, rows.weight
-    domain = _domain(rows, (*names.x, *names.w))
-    of_set: list[Inequality] = []
-    if rows.set in DELAYED:
-        storage = storage_template(rows.set, names, made.storage_degree)
-        h, n_v = e - f, len(e)
+    names, n_v = rows.names, len(e)
+    domain, storage = _domain(rows, (*names.x, *names.w)), storage_template(rows.set, names)
+    if rows.set == "2.11":
+        assert storage is not None
         shift = np.array(variables(names.x)[: len(names.x) - n_v], dtype=object)
         inside = domain + _domain(rows, names.v)
-        if rows.set == "2.10":
-            assert isinstance(storage, Polynomial)
-            kept = _form(S, names.gaps(names.v)) + _form(Q, names.gaps(names.x))
-            part = conditions.implicit_increments(
-                h, shift, storage, names.v, names.x, delta=0, rate=rate, domain=inside
-            )
-            of_set = [
-                _minus(part, [[kept]]),
-                conditions.storage(storage, names.x, domain=_domain(rows, names.x)),
-            ]
-        else:
-            assert isinstance(storage, np.ndarray)
-            part = conditions.implicit_derivatives(
-                h, shift, storage, names.v, names.x, delta=0, rate=rate, domain=inside
-            )
-            of_set = [_minus(part, _diagonal(S, Q)), Inequality(storage)]
+        part = conditions.implicit_derivatives(
+            e - f, shift, storage, (names.v, names.x), delta=0, rate=rate
+        )
+        part = replace(part, domain=inside)
+        of_set = [_minus(part, _diagonal(S, rows.weight)), Inequality(storage)]
     else:
-        e_of_x = np.array([_renamed(p, names) for p in e], dtype=object)
-        if rows.set == "2.19":
-            E, F = (
-                np.array([[p.derivative(x) for x in names.x] for p in part], dtype=object)
-                for part in (e_of_x, f)
-            )
+        E = conditions.slopes([_renamed(p, names) for p in e], names.x)
+        F = conditions.slopes(f, names.x)
+        if storage is None:
             part = conditions.linear(E, F, 0, rate=rate)
         else:
-            P = storage_template(rows.set, names, 0)
-            assert isinstance(P, np.ndarray)
-            of = conditions.increments if rows.set == "2.12" else conditions.derivatives
-            part = of(e_of_x, f, P, names.x, delta=0, rate=rate, domain=domain)
-        corner = Q
-        if rows.set == "2.12":
-            corner = np.array([[_form(Q, names.gaps(names.x))]], dtype=object)
-        of_set = [_minus(part, _diagonal(corner, S))]
+            part = conditions.derivatives(E, F, storage, delta=0, rate=rate, domain=domain)
+        of_set = [_minus(part, _diagonal(rows.weight, S))]
     found: list[Constraint] = [
         constraint(part.relevant(), name=f"set {rows.set}, {k}") for k, part in enumerate(of_set)
     ]
@@ -338,11 +311,6 @@ def _renamed(p: Polynomial, names: Names) -> Polynomial:
     """The same polynomial of the present state."""
     new = dict(zip(names.v, names.x, strict=True))
     return Polynomial(p.exponents, p.coefficients, tuple(new.get(name, name) for name in p.names))
-
-
-def _form(matrix: FloatArray | Objects, names: tuple[str, ...]) -> Polynomial:
-    y = np.array(variables(names), dtype=object)
-    return as_polynomial(y @ matrix @ y)
 
 
 def _diagonal(first: FloatArray | Objects, second: FloatArray | Objects) -> Objects:

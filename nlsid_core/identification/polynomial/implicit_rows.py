@@ -235,9 +235,9 @@ def refuse_large(model_class: Options, outputs: int, inputs: int) -> None:
             f"a semidefinite block of {outputs} outputs and {n} states, more than "
             f"{LARGEST_BLOCK}: {SLOW}; use fewer lags"
         )
-    curved = coupled or d.past > 1 or model_class.storage_degree > 0
+    curved = coupled or d.past > 1
     inside = outputs + (k if curved else 0)
-    half = max(d.left, d.past, model_class.storage_degree + 2) // 2
+    half = max(d.left, d.past, 2) // 2
     curves, flat = (outputs + n, 0) if curved else (outputs, n)
     square = curves * comb(inside + half, half) + flat
     if square > MOST_MONOMIALS:

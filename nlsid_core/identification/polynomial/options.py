@@ -17,10 +17,9 @@ MOST_LAGS = 100
 HIGHEST_DEGREE = 5  # in the inputs; the number of terms grows with that power of the inputs
 CERTIFIABLE_DEGREE = 2  # of the newest output's coefficient: the S-procedure bounds a quadratic
 CERTIFIABLE_AFFINE = 1  # of every coefficient if the others depend on inputs too: corners decide
-DELAYED = ("2.10", "2.11")  # the sets for more than one lag; the others have no known structure ã
 
 Ranges = tuple[tuple[float, float], ...]
-StableSet = Literal["2.10", "2.11", "2.12", "2.13", "2.19", "3.8"]
+StableSet = Literal["2.11", "2.13", "2.19", "3.8"]
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,9 @@ class Polynomial:
     input_range: (low, high) of each input in its unit, where the model is proved (None: the range
     in the data, or everywhere in a set). output_range: the same of each output, for a set (None:
     everywhere). on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
-    set: of stable models to search, by its number in the thesis: "2.10" to "2.13", "2.19" for
-    linear models, "3.8" for equations that are monotone in y(t) and affine in the rest (None: for a
-    linear left side those of Chapter 4, else "3.8" or "2.11", whichever has such equations).
+    set: of stable models to search, by its number in the thesis: "2.11", "2.13" for one lag, "2.19"
+    for linear models, "3.8" for equations that are monotone in y(t) and affine in the rest (None:
+    for a linear left side those of Chapter 4, else "3.8" or "2.11", whichever has such equations).
     continuous: of measured states, lags 1 and delays (1,), only models that E dx/dt = g(x) + r(u)
     makes by the trapezoidal rule; `dynamics.identified_field` is then the equation itself.
     Raises OptionError, which names an option, its value and what is allowed, or DataError for a
@@ -101,12 +100,6 @@ class Polynomial:
     def is_linear(self) -> bool:
         """No option but the lags is set, so that with one input it is a difference equation."""
         return self == Polynomial(self.lags)
-
-    @property
-    def storage_degree(self) -> int:
-        """Of the storage's metric, in set 2.10: what f grows by without a box."""
-        grows = self.form == "2.10" and self.output_range is None
-        return 2 * (self.degrees.past - 1) if grows else 0
 
     @property
     def box(self) -> Ranges | None:
@@ -155,8 +148,8 @@ class Polynomial:
     def _refuse_outside_the_set(self) -> None:
         """Combinations that no model of Chapter 2 has."""
         d, name = self.degrees, self.form
-        if self.lags > 1 and name not in DELAYED:
-            raise DataError(f"set {name} is for 1 lag; {' and '.join(DELAYED)} are for more")
+        if self.lags > 1 and name != "2.11":
+            raise DataError(f"set {name} is for 1 lag; 2.11 is for more")
         if d.leading or d.inputs == 0:
             raise DataError(f"set {name} has no factor of y(t) that depends on inputs, which f has")
         if (self.input_range is None) != (self.output_range is None):

@@ -2,15 +2,14 @@
 
 For a model 0 = h(v, x, w), x⁺ = [v; ã(x, w)] and a set:
     2.19   E = E' ≻ 0 of a linear model               V = |x - x̂|²_E
-    2.10   V(x, x̂) ≥ 0 with V(x, x) = 0
-    2.11   M(x) ⪰ 0                                   V the energy of a path from x to x̂
-    2.12, 2.13   P ≻ 0                                V = |e(x) - e(x̂)|²_{P⁻¹}
+    2.11   M ⪰ 0                                      V = |x - x̂|²_M
+    2.13   P ≻ 0                                      V = |e(x) - e(x̂)|²_{P⁻¹}
 In each, V falls by δ|x - x̂|² or more a sample. What the kernel decides is stated by its claim
 `stable_set`; here the same inequalities may hold a storage with unknowns.
-Source: thesis Lemmas 2.10 to 2.13, (2.19), Theorem 2.5, Proposition 2.7.
+Source: thesis Lemmas 2.11 and 2.13, (2.19), Theorem 2.5.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,10 @@ from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import Polynomial
 
-SETS = ("2.10", "2.11", "2.12", "2.13", "2.19")
-STORAGE = {"2.10": "V", "2.11": "M", "2.12": "P", "2.13": "P"}
+SETS = ("2.11", "2.13", "2.19")
+STORAGE = {"2.11": "M", "2.13": "P"}
 Ends = list[list[float]]
-Storage = Polynomial | NDArray[np.object_] | None
+Storage = NDArray[np.object_] | None
 
 
 @dataclass(frozen=True)
@@ -53,14 +52,6 @@ class Names:
         return tuple(name + GAP for name in names)
 
 
-def well_posed(model: ImplicitModel, *, ends: Ends) -> dict[str, Inequality]:
-    """What makes the next state unique, by name, exact."""
-    names = Names.of(model)
-    h = exact_polynomials(model.h, (*names.v, *names.x, *names.w))
-    found = _well_posed(model, h, names, _domain((*names.x, *names.w), ends))
-    return {key: part.relevant() for key, part in found.items()}
-
-
 def inequalities(
     model: ImplicitModel, kind: str, storage: Storage, *, delta: float, ends: Ends
 ) -> dict[str, Inequality]:
@@ -68,44 +59,27 @@ def inequalities(
 
     Raises DataError if the model is not of the set's form.
     """
-    found = _inequalities(model, kind, storage, delta, ends)
-    return {key: part.relevant() for key, part in found.items()}
-
-
-def _inequalities(
-    model: ImplicitModel, kind: str, storage: Storage, delta: float, ends: Ends
-) -> dict[str, Inequality]:
     names = Names.of(model)
     h = exact_polynomials(model.h, (*names.v, *names.x, *names.w))
     known = _domain((*names.x, *names.w), ends)
-    result = _well_posed(model, h, names, known)
-    if kind in ("2.10", "2.11"):
+    found = {"monotone": conditions.monotone(h, names.v, model.monotonicity, domain=known)}
+    if kind == "2.11":
+        assert storage is not None
         shift = exact_polynomials(model.shift, (*names.x, *names.w))
-        domain = known + _domain(names.v, ends[: len(names.v)])
-        if kind == "2.10":
-            assert isinstance(storage, Polynomial)
-            result["stable"] = conditions.implicit_increments(
-                h, shift, storage, names.v, names.x, delta=delta, domain=domain
-            )
-            states = _domain(names.x, ends[: len(names.x)])
-            result["storage"] = conditions.storage(storage, names.x, domain=states)
+        inside = known + _domain(names.v, ends[: len(names.v)])
+        part = conditions.implicit_derivatives(h, shift, storage, (names.v, names.x), delta=delta)
+        found["stable"] = replace(part, domain=inside)
+        found["storage"] = Inequality(storage)
+    else:
+        e, f = _separated(model, names)
+        E, F = conditions.slopes(e, names.x), conditions.slopes(f, names.x)
+        if kind == "2.19":
+            _refuse_curved(E, F, ends)
+            found["stable"] = conditions.linear(E, F, delta)
         else:
-            assert isinstance(storage, np.ndarray)
-            result["stable"] = conditions.implicit_derivatives(
-                h, shift, storage, names.v, names.x, delta=delta, domain=domain
-            )
-            result["storage"] = Inequality(storage)
-        return result
-    e, f = _separated(model, names)
-    if kind == "2.19":
-        if ends:
-            raise DataError("a linear model is stable everywhere: the claim has no box")
-        result["stable"] = conditions.linear(*_linear_parts(e, f, names), delta)
-        return result
-    assert isinstance(storage, np.ndarray)
-    condition = conditions.increments if kind == "2.12" else conditions.derivatives
-    result["stable"] = condition(e, f, storage, names.x, delta=delta, domain=known)
-    return result
+            assert storage is not None
+            found["stable"] = conditions.derivatives(E, F, storage, delta=delta, domain=known)
+    return {key: part.relevant() for key, part in found.items()}
 
 
 def exact_polynomials(parts: Polynomials, names: tuple[str, ...]) -> NDArray[np.object_]:
@@ -114,20 +88,6 @@ def exact_polynomials(parts: Polynomials, names: tuple[str, ...]) -> NDArray[np.
     for i, column in enumerate(parts.coefficients.T):
         result[i] = Polynomial(parts.exponents, column, names).exact()
     return result
-
-
-def _well_posed(
-    model: ImplicitModel, h: NDArray[np.object_], names: Names, domain: Domain
-) -> dict[str, Inequality]:
-    m = model.monotonicity
-    if model.centre is None:
-        return {"monotone": conditions.monotone(h, names.v, m, domain=domain)}
-    centre = exact_polynomials(model.centre, names.v)
-    bijective = conditions.regular if model.has_linear_centre else conditions.monotone
-    return {
-        "centre": bijective(centre, names.v, m),
-        "centred": conditions.centred(h, centre, names.v, domain=domain),
-    }
 
 
 def _separated(
@@ -140,18 +100,13 @@ def _separated(
     return exact_polynomials(e, names.x), exact_polynomials(f, (*names.x, *names.w))
 
 
-def _linear_parts(
-    e: NDArray[np.object_], f: NDArray[np.object_], names: Names
-) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
-    E, F = (
-        np.array([[p.derivative(name) for name in names.x] for p in part], dtype=object)
-        for part in (e, f)
-    )
+def _refuse_curved(E: NDArray[np.object_], F: NDArray[np.object_], ends: Ends) -> None:
+    if ends:
+        raise DataError("a linear model is stable everywhere: the claim has no box")
     if any(entry.degree for row in (*E, *F) for entry in row):
         raise DataError("the model is not linear in its states")
     if any(E[i, j] != E[j, i] for i in range(len(E)) for j in range(i)):
         raise DataError("E is not symmetric; multiply the model's equation by E' first")
-    return E, F
 
 
 def _domain(names: tuple[str, ...], ends: Ends) -> Domain:

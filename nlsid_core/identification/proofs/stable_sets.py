@@ -1,8 +1,7 @@
 """Search for the proof that an implicit model is well posed and incrementally stable."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,12 @@ from nlsid_core.identification.proofs.sets import (
     Names,
     Storage,
     inequalities,
-    well_posed,
 )
 from nlsid_core.models import ImplicitModel
-from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.algebra import as_polynomial
 from nlsid_core.polynomial.documents import write_polynomial
 from nlsid_core.proofs import binding, decide, proof_document
-from nlsid_core.sos import Program, Solution, forms_of, solve, template
-from nlsid_core.sos.program import round_to_power_of_two
+from nlsid_core.sos import Program, Solution, forms_of, solve, symmetric_template
 from nlsid_core.sos.proofs import inequality, quadratic_form
 
 KIND = "stable_set"
@@ -36,8 +32,8 @@ FAILURES = (Infeasible, SolverError, CertificateRejected, DataError)  # of a sea
 class ImplicitProof:
     """What a proof file of kind `stable_set` holds, decided by the kernel for the model.
 
-    set: of thesis Chapter 2, with its δ; empty for well-posedness alone. box: (low, high) of every
-    state and input; empty for everywhere. inequalities: a witness for each. storage: its member.
+    set: of thesis Chapter 2, with its δ. box: (low, high) of every state and input; empty for
+    everywhere. inequalities: a witness for each. storage: its member.
     """
 
     set: str
@@ -53,29 +49,11 @@ class ImplicitProof:
 
     def document(self, model: ImplicitModel, file: str) -> Json:
         """The proof file's content for the model stored in `file` beside it."""
-        claim: Json = {"kind": KIND, "about": {"model": binding(file, model.document())}}
-        if self.set:
-            claim |= {"set": self.set, "delta": self.delta}
+        about = {"model": binding(file, model.document())}
+        claim: Json = {"kind": KIND, "about": about, "set": self.set, "delta": self.delta}
         if self.box:
             claim["box"] = [list(ends) for ends in self.box]
         return proof_document(claim, {"inequalities": self.inequalities} | self.storage)
-
-
-def prove_well_posed(
-    model: ImplicitModel, *, ends: Sequence[tuple[float, float]] = ()
-) -> ImplicitProof | None:
-    """A proof that every state and input has one next state: (2.12), or Proposition 2.7.
-
-    ends: as in `prove_implicit`. None if the search finds no proof, or there is none.
-    """
-    try:
-        parts = well_posed(model, ends=[list(pair) for pair in ends])
-        witnesses = _witnesses(parts, Names.of(model), "")
-        proof = ImplicitProof("", 0.0, tuple((a, b) for a, b in ends), witnesses, {})
-        _decide(proof, model)
-    except FAILURES:
-        return None
-    return proof
 
 
 def prove_implicit(
@@ -84,65 +62,50 @@ def prove_implicit(
     delta: float,
     set: str = "2.13",
     ends: Sequence[tuple[float, float]] = (),
-    storage_degree: int = 0,
     scale: Mapping[str, float] | None = None,
 ) -> ImplicitProof | None:
     """A proof at the stated δ that the model is in the set, or None if the search finds none.
 
-    set: of thesis Chapter 2; "2.10" and "2.11" for any model, "2.12" and "2.13" for separable ones,
-    "2.19" for linear ones. ends: (low, high) of every state and input for a claim on that box; none
-    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ). scale: the sizes of
-    the variables of `Names`, for the search (default 1).
+    set: of thesis Chapter 2; "2.11" for any model, "2.13" for separable ones, "2.19" for linear
+    ones. ends: (low, high) of every state and input for a claim on that box; none is global.
+    scale: the sizes of the variables of `Names`, for the search (default 1).
     Raises DataError for an unknown set or a negative δ.
     """
     if set not in SETS or not delta > 0.0:
         raise DataError(f"set '{set}' (known: {', '.join(SETS)}), delta {delta:g} (positive)")
     names, box = Names.of(model), [list(pair) for pair in ends]
-    unknown = storage_template(set, names, 0 if ends and set == "2.11" else storage_degree)
+    unknown = storage_template(set, names)
     try:
         wanted = inequalities(model, set, unknown, delta=delta, ends=box)
         of_storage = {key: part for key, part in wanted.items() if key in ("stable", "storage")}
         storage = _valued(unknown, _solved(of_storage, names, scale)) if set in STORAGE else None
         parts = inequalities(model, set, storage, delta=delta, ends=box)
-        witnesses = _witnesses(parts, names, set, scale)
+        witnesses = _witnesses(parts, names, scale)
         written = {STORAGE[set]: _written(storage, set, names)} if set in STORAGE else {}
         proof = ImplicitProof(set, delta, tuple((a, b) for a, b in ends), witnesses, written)
-        _decide(proof, model)
+        decide(proof.document(model, "model.json"), {"model.json": model.document()})
     except FAILURES:
         return None
     return proof
 
 
-def _decide(proof: ImplicitProof, model: ImplicitModel) -> None:
-    """Raise CertificateRejected unless the kernel proves it."""
-    decide(proof.document(model, "model.json"), {"model.json": model.document()})
-
-
 def _witnesses(
-    parts: dict[str, Inequality],
-    names: Names,
-    kind: str,
-    scale: Mapping[str, float] | None = None,
+    parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None
 ) -> Json:
     """The kernel's witness for each inequality."""
     witnesses: Json = {}
     for key, part in parts.items():
         found = _solved({key: part}, names, scale)[key]
-        undone = _gap(part, scale) ** 2 if len(part.matrix) == 1 else 1.0
-        gram, *others = (replace(g, Q=undone * g.Q) for g in (found.gram, *found.multipliers))
         used = part.variables(names.all)
         wide = np.array([[e.over(used) for e in row] for row in part.matrix], dtype=object)
         c = wide[0, 0].exact() if len(wide) == 1 else quadratic_form(wide)
         domain = [g.over(c.names) for g in part.domain]
-        witness = inequality(c, gram, domain=domain, multipliers=others)
-        is_form = len(wide) == 1 and not (kind == "2.10" and key in ("stable", "storage"))
-        witnesses[key] = _lifted(witness, part, c.names, names, times_y=is_form)
+        witness = inequality(c, found.gram, domain=domain, multipliers=found.multipliers)
+        witnesses[key] = _lifted(witness, part, c.names, names)
     return witnesses
 
 
-def _lifted(
-    witness: Json, part: Inequality, used: Sequence[str], names: Names, *, times_y: bool
-) -> Json:
+def _lifted(witness: Json, part: Inequality, used: Sequence[str], names: Names) -> Json:
     """In all the claim's variables, v, x, w, their gaps, y; times y[0] for a matrix of order 1."""
     everything = (*names.all, *forms_of(2 * len(names.x) + 1))
     places = [everything.index(name) for name in used]
@@ -154,7 +117,7 @@ def _lifted(
             wide = [0] * len(everything)
             for place, power in zip(places, row, strict=True):
                 wide[place] = power
-            wide[first] += int(times_y)
+            wide[first] += int(len(part.matrix) == 1)
             lifted.append(wide)
         return lifted
 
@@ -167,28 +130,13 @@ def _lifted(
     return found
 
 
-def storage_template(kind: str, names: Names, degree: int) -> Storage:
+def storage_template(kind: str, names: Names) -> Storage:
     """The storage of a set with an unknown at every coefficient; None for linear models."""
-    if kind not in STORAGE:
-        return None
-    n, key = len(names.x), STORAGE[kind]
-    inner = names.x if key != "V" else names.x + Names.gaps(names.x)
-    basis = monomials(len(inner), range(degree + 1 if key != "P" else 1))
-    M = np.empty((n, n), dtype=object)
-    for i in range(n):
-        for j in range(i, n):
-            M[i, j] = M[j, i] = template(f"M[{i},{j}]", basis, inner)
-    if key != "V":
-        return M
-    gap = np.array(variables(Names.gaps(names.x)))
-    V: Polynomial = gap @ M @ gap
-    return V
+    return symmetric_template("M", len(names.x)) if kind in STORAGE else None
 
 
 def _valued(storage: Storage, solution: Solution) -> Storage:
     """With the unknowns at their values, exactly these floats."""
-    if isinstance(storage, Polynomial):
-        return solution.value(storage).exact()
     assert storage is not None
     result: NDArray[np.object_] = np.empty(storage.shape, dtype=object)
     for index in np.ndindex(*storage.shape):
@@ -199,36 +147,17 @@ def _valued(storage: Storage, solution: Solution) -> Storage:
 def _solved(
     parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None
 ) -> Solution:
-    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order.
-
-    The first row of a matrix that vanishes with a gap is taken in units of the gap; `_identities`
-    undoes it for a single polynomial, the program where the row has an indeterminate.
-    """
-    constraints, sizes = [], dict(scale or {})
-    for key, part in parts.items():
-        gap = _gap(part, scale)
-        if len(part.matrix) == 1:
-            part = replace(part, matrix=part.matrix * Fraction(1.0 / gap**2))
-        elif part.vanishing:
-            sizes[forms_of(1)[0]] = 1.0 / gap
-        constraints.append(constraint(part, name=key))
+    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order."""
+    constraints = tuple(constraint(part, name=key) for key, part in parts.items())
     largest = max(len(part.matrix) for part in parts.values())
     forms = forms_of(largest) if largest > 1 else ()
     everything = {name for part in parts.values() for name in part.variables(names.all)}
     used = (*(name for name in names.all if name in everything), *forms)
-    kept = {name: size for name, size in sizes.items() if name in used}
-    return solve(Program(used, tuple(constraints), scale=kept))
+    kept = {name: size for name, size in (scale or {}).items() if name in used}
+    return solve(Program(used, constraints, scale=kept))
 
 
-def _gap(part: Inequality, scale: Mapping[str, float] | None) -> float:
-    """The size of the gaps with which an inequality vanishes, a power of two; 1 if with none."""
-    sizes = [(scale or {}).get(name, 1.0) for name in part.vanishing]
-    return round_to_power_of_two(max(sizes, default=1.0))
-
-
-def _written(storage: Storage, kind: str, names: Names) -> Json | list[list[Any]]:
-    if isinstance(storage, Polynomial):
-        return write_polynomial(storage.over(names.x + Names.gaps(names.x)))
+def _written(storage: Storage, kind: str, names: Names) -> list[list[Any]]:
     assert storage is not None
     if STORAGE[kind] == "P":
         return [[float(entry) for entry in row] for row in storage]

@@ -1,0 +1,318 @@
+"""A filter, a static map, a filter, found by simulation error from random starts.
+
+    x_j = B1_j/A1 u,    y = Σ_j B2_j/A2 f(x_j),    j = 0 … phases - 1
+
+Random starts on a part of the data, then all of it; the number of phases and of knots are chosen
+by the simulation error on validation data. `BlockCascade` says what the phases are.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification.fit import Step
+from nlsid_core.identification.network.fit import (
+    MAX_RADIUS,
+    Minimum,
+    Problem,
+    Scaled,
+    best_for,
+    minimise,
+)
+from nlsid_core.identification.network.maps import Smooth
+from nlsid_core.identification.network.options import FilterMapFilter, Network
+from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Taps, Trial
+from nlsid_core.identification.regressors import signal_scale
+from nlsid_core.identification.trail import Task
+from nlsid_core.identification.validation import hold_out
+from nlsid_core.models import BlockCascade, Spline
+from nlsid_core.models.signal import signals_of
+
+STEPS, TOLERANCE = 40, 1e-3  # where a choice of knots and phases is judged
+FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
+SMOOTHING = 1e-8  # of the spline
+START_SAMPLES = 10_000  # of each trial, for the starts
+START_INTERVALS = 12
+SCREENING_STEPS, START_STEPS = 20, 60
+KEPT_STARTS = 3  # of the screened ones, minimised further
+POLE_RADII = (0.5, 0.95)
+POLE_ANGLES = (0.1, 1.5)  # rad a sample: a filter that passes something of a sampled signal
+MARGIN = 0.02  # of the range of x beyond the outer data on each side
+RIDGE = 1e-6  # of the mean curvature: knots without data stay near zero
+FINE = 40  # points an interval at which one spline is fitted to another
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """θ = [a1, b1, a2, b2, the coefficients of f] of filters of these orders, in scaled signals.
+
+    held: trials begin in motion, from the first measured outputs; else from rest.
+    """
+
+    orders: tuple[int, int]
+    phases: int
+    held: bool
+    f: Smooth
+    theta: FloatArray
+
+    @property
+    def places(self) -> list[IntArray]:
+        """Where in θ a1 (n₁,), b1 (M, n₁+1), a2 (n₂,), b2 (M, n₂+1) and the coefficients are."""
+        (n1, n2), M = self.orders, self.phases
+        shapes = [(n1,), (M, n1 + 1), (n2,), (M, n2 + 1), (self.f.intervals + 3,)]
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+        indices = np.split(np.arange(ends[-1]), ends[:-1])
+        return [at.reshape(shape) for at, shape in zip(indices, shapes, strict=True)]
+
+    @property
+    def numbers(self) -> list[FloatArray]:
+        """a1, b1, a2, b2 and the coefficients of f."""
+        return [self.theta[at] for at in self.places]
+
+    def moved(self, numbers: dict[str, FloatArray]) -> "Cascade":
+        """With other numbers, called as in `places`; their sizes may change."""
+        names = ("a1", "b1", "a2", "b2", "c")
+        known = dict(zip(names, self.numbers, strict=True)) | numbers
+        theta = np.concatenate([known[name].ravel() for name in names])
+        return replace(self, theta=theta, phases=len(known["b1"]))
+
+    @property
+    def signals(self) -> Signals:
+        """x_0 …, y of one input."""
+        a1, b1, a2, b2, c = self.places
+        nodes: list[Signal | Mapped] = []
+        for j, b in enumerate(b1):
+            nodes += [Signal((Taps(0, b), Taps(2 + 2 * j, a1, 1))), Mapped(2 + 2 * j, self.f, c)]
+        y = 2 + len(nodes)
+        taps = [Taps(3 + 2 * j, b) for j, b in enumerate(b2)]
+        nodes.append(Signal((*taps, Taps(y, a2, 1)), len(a2) if self.held else 0))
+        return Signals(1, tuple(nodes), y)
+
+    def problem(self, trials: tuple[Trial, ...], radius: float) -> Problem:
+        """What is minimised: of the map, second differences are kept small."""
+        *_, c = self.places
+        weight = np.sqrt(SMOOTHING) / max(float(np.ptp(self.theta[c])), np.finfo(float).tiny)
+        bend = np.zeros((len(c) - 2, len(self.theta)))
+        bend[:, c] = weight * np.diff(np.eye(len(c)), n=2, axis=0)
+        return Problem(self.signals, trials, bend, radius=radius)
+
+    def inner(self, trials: tuple[Trial, ...]) -> FloatArray:
+        """All x_j along all trials."""
+        signals = self.signals
+        return np.concatenate(
+            [x for trial in trials for x in signals.run(self.theta, trial)[2:-1:2]]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What was fitted with a number of phases and of knots, and its rms errors in y's unit."""
+
+    cascade: Cascade
+    train_rms: float
+    validation_rms: float
+
+    def __str__(self) -> str:
+        M = self.cascade.phases
+        phases = "1 phase" if M == 1 else f"{M} phases"
+        return f"{phases}, {self.cascade.f.intervals} intervals"
+
+
+def filter_map_filter(
+    train: Dataset, model_class: Network[FilterMapFilter], task: Task
+) -> tuple[BlockCascade, tuple[Step, ...]]:
+    """A `BlockCascade` by simulation error, and the rms errors of the choices.
+
+    Without validation trials some of the training trials choose, and what they chose is fitted to
+    all. Raises ShapeError for several inputs or outputs, DataError on too little or constant data.
+    """
+    made, progress = model_class.structure, task.progress
+    fitted, judged = (train, task.validation) if task.validation else hold_out(train)
+    scaled = _scales(fitted)
+    known, others = (_trials(data, scaled, made, task) for data in (fitted, judged))
+    search = _Search(min(MAX_RADIUS, task.searched_rate), known, others, scaled.y[1])
+    total = len(made.phases) * len(made.intervals) + 2
+    first = _best_start(search, made, np.random.default_rng(model_class.seed))
+    progress(f"best of {made.starts} starts", 1 / total)
+    single = search.minimised(_with_intervals(first, known, made.intervals[0]), known)[0]
+    tried: list[Choice] = []
+    for M in made.phases:
+        base = single if M == 1 else _with_phases(single, search, M)
+        coarser = np.inf
+        for K in made.intervals:
+            finer = search.choice(_with_intervals(base, known, K))
+            tried.append(finer)
+            progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
+            if finer.validation_rms > coarser:
+                break  # finer knots still would fit noise
+            coarser, base = finer.validation_rms, finer.cascade
+    history = [Step(str(choice), choice.validation_rms) for choice in tried]
+    best = min(tried, key=lambda choice: choice.validation_rms)
+    polished = search.choice(best.cascade, FINAL_STEPS, FINAL_TOLERANCE)
+    history.append(Step(f"{polished}, minimised further", polished.validation_rms))
+    chosen = min(best, polished, key=lambda choice: choice.validation_rms).cascade
+    if task.validation is None:
+        progress("fitted to all trials", 1.0 - 1.0 / total)
+        every = replace(search, known=_trials(train, scaled, made, task))
+        again = every.choice(
+            _with_intervals(chosen, every.known, chosen.f.intervals), FINAL_STEPS, FINAL_TOLERANCE
+        )
+        chosen = again.cascade
+        history.append(Step("fitted to all trials, training error", again.train_rms))
+    progress("minimised further", 1.0)
+    return _model(chosen, scaled, train), tuple(history)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """radius: of the poles; known, others: trials that are fitted and that judge; unit: of y."""
+
+    radius: float
+    known: tuple[Trial, ...]
+    others: tuple[Trial, ...]
+    unit: float
+
+    def minimised(
+        self,
+        start: Cascade,
+        trials: tuple[Trial, ...],
+        steps: int = STEPS,
+        tolerance: float = TOLERANCE,
+    ) -> tuple[Cascade, Minimum]:
+        """A local minimum on these trials."""
+        problem = start.problem(trials, self.radius)
+        found = minimise(problem, start.theta, steps=steps, tolerance=tolerance)
+        return replace(start, theta=found.parameters), found
+
+    def choice(self, start: Cascade, steps: int = STEPS, tolerance: float = TOLERANCE) -> Choice:
+        """A local minimum, with its errors."""
+        cascade, found = self.minimised(start, self.known, steps, tolerance)
+        judged = cascade.problem(self.others, self.radius).mean_square(cascade.theta)
+        return Choice(cascade, self.unit * found.rms, self.unit * judged**0.5)
+
+
+def _scales(train: Dataset) -> Scaled:
+    """The spreads of input and output; a cascade has no offsets to undo."""
+    first = train.trajectories[0]
+    if first.u.shape[1] != 1 or first.y.shape[1] != 1:
+        raise ShapeError(
+            f"a block cascade has one input and one output; the data have {first.u.shape[1]} and "
+            f"{first.y.shape[1]}"
+        )
+    spreads = signal_scale(train, "y")[1], signal_scale(train, "u")[1]
+    return Scaled((0.0, float(spreads[0][0])), (np.zeros(1), spreads[1]), ())
+
+
+def _trials(data: Dataset, scales: Scaled, made: FilterMapFilter, task: Task) -> tuple[Trial, ...]:
+    """In these scales, from rest or in motion."""
+    held, (_, n2) = made.begin == "measured", made.orders
+    skipped = max(task.transient, n2) if held else task.transient
+    found = Scaled.of(data, skipped, skipped, scales).trials
+    trials = tuple(replace(t, start=t.y[: n2 if held else 0], held=held) for t in found)
+    needed = 2 * (sum(made.orders) + 2) + START_INTERVALS + 3
+    if sum(len(trial.y) - trial.skipped for trial in trials) < needed:
+        raise DataError(
+            f"fewer than {needed} scored samples for orders {made.orders}; give more data"
+        )
+    return trials
+
+
+def _best_start(search: _Search, made: FilterMapFilter, rng: np.random.Generator) -> Cascade:
+    """The best of the minima from random all-pole filters with f by linear least squares."""
+    part = tuple(replace(t, u=t.u[:START_SAMPLES], y=t.y[:START_SAMPLES]) for t in search.known)
+    screened = [
+        search.minimised(_random_start(part, made, rng, search.radius), part, SCREENING_STEPS)
+        for _ in range(made.starts)
+    ]
+    screened.sort(key=lambda found: found[1].rms)
+    finished = [search.minimised(start, part, START_STEPS) for start, _ in screened[:KEPT_STARTS]]
+    return min(finished, key=lambda found: found[1].rms)[0]
+
+
+def _random_start(
+    trials: tuple[Trial, ...], made: FilterMapFilter, rng: np.random.Generator, radius: float
+) -> Cascade:
+    """All-pole filters, the first scaled to a unit output, f by regularised least squares."""
+    a1, a2 = (_random_denominator(order, rng, radius) for order in made.orders)
+    b1, b2 = np.eye(1, len(a1) + 1), np.eye(1, len(a2) + 1)
+    parts = (a1, b1.ravel(), a2, b2.ravel(), np.zeros(START_INTERVALS + 3))
+    f = Smooth(0.0, 1.0, START_INTERVALS)
+    flat = Cascade(made.orders, 1, made.begin == "measured", f, np.concatenate(parts))
+    x = flat.inner(trials)
+    gain = 1.0 / float(np.std(x))
+    flat = replace(flat.moved({"b1": gain * b1}), f=_knots(gain * x, START_INTERVALS))
+    problem = replace(flat.problem(trials, np.inf), bend=None)
+    return replace(flat, theta=best_for(problem, flat.theta, flat.places[4], RIDGE))
+
+
+def _random_denominator(order: int, rng: np.random.Generator, radius: float) -> FloatArray:
+    """Coefficients a of zⁿ - a[0] zⁿ⁻¹ - … with random poles: pairs, and a real one if n is odd."""
+    roots: list[complex] = []
+    radii = np.minimum(POLE_RADII, 0.9 * radius)
+    while len(roots) + 2 <= order:
+        pole = rng.uniform(*radii) * np.exp(1j * rng.uniform(*POLE_ANGLES))
+        roots += [pole, pole.conjugate()]
+    if len(roots) < order:
+        roots.append(rng.uniform(*radii))
+    return np.asarray(-np.real(np.poly(roots))[1:]) if roots else np.zeros(0)
+
+
+def _with_intervals(cascade: Cascade, trials: tuple[Trial, ...], intervals: int) -> Cascade:
+    """The same cascade with f on `intervals` knot intervals over the range that x takes."""
+    f, c = _knots(cascade.inner(trials), intervals), cascade.numbers[4]
+    x = np.linspace(f.low, f.low + f.spacing * intervals, FINE * intervals)
+    basis = f.moves(np.zeros(intervals + 3), x).T
+    fitted = np.linalg.lstsq(basis, cascade.f.values(c, x), rcond=None)[0]
+    return replace(cascade.moved({"c": fitted}), f=f)
+
+
+def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
+    """A cascade of one phase with `phases` of them: phase j sees x(t - j/phases).
+
+    b1[j] is fitted to x delayed by FFT, then every b2 to the outputs; both are linear.
+    """
+    _, b1_at, _, b2_at, _ = cascade.places
+    columns, targets = [], []
+    for trial in search.known:
+        sources, derivatives = cascade.signals.sensitivities(cascade.theta, trial)
+        x, moved = sources[2], derivatives[2]
+        inside = slice(trial.skipped, len(x) - trial.skipped)  # an FFT is periodic
+        columns.append(moved[b1_at[0]].T[inside])
+        targets.append(np.stack([_late(x, j / phases)[inside] for j in range(1, phases)], axis=1))
+    shifted = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
+    b1 = np.concatenate([cascade.theta[b1_at], shifted.T])
+    wide = cascade.moved({"b1": b1, "b2": np.zeros((phases, b2_at.shape[1]))})
+    problem = replace(wide.problem(search.known, np.inf), bend=None)
+    return replace(wide, theta=best_for(problem, wide.theta, wide.places[3].ravel()))
+
+
+def _knots(x: FloatArray, intervals: int) -> Smooth:
+    """A map on knots that cover x with a margin."""
+    width = float(np.ptp(x))
+    low = float(np.min(x)) - MARGIN * width
+    return Smooth(low, (1.0 + 2.0 * MARGIN) * width / intervals, intervals)
+
+
+def _late(x: FloatArray, delay: float) -> FloatArray:
+    """x(t - delay) of a band-limited signal, delay in samples."""
+    turn = np.exp(-2j * np.pi * np.fft.rfftfreq(len(x)) * delay)
+    return np.asarray(np.fft.irfft(np.fft.rfft(x) * turn, len(x)))
+
+
+def _model(cascade: Cascade, scaled: Scaled, train: Dataset) -> BlockCascade:
+    """Scaling undone: the only place where it is."""
+    first, (a1, b1, a2, b2, c) = train.trajectories[0], cascade.numbers
+    return BlockCascade(
+        a1=a1,
+        b1=b1 / scaled.u[1],
+        f=Spline(cascade.f.low, cascade.f.spacing, c),
+        a2=a2,
+        b2=b2 * scaled.y[1],
+        period=train.period,
+        y=signals_of(first, "y")[0],
+        u=signals_of(first, "u")[0],
+        bags=train.bags,
+    )

@@ -1,0 +1,278 @@
+"""Signals one after the other: what filters and static maps make of inputs, and its derivatives.
+
+    s(t) = Σ_k w_k r(t - k),   r: an input, 1, a signal before it or itself, or a map f of those
+
+So they are simulated one after the other: each by a filter, or by a loop over its samples where its
+own past passes a map. With all signals known their derivatives in all parameters pass the same
+filters, whose coefficients then vary with the slopes of a signal's own maps: a banded system each.
+Source: the sensitivities are those of linear filters, each a filter itself.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.signal import lfilter
+
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.identification.network.maps import Bent, Map, as_piecewise_linear
+
+DIVERGED = 1e3  # spreads of a signal, at which a loop's simulation is held
+
+
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """Σ_k w_k r(t - first - k): w are the parameters `at` times `factor`; without any, `factor`.
+
+    source: the number of r among the inputs, 1, and the nodes.
+    """
+
+    source: int
+    at: IntArray
+    first: int = 0
+    factor: float = 1.0
+
+    def weights(self, theta: FloatArray) -> list[tuple[int, float]]:
+        """(delay, weight) of each."""
+        values = theta[self.at] if len(self.at) else np.ones(1)
+        return list(enumerate((self.factor * values).tolist(), self.first))
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """The sum of taps; its first `given` samples are given."""
+
+    taps: tuple[Taps, ...]
+    given: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """A map of the signal with number `source`, with the parameters `at`."""
+
+    source: int
+    function: Map
+    at: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """u (N, q) and y (N,), scaled. start: the given first samples of all signals, in their order.
+
+    The first `skipped` samples are not scored. held: before the trial every input was what it is at
+    the first sample, for ever; else all was zero.
+    """
+
+    u: FloatArray
+    y: FloatArray
+    start: FloatArray
+    skipped: int
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Signals and maps of them, each after those it depends on; a signal's own maps follow it.
+
+    Numbered from 0: the inputs, 1, the nodes. free: the given samples are parameters, of each trial
+    its own. output: the number of y.
+    """
+
+    inputs: int
+    nodes: tuple[Signal | Mapped, ...]
+    output: int
+    free: bool = False
+
+    @cached_property
+    def given(self) -> int:
+        """How many samples are given, of all signals."""
+        return sum(node.given for node in self.nodes if isinstance(node, Signal))
+
+    @cached_property
+    def chained(self) -> set[int]:
+        """The numbers whose derivatives another one needs, and that of y."""
+        later = {
+            part.source
+            for number, node in enumerate(self.nodes, self.inputs + 1)
+            if isinstance(node, Signal)
+            for part in node.taps
+            if part.source < number
+        }
+        return later | {self.output}
+
+    def own_maps(self, number: int) -> list[tuple[Taps, Mapped]]:
+        """The taps of a signal that are of maps of it."""
+        node, first = self.nodes[number - self.inputs - 1], self.inputs + 1
+        assert isinstance(node, Signal)
+        return [(p, self.nodes[p.source - first]) for p in node.taps if p.source > number]  # type: ignore[misc]
+
+    def own_filter(self, number: int, theta: FloatArray) -> FloatArray:
+        """A = [1, -a₁, …] of a signal's own past, its maps left out."""
+        a: FloatArray = np.ones(1)
+        for part in self.nodes[number - self.inputs - 1].taps:  # type: ignore[union-attr]
+            if part.source == number:
+                a = np.concatenate([a, -theta[part.at]])
+        return a
+
+    def radius(self, theta: FloatArray) -> float:
+        """Of the slowest pole of the signals whose past passes no map."""
+        slowest = 0.0
+        for number, node in enumerate(self.nodes, self.inputs + 1):
+            if isinstance(node, Signal) and not self.own_maps(number):
+                roots = np.roots(self.own_filter(number, theta))
+                slowest = max(slowest, float(np.abs(roots).max(initial=0.0)))
+        return slowest
+
+    def run(self, theta: FloatArray, trial: Trial) -> list[FloatArray]:
+        """Inputs, 1 and nodes, (N,) each, along a trial."""
+        sources, first = [*trial.u.T, np.ones(len(trial.u))], 0
+        for number, node in enumerate(self.nodes, self.inputs + 1):
+            if isinstance(node, Mapped):
+                sources.append(node.function.values(theta[node.at], sources[node.source]))
+                continue
+            start = trial.start[first : first + node.given]
+            first += node.given
+            forcing = np.zeros(len(trial.u))
+            for part in node.taps:
+                if part.source < number:
+                    forcing += passed(part.weights(theta), sources[part.source], trial)
+            A = self.own_filter(number, theta)
+            if own := self.own_maps(number):
+                sources.append(_looped(A, own, theta, forcing, start))
+            else:
+                sources.append(_filtered(A, forcing, start, trial))
+        return sources
+
+    def sensitivities(
+        self, theta: FloatArray, trial: Trial
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """`run`, and the derivatives (G + P, N) of each in [start; θ]; G: of free starts."""
+        sources, first, N = self.run(theta, trial), 0, len(trial.u)
+        G = self.given if self.free else 0
+        moved = [np.zeros((G + len(theta), N))] * (self.inputs + 1)
+        live: list[list[int]] = [[]] * (self.inputs + 1)  # the rows that are not zero
+        for number, node in enumerate(self.nodes, self.inputs + 1):
+            direct = np.zeros((G + len(theta), N))
+            if isinstance(node, Mapped):
+                p, x, rows = theta[node.at], sources[node.source], live[node.source]
+                if number in self.chained:
+                    direct[rows] = node.function.slopes(p, x) * moved[node.source][rows]
+                    direct[G + node.at] += node.function.moves(p, x)
+                moved.append(direct)
+                live.append(sorted({*rows, *(G + node.at).tolist()}))
+                continue
+            for part in node.taps:
+                source = sources[part.source]
+                for k, at in enumerate(part.at, part.first):
+                    direct[G + at] += part.factor * delayed(source, k, trial)
+                if self.inputs < part.source < number:
+                    rows = live[part.source]
+                    direct[rows] += passed(part.weights(theta), moved[part.source][rows], trial)
+            own, A = self.own_maps(number), self.own_filter(number, theta)
+            for part, one in own:
+                moves = one.function.moves(theta[one.at], sources[number])
+                direct[G + one.at] += passed(part.weights(theta), moves, trial)
+            direct[:, : node.given] = 0.0
+            if self.free:
+                direct[first + np.arange(node.given), np.arange(node.given)] = 1.0
+            first += node.given
+            rows = np.flatnonzero(direct.any(axis=1)).tolist()
+            if own:
+                bands = _bands(A, own, theta, sources[number], node.given)
+                depth = (len(bands) - 1, 0)
+                direct[rows] = solve_banded(depth, bands, direct[rows].T, check_finite=False).T
+            else:
+                direct[rows] = _filtered(A, direct[rows], np.zeros(node.given), trial)
+            moved.append(direct)
+            live.append(rows)
+        return sources, moved
+
+
+def delayed(signal: FloatArray, samples: int, trial: Trial) -> FloatArray:
+    """(…, N): signal(t - samples), before its first sample zero or held."""
+    moved = np.zeros_like(signal)
+    moved[..., :samples] = signal[..., :1] if trial.held else 0.0
+    moved[..., samples:] = signal[..., : signal.shape[-1] - samples]
+    return moved
+
+
+def passed(weights: list[tuple[int, float]], signal: FloatArray, trial: Trial) -> FloatArray:
+    """(…, N): Σ weight·signal(t - delay)."""
+    total, N = np.zeros_like(signal), signal.shape[-1]
+    for k, weight in weights:
+        total[..., k:] += weight * signal[..., : N - k]
+        if trial.held:
+            total[..., :k] += weight * signal[..., :1]
+    return total
+
+
+def _filtered(A: FloatArray, forcing: FloatArray, start: FloatArray, trial: Trial) -> FloatArray:
+    """(…, N): forcing through 1/A, from the given first samples, from rest or from a held past."""
+    if len(start):
+        forcing = forcing.copy()
+        forcing[..., : len(start)] = lfilter(A, [1.0], start)  # what makes them the first samples
+        return np.asarray(lfilter([1.0], A, forcing))
+    before = forcing[..., :1] if trial.held else np.zeros(1)
+    return np.asarray(lfilter([1.0], A, forcing - before) + before / np.sum(A))
+
+
+def _looped(
+    A: FloatArray,
+    own: list[tuple[Taps, Mapped]],
+    theta: FloatArray,
+    forcing: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """(N,): sample by sample, held at DIVERGED where it grows beyond all measure."""
+    a, y = list(enumerate((-A[1:]).tolist(), 1)), start.tolist()
+    mapped = []
+    for part, one in own:
+        f = _compiled(one.function, theta[one.at])
+        mapped.append((f, part.weights(theta), [f(value) for value in y]))
+    for t, value in enumerate(forcing[len(y) :].tolist(), len(y)):
+        for k, weight in a:
+            value += weight * y[t - k]
+        for _, weights, w in mapped:
+            for k, weight in weights:
+                value += weight * w[t - k]
+        value = min(max(value, -DIVERGED), DIVERGED)
+        y.append(value)
+        for f, _, w in mapped:
+            w.append(f(value))
+    return np.array(y)
+
+
+def _compiled(function: Bent, p: FloatArray) -> Callable[[float], float]:
+    """A piecewise-linear map of one number."""
+    f = as_piecewise_linear(function, p)
+    inner, knots, values, slopes = (
+        part.tolist() for part in (f.knots[1:-1], f.knots, f.values, f.slopes)
+    )
+
+    def at(x: float) -> float:
+        i = bisect_right(inner, x)
+        return values[i] + slopes[i] * (x - knots[i])  # type: ignore[no-any-return]
+
+    return at
+
+
+def _bands(
+    A: FloatArray,
+    own: list[tuple[Taps, Mapped]],
+    theta: FloatArray,
+    signal: FloatArray,
+    given: int,
+) -> FloatArray:
+    """The system of the derivatives of a signal whose own past passes maps, by diagonals."""
+    N, terms = len(signal), [(k, np.full(len(signal), a)) for k, a in enumerate(A[1:], 1)]
+    for part, one in own:
+        slopes = one.function.slopes(theta[one.at], signal)
+        terms += [(k, -weight * slopes) for k, weight in part.weights(theta)]
+    bands = np.zeros((1 + max(k for k, _ in terms), N))
+    bands[0] = 1.0
+    for k, values in terms:
+        bands[k, given - k : N - k] += values[given - k : N - k]
+    return bands
