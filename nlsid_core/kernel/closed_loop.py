@@ -173,8 +173,7 @@ def read_hold(claim: Node, stated: dict[str, Any], field: Field, funnel: Funnel)
         error = Node(claim.value["error"], "error").array(field.n)
         claim.require({"error should be 0 or more": min(error) >= 0}, "not_below")
     if held or "error" in claim.value:
-        wanted = "f should be affine in each input, else corners do not bound its hold"
-        claim.require({wanted: field.affine}, "not_valid")
+        claim.require({"f is not affine in each input that is off": field.affine}, "not_valid")
 
     shaken = [
         [max(dot(list(map(abs, gain[i])), error) for gain in points) for i in range(field.m)]

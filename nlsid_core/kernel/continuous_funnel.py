@@ -160,8 +160,8 @@ def _decide_pieces(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, A
         kappa = stated["kappa"].array(count, len(field.box))
         above = all(entry > 0 for row in kappa for entry in row)
         stated["kappa"].require({"should be positive": above}, "not_below")
-        pushing = field.pushing.issuperset(columns)
-        stated["kappa"].require({"w does more than add constants": pushing}, "not_valid")
+        pushing = {"w does more than add constants": field.pushing.issuperset(columns)}
+        stated["kappa"].require(pushing, "not_valid")
         values = [tuple((low + high) / 2 for low, high in field.box)]
     refuse_many(count, 2 ** (0 if kappa else len(field.box)), len(hold.corners), 3**limited)
     vertices = list(product(hold.corners, values))

@@ -75,8 +75,8 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
     n, count = len(x[0][0]), len(x)
     if policy["t"] != t or _curve(policy["x"], count, n) != x:
         raise Mismatch("the funnel is around another nominal than the policy's")
-    node.require({"one rho a knot": len(rho) == len(t)})
-    node.require({"x should not jump": all(a[-1] == b[0] for a, b in pairwise(x))})
+    smooth = all(a[-1] == b[0] for a, b in pairwise(x))
+    node.require({"one rho a knot": len(rho) == len(t), "x should not jump": smooth})
     node.require({"rho should be positive": min(rho) > 0}, "not_below")
     P = given["P"].array(len(t), n, n)
     for k, shape in enumerate(P):
