@@ -16,10 +16,10 @@ from math import prod
 from typing import Any
 
 from .exact import Matrix, dot
-from .files import Node, Terms
+from .files import Node, Terms, limit
 from .polynomials import Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .trajectory import Field, Funnel, Mode, Part, Piece, in_order, pushed, refuse_many
+from .trajectory import MAX_PIECES, Field, Funnel, Mode, Part, Piece, in_order, pushed
 
 Corner = tuple[int, ...]  # -1 or 1 for each input that is off; 0 where it is not
 
@@ -204,7 +204,8 @@ def decide_rates(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any
         ((low + high) / 2,) if m + j in free else (low, high)
         for j, (low, high) in enumerate(field.box)
     ]
-    refuse_many(count, 2 ** (m + len(field.box) - len(free)), 3 ** len(limited), 2 * m)
+    cases_of = 2 ** (m + len(field.box) - len(free)) * len(funnel.modes) * 2 * m
+    limit(count * cases_of, MAX_PIECES, "intervals, vertices and modes")
     vertices = list(product(product(*sides), product(*values)))
     cases = [
         (i, sign, *mode)

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
-from math import prod
 from typing import Any
 
 from .exact import Matrix, definite
-from .files import Mismatch, Node, Reader, Table, Terms, itself, limit, whole
+from .files import Mismatch, Node, Reader, Table, Terms, itself, whole
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -174,11 +173,6 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
         wanted = f"a piece of interval {k}, vertex {v}, mode {mode} is missing"
         node.require({wanted: until >= 1}, "not_covered")
     return pieces
-
-
-def refuse_many(*counts: int) -> None:
-    """Raise Rejected if there are more intervals, vertices and modes than pieces."""
-    limit(prod(counts), MAX_PIECES, "intervals, vertices and modes")
 
 
 def _times(least: int, most: int) -> Reader:
