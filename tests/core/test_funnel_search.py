@@ -78,7 +78,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     }
     goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
     claim = {"kind": "continuous_funnel", "goal": goal}
-    forged = Design(*parts, {"claim": claim, "proof": proof})
+    forged: Design[Any, Any, Any, Any] = Design(*parts, {"claim": claim, "proof": proof})
     with pytest.raises(CertificateRejected, match="pieces should be a list of 1 to"):
         check(forged.save(tmp_path)[-1])
 
