@@ -73,7 +73,9 @@ def _rows(signals: Signals, theta: FloatArray) -> tuple[FloatArray, FloatArray, 
     m, size = len(signals.nodes) - len(depths), sum(depths)
     unit = np.eye(m + size + signals.inputs + 1)
     sources: list[FloatArray] = list(unit[m + size :])
-    into, after, first = [], [], m
+    into: list[FloatArray] = []
+    after: list[FloatArray] = []
+    first = m
     for node in signals.nodes:
         if isinstance(node, Mapped):
             sources.append(unit[len(into)])
