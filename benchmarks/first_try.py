@@ -51,7 +51,7 @@ def car() -> Written:
     def rate(x: Any, u: Any) -> Any:  # along, across in m, heading in rad, curvature in 1/m
         return [8 * np.cos(x[2]), 8 * np.sin(x[2]), 8 * x[3], u[0]]
 
-    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[31.5, 3, 0, 0], seconds=4, m=1)
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[31.5, 3, 0, 0], seconds=4, u=[0])
     goal = [1.0, 0.5, 0.1, 0.05]
     return rate, ContinuousTracking(rate, motion, goal=goal, limits=[[-0.3, 0.3]])
 
@@ -62,7 +62,7 @@ def bicycle() -> Written:
     def rate(x: Any, u: Any) -> Any:  # across in m, heading and steering in rad
         return [10 * np.sin(x[1]), 10 / 2.7 * np.tan(x[2]), (u[0] - x[2]) / 0.2]
 
-    motion = plan_motion(rate, start=[0, 0, 0], end=[3, 0, 0], seconds=3, m=1)
+    motion = plan_motion(rate, start=[0, 0, 0], end=[3, 0, 0], seconds=3, u=[0])
     return rate, ContinuousTracking(rate, motion, goal=[0.3, 0.06, 0.06])
 
 
@@ -91,7 +91,7 @@ def acrobot() -> Written:
         a = solve(M, b)
         return [x[2], x[3], a[0], a[1]]
 
-    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[np.pi, 0, 0, 0], seconds=4, m=1)
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[np.pi, 0, 0, 0], seconds=4, u=[0])
     return rate, ContinuousTracking(rate, motion, goal=[0.1, 0.1, 0.3, 0.3])
 
 
@@ -112,7 +112,7 @@ def dubins(wind: float) -> Written:
         return rate(x, u, np.zeros(3))
 
     start, end = [0, 0, 0, 0, 0], [35, 15, 3, np.pi / 4, 0]
-    motion = plan_motion(still, start=start, end=end, seconds=4, m=2)
+    motion = plan_motion(still, start=start, end=end, seconds=4, u=[0, 0])
     box = wind * np.array([[-1, 1], [-1, 1], [-1, 1]])
     return rate, ContinuousTracking(rate, motion, goal=[4, 3, 3, 0.3, 0.3], uncertain=box)
 
@@ -128,7 +128,7 @@ def satellite() -> Written:
         return [*turned, gyro[0] + u[0], (gyro[1] + u[1]) / 2, (gyro[2] + u[2]) / 4]
 
     start, end = [0.3, -0.2, 0.2, 0, 0, 0], np.zeros(6)
-    motion = plan_motion(rate, start=start, end=end, seconds=5, m=3)
+    motion = plan_motion(rate, start=start, end=end, seconds=5, u=[0, 0, 0])
     return rate, ContinuousTracking(rate, motion, goal=[0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
 
 
@@ -155,7 +155,7 @@ def flexible_arm() -> Written:
         return [*x[4:], *a, *((u - spring) / 0.3)]
 
     start, end = np.zeros(8), [1, 0.8, 1, 0.8, 0, 0, 0, 0]
-    motion = plan_motion(rate, start=start, end=end, seconds=2, m=2)
+    motion = plan_motion(rate, start=start, end=end, seconds=2, u=[0, 0])
     goal = [0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 0.5, 0.5]
     return rate, ContinuousTracking(rate, motion, goal=goal)
 

@@ -2,8 +2,7 @@
 
     python -m benchmarks.funnel_scaling [--json] [--most N]
 
-The thesis stopped at 6 states. Every state enters nonlinearly, but with one other at most: from 12
-states on the programs have a small Gram matrix for every pendulum.
+The thesis stopped at 6 states. Every state enters nonlinearly.
 """
 
 import time
@@ -14,7 +13,6 @@ import numpy as np
 
 from benchmarks.machine import parser, tell
 from nlsid_core.design import ContinuousTracking, design_funnel, integrate_nominal
-from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.lstep import LSteps, section_at
 from nlsid_core.design.continuous.tvlqr import tvlqr
 from nlsid_core.dynamics import VectorField
@@ -50,7 +48,6 @@ def row(n: int) -> dict[str, Any]:
     nominal = integrate_nominal(field, lambda _: np.zeros(half), t=t, start=np.zeros(n))
     goal = GOAL * np.eye(n)
     steps = LSteps(field)
-    steps = CliqueSteps.of(steps) or steps
     tracking = tvlqr(field, nominal, Q=np.eye(n), R=np.eye(half), S_final=1.01 * goal)
     section = section_at(steps, tracking.policy, tracking.S, KNOTS - 2, 1.0)
     first = steps.solve(section, 1.0)

@@ -40,6 +40,7 @@ from bags.designs.bundle import Bundle
 from bags.designs.documents import FUNNEL
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
+from bags.signals.sampling import Grid
 from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python, resident_mb
 from nlsid_core.arrays import FloatArray
@@ -72,7 +73,7 @@ ASKED = {
 def updates() -> dict[str, float]:
     """Microseconds per update on F1TENTH trials, n = 6, for one funnel and for ten."""
     speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
-    data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
+    data = read_dataset(f1tenth(), responses=[speed], excitations=[command], grid=Grid(max_gap=0.1))
     model = identify(data, Polynomial(LAGS)).model
     designs = [
         design_output_tube(

@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from bags.samples import convert_dart
 from benchmarks import recorded
 from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.machine import parser, tell
@@ -176,22 +175,14 @@ def f1tenth(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
 def dart(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
     """Steering times speed, and speed, to the yaw rate at 20 Hz on the rubbery floor."""
     trials = []
-    for drive in convert_dart.drives(folder):
-        if not drive.name.startswith("rubbery"):
-            continue
-        at = drive.columns["t"] - drive.columns["t"][0]
+    for name, drive in recorded.dart(folder).items():
+        at = drive["vicon_time"] - drive["vicon_time"][0]
         t = np.arange(0.2, at[-1] - 0.2, 0.05)
-
-        def of(title: str, when: FloatArray, drive: Any = drive, at: FloatArray = at) -> FloatArray:
-            column = drive.columns[title]
-            values = np.unwrap(column) if title == "vicon yaw" else column
-            return np.asarray(np.interp(when, at, values))
-
-        yaw_rate = (of("vicon yaw", t + 0.1) - of("vicon yaw", t - 0.1)) / 0.2
-        moved = [of(f"vicon {axis}", t + 0.1) - of(f"vicon {axis}", t - 0.1) for axis in "xy"]
-        speed = np.hypot(*moved) / 0.2
-        u = np.column_stack([of("steering", t - 0.1) * speed, speed])
-        trials.append(Trajectory(t=t, y=yaw_rate, u=u, name=drive.name))
+        pose = [drive["vicon_x"], drive["vicon_y"], np.unwrap(drive["vicon_yaw"])]
+        moved = [np.interp(t + 0.1, at, c) - np.interp(t - 0.1, at, c) for c in pose]
+        speed = np.hypot(moved[0], moved[1]) / 0.2
+        u = np.column_stack([np.interp(t - 0.1, at, drive["steering"]) * speed, speed])
+        trials.append(Trajectory(t=t, y=moved[2] / 0.2, u=u, name=name))
     parts = [Dataset(tuple(trials[k::3])) for k in range(3)]
     return parts[0], parts[1], parts[2]
 

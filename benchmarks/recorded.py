@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from nlsid_core import files
@@ -13,6 +14,14 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.proofs import check
+
+RUBBERY = (
+    "81_throttle_ramps",
+    "80_circles_rubbery_floor",
+    "91_free_driving_16_sept_2024",
+    "free_driving_steer_rate_testing_16_sept_2024",
+    "circles_27_sept_2024_fast_ramp",
+)  # folders of the DART car's drives
 
 
 def heat_exchanger(folder: Path) -> tuple[FloatArray, FloatArray]:
@@ -36,6 +45,16 @@ def f1tenth_car(folder: Path) -> Mapping[int, tuple[FloatArray, FloatArray]]:
         u = np.loadtxt(path / "input.csv", delimiter=",")
         motion = np.loadtxt(path / "trajectory.csv", delimiter=",")
         found[number] = u, motion[: len(u)]
+    return found
+
+
+def dart(folder: Path) -> Mapping[str, NDArray[Any]]:
+    """By file, the drives on the rubbery floor: tables with titles (Lyons et al. 2024)."""
+    found = {}
+    for name in RUBBERY:
+        for file in sorted((folder / name).glob("*.csv")):
+            table = np.genfromtxt(file, delimiter=",", names=True, encoding="utf-8-sig")
+            found[file.stem] = table[np.diff(table["vicon_time"], prepend=0.0) > 0.0]
     return found
 
 

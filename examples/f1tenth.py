@@ -1,7 +1,7 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
 from bags.samples import f1tenth
-from nlsid import Monitor, OutputTube, Polynomial, Status, design, identify, read_bags
+from nlsid import Grid, Monitor, OutputTube, Polynomial, Status, design, identify, read_bags
 from nlsid_core.identification import simulation_percent
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
@@ -10,7 +10,7 @@ SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
 
 def run() -> tuple[dict[str, float], dict[str, float]]:
     """(computed, known): the test error in % and how many test trials stay inside."""
-    dataset = read_bags(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
+    dataset = read_bags(f1tenth(), responses=[SPEED], excitations=[COMMAND], grid=Grid(max_gap=0.1))
     train, test = dataset.without(TEST), dataset.select(TEST)
 
     fit = identify(train, Polynomial(4))

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bags.designs.displacement import displacement_half_width
-from bags.signals.expressions import washout
+from bags.signals.expressions import Expression
 from nlsid import Dataset, OutputTube, Polynomial, Trajectory, design, identify
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import OutputTubeDesign
@@ -41,7 +41,8 @@ class Drive:
 
     def washed_out(self) -> Trajectory:
         """`|washout(2 s)` of its position."""
-        return self.trial(washout(self.position, np.rint(1e9 * self.t).astype(np.int64), SPAN))
+        moved = Expression.parse(f"/car:position|washout({SPAN:g} s)")
+        return self.trial(moved.apply(self.position, np.rint(1e9 * self.t).astype(np.int64), "m"))
 
     def velocity(self) -> Trajectory:
         """The differences of its position, the sum of which is the position again."""

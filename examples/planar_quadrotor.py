@@ -40,10 +40,9 @@ def truth(x: FloatArray, u: FloatArray) -> FloatArray:
 
 def problem() -> tuple[VectorField, Nominal]:
     """The cubic models of the intervals, with what they leave out, and the motion."""
-    planned = plan_motion(
-        rate, start=START, end=END, seconds=SECONDS, u=[GRAVITY, 0.0], scale=[1.0, 1.0], knots=KNOTS
-    )
-    t, x, u = planned.t, planned.x.ends(), planned.u.ends()
+    planned = plan_motion(rate, start=START, end=END, seconds=SECONDS, u=[GRAVITY, 0.0])
+    t = np.linspace(0.0, SECONDS, KNOTS)
+    x, u = planned.x(t), planned.u(t)
     field = taylor_field(rate, t, x, u, radius=RADIUS)
     return field, nominal_through(t, x, u, field)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
+    from bags.signals.sampling import Grid
     from nlsid_core.data.trajectory import Dataset, Trajectory
     from nlsid_core.design import (
         ContinuousTracking,
@@ -57,6 +58,7 @@ __all__ = [
     "FilterMapFilter",
     "Fit",
     "Goal",
+    "Grid",
     "LeastSquares",
     "Monitor",
     "Network",
@@ -100,6 +102,7 @@ _MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
 _HOMES: Final = {
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
+    "bags.signals.sampling": ("Grid",),
     "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
     "nlsid_core.models": ("Signal",),
     "nlsid_core.identification": ("identify", "Fit", *_FAMILIES, *_METHODS),

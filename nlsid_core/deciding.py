@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -32,12 +32,21 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.files import digest, read_regular
 
-SECONDS: Final = 20  # of processor time; a large proof takes 3
-MEMORY: Final = 4096  # MB of address space
-PATIENCE: Final = 30  # times SECONDS on the wall, on a machine that has other work
+PATIENCE: Final = 30  # times the seconds on the wall, on a machine that has other work
 KERNEL: Final = Path(kernel.__file__).parent
 LARGEST: Final = 2**20  # bytes of an entry
 LOOK: Final = 0.01  # s between two looks at the process
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a proof may take: s of processor time (a large one takes 3), MB of address space."""
+
+    seconds: int = 20
+    memory: int = 4096
+
+
+USUAL: Final = Limits()
 
 
 class Deciding:
@@ -46,36 +55,27 @@ class Deciding:
     before: whether this machine had decided it, so that nothing is done.
     """
 
-    def __init__(
-        self, proof: Path, *, seconds: int = SECONDS, memory: int = MEMORY, remembered: bool = True
-    ) -> None:
+    def __init__(self, proof: Path, limits: Limits = USUAL, *, remembered: bool = True) -> None:
         """Begin. OSError if the proof cannot be read, CertificateRejected if it is too large."""
-        self._seconds, self._begun = seconds, time.monotonic()
+        self._seconds, self._begun = limits.seconds, time.monotonic()
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         with _own_errors():
             self._proof = read_regular(proof)
         self._found = _recalled(self._proof, proof.parent) if remembered else None
         self.before = self._found is not None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - until close
-        limits = f"--seconds={seconds}", f"--memory={memory}"
+        options = "--json", f"--seconds={limits.seconds}", f"--memory={limits.memory}"
         self._process: subprocess.Popen[bytes] | None = None
         if not self.before:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", str(KERNEL), "--json", *limits, str(proof.resolve())],
+                [sys.executable, "-I", str(KERNEL), *options, str(proof.resolve())],
                 stdin=subprocess.DEVNULL,
                 stdout=self._answer,
                 stderr=subprocess.DEVNULL,
             )
 
     @classmethod
-    def of(
-        cls,
-        proof: bytes,
-        files: Mapping[str, bytes],
-        *,
-        seconds: int = SECONDS,
-        memory: int = MEMORY,
-    ) -> "Deciding":
+    def of(cls, proof: bytes, files: Mapping[str, bytes], limits: Limits = USUAL) -> "Deciding":
         """The same for a proof in memory; `files` by the names that it calls them."""
         folder = tempfile.TemporaryDirectory(prefix="nlsid-proof-")
         path = Path(folder.name) / f"{digest(proof)[7:]}.json"
@@ -84,7 +84,7 @@ class Deciding:
             if name not in ("", ".", "..") and not set(name) & set("/\\:\0"):
                 with contextlib.suppress(OSError):  # too long a name: the kernel misses the file
                     path.with_name(name).write_bytes(content)
-        made = cls(path, seconds=seconds, memory=memory)
+        made = cls(path, limits)
         made._folder = folder
         return made
 
@@ -138,21 +138,26 @@ class Deciding:
         return f"the kernel ended with status {status}"
 
 
+def as_ours(message: str, reason: str) -> CertificateRejected:
+    """The kernel's refusal as this project's error."""
+    made = CertificateMismatch if reason == "mismatch" else CertificateRejected
+    refusal = made(message)
+    refusal.reason = reason
+    return refusal
+
+
 def _verdict(answer: dict[str, Any]) -> Verdict:
     """What the kernel's process has written."""
     if "unread" in answer:
         raise OSError(0, answer["unread"])
     if "rejected" in answer:
-        mismatch = answer["reason"] == "mismatch"
-        refusal = (CertificateMismatch if mismatch else CertificateRejected)(answer["rejected"])
-        refusal.reason = answer["reason"]
-        raise refusal
+        raise as_ours(answer["rejected"], answer["reason"])
     return Verdict(
-        answer["kind"],
         answer["statement"],
         Fraction(answer["margin"]),
         tuple(answer["assumptions"]),
         answer["digests"],
+        answer["kind"],
         answer["files"],
     )
 
@@ -163,7 +168,7 @@ def _own_errors() -> Iterator[None]:
     try:
         yield
     except kernel.Rejected as refusal:
-        raise CertificateRejected(str(refusal)) from refusal
+        raise as_ours(str(refusal), refusal.reason) from refusal
 
 
 @cache

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from nlsid_core import files, kernel
 from nlsid_core.arrays import Json
-from nlsid_core.deciding import Deciding
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.deciding import Deciding, as_ours
 from nlsid_core.kernel import Verdict
 
 __all__ = ["Verdict", "binding", "check", "decide", "proof_document"]
@@ -40,10 +39,8 @@ def decide(document: Json | bytes, about: Mapping[str, Json | bytes]) -> Verdict
 
     try:
         return kernel.decide(content_of(document), read)
-    except kernel.Mismatch as refusal:
-        raise CertificateMismatch(str(refusal)) from refusal
     except kernel.Rejected as refusal:
-        raise CertificateRejected(str(refusal)) from refusal
+        raise as_ours(str(refusal), refusal.reason) from refusal
 
 
 def proof_document(claim: Json, proof: Json) -> Json:

@@ -4,112 +4,103 @@ Messages are published undecoded, so header stamps and every other byte are the 
 for subscribers first, since a volatile topic forgets what nobody heard; ends with the bag.
 """
 
-import sys
 import time
-from collections.abc import Mapping
-from typing import Any
+from contextlib import ExitStack
 
-import rclpy
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
-from rclpy.utilities import ok, try_shutdown
 
 from bags.recordings.bag import Bag
-from bags.signals.grid import seconds
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import PlainNode, declare
+from nlsid_ros.running import ManagedNode, Parameter, arm
+from nlsid_ros.starting import entry_point
 
-NAME = "bag_player"
-SLICE = 0.05  # s: longest sleep, so that an interrupt is noticed
+LOOK = 0.005  # s between looks at who listens
 SETTLE = 1.0  # s: a subscriber learns of its match later than the publisher does
 ACKNOWLEDGE = 5.0  # s: how long the end waits for reliable subscribers to have everything
 
 
-class BagPlayer(PlainNode):
+class BagPlayer(ManagedNode):
     """Plays one bag once."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
-        self._path = str(declare(self, "bag", "", "rosbag2 folder or .mcap file to play"))
-        topics: Any = declare(self, "topics", [""], "topics to play; none named: all")
-        rate: Any = declare(self, "rate", 1.0, "speed, 1: as recorded", between=(0.01, 100.0))
-        wait_for: Any = declare(
-            self, "wait_for", 1, "subscribers each topic must have first", between=(0, 100)
-        )
-        timeout: Any = declare(
-            self, "wait_timeout", 10.0, "s to wait for subscribers", between=(0.0, 3600.0)
-        )
-        self._topics = [topic for topic in topics if topic]
-        self._rate, self._wait_for, self._timeout = rate, wait_for, timeout
-        if not self._path:
+    name = "bag_player"
+    parameters = (
+        Parameter("bag", "", "rosbag2 folder or .mcap file to play"),
+        Parameter("topics", [""], "topics to play; none named: all"),
+        Parameter("wait_for", 1, "subscribers each topic must have first", (0, 100)),
+        Parameter("wait_timeout", 30.0, "s to wait for subscribers", (0.0, 3600.0)),
+    )
+
+    def read_parameters(self) -> None:
+        """DataError if there is no bag."""
+        if not self.values.bag:
             raise DataError("no bag to play; set the parameter bag")
 
-    def play(self) -> None:
-        """Publish the whole bag; returns early if ROS is shut down.
+    def start(self) -> None:
+        """Make the topics, and play once they are listened to.
 
-        Raises BagError if the bag cannot be read, DataError if a type is not installed or if
-        subscribers do not come in time.
+        Raises BagError if the bag cannot be read, DataError if a type is not installed.
         """
-        with Bag(self._path) as bag:
-            names = self._topics or list(bag.topics)
-            publishers = {
+        with ExitStack() as opened:
+            bag = opened.enter_context(Bag(self.values.bag))
+            topics = [topic for topic in self.values.topics if topic] or list(bag.topics)
+            self._players: dict[str, Publisher] = {
                 topic: self.create_publisher(
-                    message_class(bag.types_on(topic)[0]),
-                    topic,
-                    qos.playing_of(bag.offered(topic)),
+                    message_class(bag.types_on(topic)[0]), topic, qos.playing_of(bag.offered(topic))
                 )
-                for topic in names
+                for topic in topics
             }
-            self._await_subscribers(publishers)
-            start = time.monotonic()
-            first_ns: int | None = None
-            for count, message in enumerate(bag.messages(names), start=1):
-                first_ns = message.log_time_ns if first_ns is None else first_ns
-                due = start + seconds(message.log_time_ns, first_ns) / self._rate
-                while (ahead := due - time.monotonic()) > 0 and ok():
-                    time.sleep(min(ahead, SLICE))
-                if not ok():
-                    self.get_logger().info(f"stopped after {count - 1} messages")
-                    return
-                publishers[message.topic].publish(message.data)
-            for publisher in publishers.values():
-                publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE))
-        self.get_logger().info(f"played {self._path}")
+            self._messages = bag.messages(topics)
+            self._message = next(self._messages, None)
+            self._opened = opened.pop_all()
+        self._began = time.monotonic()
+        self._playing = self.later(self._play)
+        self._waiting = self.every(LOOK, self._await_listeners)
 
-    def _await_subscribers(self, publishers: Mapping[str, Publisher]) -> None:
-        deadline = time.monotonic() + self._timeout
-        while ok():
-            counts = {topic: p.get_subscription_count() for topic, p in publishers.items()}
-            if all(count >= self._wait_for for count in counts.values()):
-                if self._wait_for:
-                    time.sleep(SETTLE)
-                return
-            if time.monotonic() > deadline:
-                missing = ", ".join(t for t, n in counts.items() if n < self._wait_for)
-                raise DataError(
-                    f"fewer than {self._wait_for} subscribers on {missing} after "
-                    f"{self._timeout:g} s; start them, or set wait_for"
+    def stop(self) -> None:
+        """Close the bag."""
+        self._opened.close()
+
+    def _await_listeners(self) -> None:
+        """Have it played once every topic is listened to."""
+        wanted, most = self.values.wait_for, self.values.wait_timeout
+        missing = [t for t, p in self._players.items() if p.get_subscription_count() < wanted]
+        if missing and time.monotonic() - self._began > most:
+            self.end(
+                DataError(
+                    f"fewer than {wanted} subscribers on {', '.join(missing)} after {most:g} s; "
+                    "start them, or set wait_for"
                 )
-            time.sleep(SLICE / 10)
+            )
+        if not missing:
+            self._waiting.cancel()
+            settle_ns = round(SETTLE * 1e9) if wanted else 1
+            first_ns = 0 if self._message is None else self._message.log_time_ns
+            self._later_ns = time.monotonic_ns() + settle_ns - first_ns
+            arm(self._playing, settle_ns)
+
+    def _play(self) -> None:
+        """Publish what is due by now, and wait for the next; end with the bag."""
+        now_ns = time.monotonic_ns() - self._later_ns
+        try:
+            while self._message is not None and self._message.log_time_ns <= now_ns:
+                self._players[self._message.topic].publish(self._message.data)
+                self._message = next(self._messages, None)
+        except NlsidError as error:
+            self.end(error)
+            return
+        if self._message is not None:
+            arm(self._playing, self._message.log_time_ns - now_ns)
+            return
+        for publisher in self._players.values():
+            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE))
+        self.get_logger().info(f"played {self.values.bag}")
+        self.end()
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid bag_player`."""
-    try:
-        rclpy.init(args=args)
-        player = BagPlayer()
-        player.play()
-        player.destroy_node()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (NlsidError, OSError) as error:
-        sys.exit(f"{NAME}: {error}")
-    finally:
-        try_shutdown()
-
+main = entry_point(BagPlayer)
 
 if __name__ == "__main__":
     main()

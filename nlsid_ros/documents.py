@@ -5,48 +5,78 @@ Of a continuous funnel parameters say where its signals are.
 
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.node import Node
 from std_msgs.msg import String
 
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
 from bags.designs.design import AnyDesign, Wiring
+from nlsid_core.deciding import USUAL, Limits
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
-from nlsid_ros.running import declare_number, declare_text
+from nlsid_ros.running import ManagedNode, Parameter
 
 LOOK = 0.2  # s between looks at who publishes, and at a check that is on
 CHECKING = "checking the proof"
 LONG = 5.0  # s of checking, after which it is said
+OF_A_CONTINUOUS = (
+    "of a continuous funnel: topic:field paths separated by commas, all on one topic; empty: the "
+    "model says it"
+)
+CHECK = (
+    Parameter(
+        "check_seconds",
+        USUAL.seconds,
+        "s of processor time that the check of a proof may take",
+        (1, 3600),
+    ),
+    Parameter(
+        "check_memory",
+        USUAL.memory,
+        "MB of memory that the check of a proof may take",
+        (64, 10**6),
+    ),
+)
+DESIGN = (
+    *CHECK,
+    Parameter("source", "funnel_publisher", "node that publishes the funnel"),
+    Parameter("response", "", f"the state {OF_A_CONTINUOUS}"),
+    Parameter("command", "", f"the inputs {OF_A_CONTINUOUS}"),
+    Parameter("period", 0.0, "s between samples of a continuous funnel", (0.0, 60.0)),
+    Parameter(
+        "expected_digest",
+        "",
+        "SHA-256 of the only funnel.json to be used, as sha256sum prints it; empty: any proved",
+    ),
+)
 _DIGEST = re.compile(r"(sha256:)?[0-9a-f]{64}", re.ASCII)
 
 
-def declare_wiring(node: Node) -> Wiring | None:
-    """The parameters that say where a continuous funnel's state and inputs are; None if unset."""
-    what = "of a continuous funnel: topic:field paths separated by commas, all on one topic; empty"
-    response = declare_text(node, "response", "", f"the state {what}: the model says it")
-    command = declare_text(node, "command", "", f"the inputs {what}: the model says it")
-    period = declare_number(
-        node, "period", 0.0, "s between samples of a continuous funnel", between=(0.0, 60.0)
-    )
-    if not (response or command):
+def wiring_of(values: SimpleNamespace) -> Wiring | None:
+    """Where a continuous funnel's state and inputs are, by the parameters of DESIGN; None if unset.
+
+    Raises BagError if they are no paths.
+    """
+    if not (values.response or values.command):
         return None
     return Wiring.parse(
-        (path.strip() for path in response.split(",")),
-        (path.strip() for path in command.split(",")),
-        period,
+        (path.strip() for path in values.response.split(",")),
+        (path.strip() for path in values.command.split(",")),
+        values.period,
     )
 
 
-def declare_expected(node: Node) -> str:
-    """The parameter that pins the funnel; DataError if it is no digest."""
-    what = "SHA-256 of the only funnel.json to be used, as sha256sum prints it; empty: any proved"
-    expected = declare_text(node, "expected_digest", "", what)
+def expected_of(values: SimpleNamespace) -> str:
+    """The digest that pins the funnel, empty if none does; DataError if it is no digest."""
+    expected = values.expected_digest
     if expected and not _DIGEST.fullmatch(expected):
         raise DataError(f"expected_digest is '{expected}'; it should have 64 hexadecimal digits")
     return "sha256:" + expected.removeprefix("sha256:") if expected else ""
+
+
+def limits_of(values: SimpleNamespace) -> Limits:
+    """What the check of a proof may take, by the parameters of CHECK."""
+    return Limits(values.check_seconds, values.check_memory)
 
 
 class Unproved:
@@ -70,25 +100,21 @@ class DesignSubscription:
 
     def __init__(
         self,
-        node: Node,
-        source: str,
+        node: ManagedNode,
         taken: Callable[[AnyDesign, str], None],
         changed: Callable[[], None],
-        *,
-        wiring: Wiring | None = None,
-        expected: str = "",
     ) -> None:
         self._node, self._taken, self._changed = node, taken, changed
-        self._wiring, self._expected = wiring, expected
+        self._wiring, self._expected = wiring_of(node.values), expected_of(node.values)
+        self._limits = limits_of(node.values)
         self._check: Check | None = None
         self._waiting: str | None = None
         self._used = ""  # the text of the design in use
         self._crowded = False
         self.digest = self.refusal = self._verdict = ""
         self.state = "waiting for a design"
-        self._subscribe(source)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(LOOK, self._look, clock=wall)
+        self._subscribe()
+        node.every(LOOK, self._look)
 
     def close(self) -> None:
         """Call off a check that is on."""
@@ -96,11 +122,11 @@ class DesignSubscription:
             self._check.close()
             self._check = None
 
-    def _subscribe(self, source: str) -> None:
+    def _subscribe(self) -> None:
+        topic = f"{self._node.values.source}/design"
         self._subscription = self._node.create_subscription(
-            String, f"{source}/design", self._on_bundle, qos.DOCUMENT
+            String, topic, self._on_bundle, qos.DOCUMENT
         )
-        self._source = source
 
     def _on_bundle(self, message: String) -> None:
         if self._is_crowded():
@@ -129,7 +155,7 @@ class DesignSubscription:
         elif self._crowded and count == 1:  # which the one that is left has published is not known
             self._crowded = False
             self._node.destroy_subscription(self._subscription)
-            self._subscribe(self._source)
+            self._subscribe()
         return self._crowded
 
     def _unheard(self) -> str:
@@ -161,7 +187,7 @@ class DesignSubscription:
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:
-                self._check = Check(text)
+                self._check = Check(text, self._limits)
             except OSError as error:
                 self._refuse(f"it cannot be checked: {error}")
                 return

@@ -9,31 +9,24 @@ its own, and those of one signal have one `repeat_group`. Refuses to run without
 import hashlib
 import json
 import math
-import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.signals.expressions import Expression, factors
-from bags.signals.grid import seconds
-from bags.signals.reader import read_signals
 from bags.signals.signal import SignalPath
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
-from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.errors import DataError
 from nlsid_ros import graph, qos
-from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.messages import (
     OTHERS,
     PATIENT_PERIODS,
@@ -42,11 +35,11 @@ from nlsid_ros.messages import (
     base_stopped,
     patience,
 )
-from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import ManagedNode, Parameter
+from nlsid_ros.starting import entry_point
 
-NAME = "excitation"
 COMMAND = "/cmd_vel:twist.linear.x"
-KINDS = ("multisine", "chirp", "prbs", "steps", "replay")
+KINDS = ("multisine", "chirp", "prbs", "steps")
 BIG = 1e9
 STILL = 1.0  # s of the wall's time without a command while a signal is played
 ANSWER = 10.0  # s for the recorder to answer
@@ -56,51 +49,48 @@ LAST_WORD = 1.0  # s for the last command to be received before the node goes
 class Excitation(ManagedNode):
     """Plays one signal `repeats` times, resting in between."""
 
-    def __init__(self, arguments: Arguments = None) -> None:
-        super().__init__(NAME, arguments)
+    name = "excitation"
+    parameters = (
+        Parameter("kind", "multisine", "one of " + ", ".join(KINDS)),
+        Parameter("command", "", f"signal published; empty: that of config, else {COMMAND}"),
+        Parameter("config", "", "a robot's configuration, whose excitation it is"),
+        Parameter("command_type", "geometry_msgs/msg/TwistStamped", "its type"),
+        Parameter("others", ZERO, f"its fields that are not the signal: {OTHERS}"),
+        Parameter("period", 0.025, "s between commands", (1e-3, 10.0)),
+        Parameter("duration", 20.0, "s of one signal", (0.1, 36000.0)),
+        Parameter("lowest_hz", 0.1, "lowest frequency", (1e-6, 1e4)),
+        Parameter("highest_hz", 2.0, "highest frequency", (1e-6, 1e4)),
+        Parameter("hold", 0.5, "s a step or a bit lasts", (1e-3, 1e4)),
+        Parameter(
+            "pause", 2.0, "s of rest before each repeat, and after it in its own bag", (0.0, 3600.0)
+        ),
+        Parameter("recorder", "", "node asked for a bag per repeat (at_once: false); empty: none"),
+        Parameter("repeats", 1, "how often it is played", (1, 1000)),
+        Parameter("seed", 1, "of phases and levels", (0, 2**31)),
+        Parameter("lowest", 0.0, "least input", (-BIG, BIG)),
+        Parameter("highest", 0.0, "greatest input; must be set", (-BIG, BIG)),
+        Parameter("slew", 0.0, "fastest change, 1/s; must be set", (0.0, BIG)),
+        Parameter("fade", 1.0, "s of soft start and stop", (0.0, 60.0)),
+        Parameter("rest", 0.0, "input of a robot at rest", (-BIG, BIG)),
+    )
 
     def read_parameters(self) -> None:
-        """Declare them; take the values that they have now."""
-        number = partial(declare_number, self)
-        self._kind = declare_text(self, "kind", "multisine", "one of " + ", ".join(KINDS))
-        self._command = SignalMessage(
-            self._signal(),
-            declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "its type"),
-            declare_text(self, "others", ZERO, f"its fields that are not the signal: {OTHERS}"),
-        )
-        self._bag = declare_text(self, "bag", "", "for kind replay: the bag whose command is sent")
-        self._period = number("period", 0.025, "s between commands", between=(1e-3, 10.0))
-        self._duration = number("duration", 20.0, "s of one signal", between=(0.1, 36000.0))
-        self._lowest_hz = number("lowest_hz", 0.1, "lowest frequency", between=(1e-6, 1e4))
-        self._highest_hz = number("highest_hz", 2.0, "highest frequency", between=(1e-6, 1e4))
-        self._hold = number("hold", 0.5, "s a step or a bit lasts", between=(1e-3, 1e4))
-        self._pause = number(
-            "pause",
-            2.0,
-            "s of rest before each repeat, and after it in its own bag",
-            between=(0.0, 3600.0),
-        )
-        recorder = declare_text(
-            self, "recorder", "", "node asked for a bag per repeat (at_once: false); empty: none"
-        )
-        self._recorder = recorder.rstrip("/")
-        repeats: Any = declare(self, "repeats", 1, "how often it is played", between=(1, 1000))
-        seed: Any = declare(self, "seed", 1, "of phases and levels", between=(0, 2**31))
-        self._repeats, self._seed = repeats, seed
+        """Find the signal and the limits; DataError if there are none."""
+        values = self.values
+        self._command = SignalMessage(self._signal(), values.command_type, values.others)
+        self._period: float = values.period
+        self._recorder: str = values.recorder.rstrip("/")
         self._shape = Shape(
-            lowest=number("lowest", 0.0, "least input", between=(-BIG, BIG)),
-            highest=number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG)),
-            slew=number("slew", 0.0, "fastest change, 1/s; must be set", between=(0.0, BIG)),
-            fade=number("fade", 1.0, "s of soft start and stop", between=(0.0, 60.0)),
-            rest=number("rest", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
+            lowest=values.lowest,
+            highest=values.highest,
+            slew=values.slew,
+            fade=values.fade,
+            rest=values.rest,
         )
 
     def _signal(self) -> SignalPath:
         """What is published: the parameter `command`, else the one excitation of `config`."""
-        command = declare_text(
-            self, "command", "", f"signal published; empty: that of config, else {COMMAND}"
-        )
-        config = declare_text(self, "config", "", "a robot's configuration, whose excitation it is")
+        command, config = self.values.command, self.values.config
         if command or not config:
             return SignalPath.parse(command or COMMAND)
         texts = [signal.path for signal in load_config(Path(config)).signals.excitation]
@@ -113,39 +103,27 @@ class Excitation(ManagedNode):
 
     def prepare(self) -> None:
         """Make the whole signal before anything moves."""
-        if self._kind not in KINDS:
-            raise DataError(f"kind is '{self._kind}'; it should be one of {', '.join(KINDS)}")
-        rest = np.full(round(self._pause / self._period), self._shape.rest)
-        self._once = np.concatenate([rest, self._inputs()])
+        kind = self.values.kind
+        rest = np.full(round(self.values.pause / self._period), self._shape.rest)
+        self._once = np.concatenate([rest, self._shape(self._inputs(kind), self._period)])
         digest = hashlib.sha256(self._once.tobytes()).hexdigest()
-        self._group = f"{self._command.path}, {self._kind}, sha256:{digest[:16]}"
+        self._group = f"{self._command.path}, {kind}, sha256:{digest[:16]}"
 
-    def _inputs(self) -> FloatArray:
-        samples, period = round(self._duration / self._period), self._period
-        rng = np.random.default_rng(self._seed)
-        band = {"lowest": self._lowest_hz, "highest": self._highest_hz}
-        match self._kind:
+    def _inputs(self, kind: str) -> FloatArray:
+        """The signal between -1 and 1."""
+        values, period = self.values, self._period
+        samples, rng = round(values.duration / period), np.random.default_rng(values.seed)
+        band = {"lowest": values.lowest_hz, "highest": values.highest_hz}
+        match kind:
             case "multisine":
-                signal = multisine(samples, period, rng=rng, **band)
+                return multisine(samples, period, rng=rng, **band)
             case "chirp":
-                signal = chirp(samples, period, **band)
+                return chirp(samples, period, **band)
             case "prbs":
-                signal = prbs(samples, period, hold=self._hold)
+                return prbs(samples, period, hold=values.hold)
             case "steps":
-                signal = steps(samples, period, hold=self._hold, rng=rng)
-            case _:
-                signal = self._recorded()
-        return self._shape(signal, period)
-
-    def _recorded(self) -> FloatArray:
-        """The bag's command on our grid, held between its samples; beyond the limits it is cut."""
-        path = str(self._command.path)
-        samples = read_signals(Path(self._bag), [path])[path]
-        t = seconds(samples.stamp_ns, int(samples.stamp_ns[0]))
-        grid = np.arange(0.0, float(t[-1]), self._period)
-        held = samples.values[np.searchsorted(t, grid, side="right") - 1]
-        lo, hi = self._shape.lowest, self._shape.highest
-        return np.asarray(2.0 * (held - lo) / (hi - lo) - 1.0)
+                return steps(samples, period, hold=values.hold, rng=rng)
+        raise DataError(f"kind is '{kind}'; it should be one of {', '.join(KINDS)}")
 
     def start(self) -> None:
         """Be ready; nothing moves before ~/start."""
@@ -164,17 +142,15 @@ class Excitation(ManagedNode):
         )
         self._command.listen(self)
         self._experiment = self.create_publisher(String, "~/experiment", qos.DOCUMENT)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self.keep_reporting(self._report)
         self._bags = {
             name: self.create_client(Trigger, f"{self._recorder}/{name}")
             for name in ("start", "stop")
             if self._recorder
         }
-        self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/stop", self._on_stop)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._period, self._on_tick, clock=steady)
-        self.create_timer(1.0, self._report, clock=steady)
+        self.serve("start", self._on_start)
+        self.serve("stop", self._on_stop)
+        self.every(self._period, self._on_tick)
 
     def stop(self) -> None:
         """Go to rest before going."""
@@ -265,28 +241,29 @@ class Excitation(ManagedNode):
 
     def _play(self, start_ns: int) -> None:
         self._next, self._start_ns, self._sent = 0, start_ns, time.monotonic()
+        values = self.values
         self._did = {
-            "kind": self._kind,
+            "kind": values.kind,
             "signal": str(self._command.path),
-            "period": self._period,
-            "duration": self._duration,
+            "period": values.period,
+            "duration": values.duration,
             "repeat": self._repeat + 1,
-            "repeats": self._repeats,
-            "pause": self._pause,
-            "seed": self._seed,
-            "lowest_hz": self._lowest_hz,
-            "highest_hz": self._highest_hz,
-            "hold": self._hold,
+            "repeats": values.repeats,
+            "pause": values.pause,
+            "seed": values.seed,
+            "lowest_hz": values.lowest_hz,
+            "highest_hz": values.highest_hz,
+            "hold": values.hold,
             "limits": vars(self._shape),
             "start_ns": self._start_ns,
             "repeat_group": self._group,
         }
         self._experiment.publish(String(data=json.dumps(self._did)))
-        self._say(f"repeat {self._repeat + 1} of {self._repeats}")
+        self._say(f"repeat {self._repeat + 1} of {values.repeats}")
 
     def _end_repeat(self) -> None:
         if self._recorder:  # the response is heard for as long as a command may be held
-            self._still = max(1, round(self._pause / self._period))
+            self._still = max(1, round(self.values.pause / self._period))
         else:  # the next one goes on where this one ends
             self._next_repeat(self._start_ns + len(self._once) * round(self._period * 1e9))
 
@@ -302,7 +279,7 @@ class Excitation(ManagedNode):
 
     def _next_repeat(self, start_ns: int | None) -> None:
         self._repeat += 1
-        if self._repeat == self._repeats:
+        if self._repeat == self.values.repeats:
             self._finish("done")
         elif start_ns is None:
             self._begin_repeat()
@@ -327,24 +304,22 @@ class Excitation(ManagedNode):
         if self._recorder:
             self._bags["stop"].call_async(Trigger.Request())
 
-    def _on_start(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+    def _on_start(self) -> tuple[bool, str]:
         if self._busy:
-            answer.message = "it runs already"
-        elif lacking := self._command.lacking():
-            answer.message = lacking
-        elif not all(client.service_is_ready() for client in self._bags.values()):
-            answer.message = f"there is no recorder {self._recorder}; start it with at_once:=false"
-        else:
-            self._busy, self._failed, self._repeat = True, False, 0
-            self._did = {}
-            self._begin_repeat()
-            answer.success, answer.message = True, "running"
-        return answer
+            return False, "it runs already"
+        if lacking := self._command.lacking():
+            return False, lacking
+        if not all(client.service_is_ready() for client in self._bags.values()):
+            return False, f"there is no recorder {self._recorder}; start it with at_once:=false"
+        self._busy, self._failed, self._repeat = True, False, 0
+        self._did = {}
+        self._begin_repeat()
+        return True, "running"
 
-    def _on_stop(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = True, "stopping" if self._busy else "nothing runs"
+    def _on_stop(self) -> tuple[bool, str]:
+        said = "stopping" if self._busy else "nothing runs"
         self._call_off("stopped when asked to")
-        return answer
+        return True, said
 
     def _say(self, state: str) -> None:
         self._state = state
@@ -355,23 +330,16 @@ class Excitation(ManagedNode):
             "input": f"{self._input:.6g}",
             "sample": "none" if self._next is None else str(self._next),
             "of": str(len(self._once)),
-            "repeat": str(min(self._repeat + 1, self._repeats)),
+            "repeat": str(min(self._repeat + 1, self.values.repeats)),
         }
         level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
         text = self._state
         if named := graph.rivals(self, self._publisher):
             level, text = max(level, DiagnosticStatus.WARN), f"{text}; {named}"
-        now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, text, values))
+        self.report(level, text, values)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid excitation`."""
-    try:
-        run(Excitation, args)
-    except (NlsidError, OSError) as error:
-        sys.exit(f"{NAME}: {error}")
-
+main = entry_point(Excitation)
 
 if __name__ == "__main__":
     main()

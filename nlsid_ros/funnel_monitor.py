@@ -11,24 +11,16 @@ once a second. Leaving the funnel calls
 What is outside, or violates the assumption, stays so until `~/restart`, which begins a new run.
 """
 
-import sys
-from array import array
+import math
 from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from collections.abc import Iterable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.client import Client
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.subscription import Subscription
-from rclpy.task import Future
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import UNANNOUNCED, Run
@@ -44,21 +36,18 @@ from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import graph, qos
-from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
-from nlsid_ros.message_classes import installed_types, message_class
-from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
-from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
-from nlsid_ros.subscribing import Informed, Silence
+from nlsid_ros.documents import DESIGN, DesignSubscription, expected_of, wiring_of
+from nlsid_ros.helping import Help
+from nlsid_ros.message_classes import installed_types
+from nlsid_ros.messages import numbers_at, off_clock, patience, stamp_ns_of
+from nlsid_ros.running import REPORT, ManagedNode, Parameter, arm
+from nlsid_ros.starting import entry_point
+from nlsid_ros.subscribing import Topic
 
-NAME = "funnel_monitor"
 LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signals' types
-RETRY = 0.5  # s until a service that has not answered is called again
-THROTTLE = 5.0  # s between log lines about a service that does not answer
 LATEST_COMMAND = (
     1.0  # s from a command's stamp to this node's clock; one is stamped when it is sent
 )
-HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
 LOOK_AHEAD = 0.1  # s between forecasts
 MOST_STEPS = 100  # samples ahead: each takes about as long as judging one
 LEVELS = {
@@ -68,126 +57,115 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
-ALARM = [field.name for field in fields(AlarmOptions)]
 
 
 class FunnelMonitor(ManagedNode):
     """Reads stamped signals, asks the core's Monitor, publishes what it says."""
 
+    name = "funnel_monitor"
     is_watched = True
-
-    def __init__(self, arguments: Arguments = None) -> None:
-        super().__init__(NAME, arguments)
+    parameters = (
+        *DESIGN,
+        Parameter("controller", "", "node that announces when a run starts; empty: first sample"),
+        Parameter(
+            "nominal",
+            Centre.COMMAND.value,
+            "what the tube is around: command, motion (command, begun in motion) or profile",
+        ),
+        Parameter(
+            "stale_after",
+            0.0,
+            "s without a response, or from its stamp to this node's clock: unknown; "
+            "0: 4 periods, at least 0.1",
+            (0.0, 60.0),
+            tunable=True,
+        ),
+        Parameter(
+            "command_wait", 0.02, "s a response waits for its command", (1e-4, 1.0), tunable=True
+        ),
+        Parameter("warning_margin", 0.2, "warn below", (0.0, 1.0), tunable=True),
+        Parameter(
+            "warning_time", 0.0, "s: warn if exit is predicted sooner", (0.0, 60.0), tunable=True
+        ),
+        Parameter(
+            "hysteresis", 0.0, "margin above a threshold to come back", (0.0, 1.0), tunable=True
+        ),
+        Parameter(
+            "clear_after",
+            0.0,
+            "s a better state lasts before it is said",
+            (0.0, 60.0),
+            tunable=True,
+        ),
+        Parameter(
+            "forecast", 0.0, "s ahead of the newest sample; 0: none", (0.0, 60.0), tunable=True
+        ),
+        Parameter(
+            "allow_old_stamps",
+            False,
+            "judge stamps that are not of now: a recording that is played again",
+        ),
+        Parameter(
+            "response_frame", "", "frame_id that the response must have; empty: that of the first"
+        ),
+        Parameter("stop_service", "", "std_srvs/Trigger called on leaving the funnel; empty: none"),
+        Parameter("snapshot_service", "", "std_srvs/Trigger called on leaving; empty: none"),
+    )
 
     def read_parameters(self) -> None:
-        """Declare them; take the values that they have now."""
-        self._source = declare_text(
-            self, "source", "funnel_publisher", "node that publishes the funnel"
-        )
-        self._controller = declare_text(
-            self, "controller", "", "node that announces when a run starts; empty: first sample"
-        )
-        what = "what the tube is around: command, motion (command, begun in motion) or profile"
-        nominal = declare_text(self, "nominal", "command", what)
+        """Refuse what makes no sense."""
+        nominal = self.values.nominal
         if nominal not in [centre.value for centre in Centre]:
             raise DataError(f"nominal is '{nominal}'; it should be command, motion or profile")
-        self._centre = Centre(nominal)
-        self._wiring = declare_wiring(self)
-        self._expected = declare_expected(self)
-        number = partial(declare_number, self, tunable=True)
-        what = (
-            "s without a response, or from its stamp to this node's clock: unknown; "
-            "0: 4 periods, at least 0.1"
-        )
-        number("stale_after", 0.0, what, between=(0.0, 60.0))
-        number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
-        number("warning_margin", 0.2, "warn below", between=(0.0, 1.0))
-        number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
-        number("hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0))
-        number("clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0))
-        number("forecast", 0.0, "s ahead of the newest sample; 0: none", between=(0.0, 60.0))
-        what = "judge stamps that are not of now: a recording that is played again"
-        self._allow_old_stamps = bool(declare(self, "allow_old_stamps", False, what))
-        what = "frame_id that the response must have; empty: that of the first"
-        self._frame = declare_text(self, "response_frame", "", what)
+        wiring_of(self.values)
+        expected_of(self.values)
         self._watch: Watch | None = None
-        self.tune(self.tunable())
-        self._stop_service = declare_text(
-            self, "stop_service", "", "std_srvs/Trigger called on leaving the funnel; empty: none"
-        )
-        self._snapshot_service = declare_text(
-            self, "snapshot_service", "", "std_srvs/Trigger called on leaving; empty: none"
-        )
 
-    def tune(self, values: Mapping[str, Any]) -> None:
+    def tune(self, values: SimpleNamespace) -> None:
         """Take patience and warnings, also in the middle of a run."""
-        self._options = AlarmOptions(**{name: values[name] for name in ALARM})
-        self._stale_after, self._command_wait = values["stale_after"], values["command_wait"]
-        self._forecast = values["forecast"]
+        self._options = AlarmOptions(
+            values.warning_margin, values.warning_time, values.hysteresis, values.clear_after
+        )
         if self._watch is not None:
             self._watch.warn(self._options)
 
     @property
     def _patient_for(self) -> float:
         """s without a response."""
-        return patience(self._stale_after, self._watch.design.period if self._watch else 0.0)
+        return patience(self.values.stale_after, self._watch.design.period if self._watch else 0.0)
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals: dict[str, Subscription] = {}  # by topic
-        self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
-        self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
-        self._doubts: dict[str, str] = {}  # topic -> who publishes on it, if several do
-        self._unheard: dict[str, str] = {}  # response topic -> who publishes on it in vain
-        self._silences: dict[str, Silence] = {}
-        self._numbers: dict[str, Sequence] = {}  # topic -> its publisher's count
+        self._watch = None
+        self._run: Run | None = None
+        self._topics: dict[str, Topic] = {}  # of the signals, as the model calls them
         self._unfit_commands: dict[str, str] = {}  # topic -> what is wrong with the newest command
         self._unfit = ""
-        self._watch = None
         self._names = ""
         self._latched: tuple[State, str] | None = None
-        self._heard_ns: dict[str, int] = {}  # response topic -> when its last message came
-        self._run: Run | None = None
         waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for a design")
         self._said: tuple[Reading, State] = waiting, State.UNKNOWN
+        self._heard_ns: dict[str, int] = {}  # response topic -> when its last message came
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
-        self._slowest_ns = 0
-        self._judged = 0
-        self._foreseen_ns = -1
+        self._slowest_ns = self._judged = 0
+        self._clock_ns = self._beat_ns = self._foreseen_ns = -1
+        self._simulated = bool(self.get_parameter("use_sim_time").value)
+
+        self.keep_reporting(self._on_heartbeat)
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._ahead = self.create_publisher(JointState, "~/forecast", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._funnel = DesignSubscription(
-            self,
-            self._source,
-            self._on_design,
-            self._on_news,
-            wiring=self._wiring,
-            expected=self._expected,
-        )
-        if self._controller:
-            self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
-        self.create_service(Trigger, "~/restart", self._on_restart)
-        names = (self._stop_service, self._snapshot_service)
-        self._on_exit = [self.create_client(Trigger, name) for name in names if name]
-        self._unanswered: dict[Client, Future | None] = {}
-        self._failures: dict[str, str] = {}
-        self._simulated = bool(self.get_parameter("use_sim_time").value)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self._patience = self.get_clock() if self._simulated else wall
-        self._clock_ns = self._beat_ns = -1
-        self.create_timer(LOOK, self._look, clock=wall)
-        self._retry = self.create_timer(RETRY, self._call, clock=wall)
-        self._retry.cancel()
-        self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
-        self.create_timer(LOOK_AHEAD, self._look_ahead, clock=wall)
-        self._stale = self.create_timer(self._patient_for, self._on_stale, clock=self._patience)
-        self._stale.cancel()
-        self._release = self.create_timer(
-            self._command_wait, self._on_release, clock=self._patience
-        )
-        self._release.cancel()
+        self._funnel = DesignSubscription(self, self._on_design, self._on_news)
+        if controller := self.values.controller:
+            self.create_subscription(String, f"{controller}/run", self._on_run, qos.DOCUMENT)
+        self._help = Help(self, (self.values.stop_service, self.values.snapshot_service))
+        self.serve("restart", self._on_restart)
+
+        self._patience = self.get_clock() if self._simulated else self.steady
+        self._stale = self.later(self._on_stale, self._patience)
+        self._release = self.later(self._on_release, self._patience)
+        self.every(LOOK, self._look)
+        self.every(LOOK_AHEAD, self._look_ahead)
 
     def stop(self) -> None:
         """Call off a check that is on."""
@@ -195,33 +173,43 @@ class FunnelMonitor(ManagedNode):
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """A proved design came, or another one: watch its signals from scratch."""
-        watch = Watch(
-            design, centre=self._centre, options=self._options, announced=bool(self._controller)
-        )
-        for subscription in self._signals.values():
-            self.destroy_subscription(subscription)
-        self._signals.clear()
+        announced = bool(self.values.controller)
+        centre = Centre(self.values.nominal)
+        watch = Watch(design, centre=centre, options=self._options, announced=announced)
+        for topic in self._topics.values():
+            topic.drop()
+        self._topics = {
+            topic: Topic(
+                self,
+                self.resolve_topic_name(self.signal_topic(topic)),
+                partial(self._on_signal, topic),
+            )
+            for topic in watch.pairing.topics
+        }
         self._watch, self._digest = watch, digest
         self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
-        self._kinds, self._unfit = {}, ""
-        for known in (self._doubts, self._numbers, self._unfit_commands, self._unheard):
-            known.clear()
-        self._silences.clear()
-        self._frames.clear()
+        self._unfit = ""
+        self._unfit_commands.clear()
         self._heard_ns.clear()
-        self._deadlines.clear()
+        self._forget()
         self._tell(f"no {design.name} yet")
         self.get_logger().info(f"watching {watch.pairing}")
-        if self._forecast and not watch.monitor.goes_on:
+        if self.values.forecast and not watch.monitor.goes_on:
             self.get_logger().warning("no forecasts: they are of tubes around a simulation")
         self._begin()
+
+    def _forget(self) -> None:
+        """Whatever the next messages are compared with."""
+        self._deadlines.clear()
+        for topic in self._topics.values():
+            topic.frame, topic.numbers = self.values.response_frame or None, Sequence()
 
     def _on_news(self) -> None:
         """A check began, or a design was used again or refused: what is in use stays in use."""
         if self._watch is None:
             self._tell(self._funnel.state)
         else:
-            self._diagnostics.publish(self._status_message())
+            self._report()
 
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0, or the end of that run."""
@@ -235,7 +223,7 @@ class FunnelMonitor(ManagedNode):
                 self._watch.stop(self._run.last_ns, self._run.ended)
             return
         if self._latched is not None:  # what happened before has not been looked at
-            self._call_for_help()
+            self._help.call()
         self._begin()
 
     def _begin(self) -> None:
@@ -259,112 +247,70 @@ class FunnelMonitor(ManagedNode):
             self._stale.cancel()
             reason = f"this node's clock went back by {seconds(back_ns, 0):.3g} s"
             self._publish(self._watch.missing(reason))
-        self._connect()
+        for topic in self._topics:
+            self._connect(topic)
 
-    def _connect(self) -> None:
-        """Subscribe to the signals' topics, each with a type that is published and carries them.
+    def _connect(self, topic: str) -> None:
+        """Subscribe to a signal's topic with a type that is published and carries it.
 
-        A subscription whose type is no longer published is replaced.
+        Where several publish it, nobody knows whose messages come: a response is unknown then. Of
+        several publishers of commands all but one may be silent, and the robot hears the same as
+        this node: they are named.
         """
-        if self._watch is None:
+        assert self._watch is not None
+        heard = self._topics[topic]
+        found = self.get_publishers_info_by_topic(heard.name)
+        kind = self._kind(topic, [each.topic_type for each in found])
+        if not kind:
             return
-        for topic in self._watch.pairing.topics:
-            name = self.resolve_topic_name(self.signal_topic(topic))
-            publishers = self.get_publishers_info_by_topic(name)
-            if kind := self._kind(topic, [publisher.topic_type for publisher in publishers]):
-                heard = [each for each in publishers if each.topic_type == kind]
-                self._subscribe(topic, name, kind, heard)
-                self._doubt(topic, graph.several(name, heard))
-                self._unheard[topic] = graph.unheard(name, heard) if self._is_silent(topic) else ""
+        before = self._doubt(topic)
+        heard.look(kind, found)
+        if (doubt := self._doubt(topic)) and not before:
+            self.get_logger().warning(doubt)
+            if topic in self._watch.pairing.response_topics:
+                self._publish(self._watch.missing(doubt))
 
     def _kind(self, topic: str, kinds: list[str]) -> str:
         """The type to subscribe with: the one in use, or the first that fits; empty if none."""
-        kind = self._kinds.get(topic, "")
+        assert self._watch is not None
+        kind = self._topics[topic].kind
         if not kinds or kind in kinds:
             return kind
-        try:
-            kind = self._fitting(topic, list(dict.fromkeys(kinds)))
-        except BagError as error:
-            if str(error) != self._unfit:
-                self._unfit = str(error)
-                self.get_logger().error(str(error))
-                self._tell(str(error))
-            return ""
-        self._unfit = ""
-        return kind
-
-    def _subscribe(
-        self, topic: str, name: str, kind: str, publishers: list[TopicEndpointInfo]
-    ) -> None:
-        """Subscribe as the publishers offer, and anew where that or their type has changed."""
-        now = self._signals.get(topic)
-        offered = [publisher.qos_profile.reliability for publisher in publishers]
-        profile = qos.subscription_to(offered)
-        if not publishers:
-            return
-        self._silences.setdefault(topic, Silence())
-        if now is not None:
-            if self._kinds[topic] == kind and now.qos_profile == profile:
-                return
-            said = f"{name} is subscribed to anew, as {graph.names(publishers)} offers it"
-            self.get_logger().warning(said)
-            self.destroy_subscription(now)
-        self._kinds[topic] = kind
-        callback = Informed(partial(self._on_signal, topic))
-        self._signals[topic] = self.create_subscription(
-            message_class(kind), name, callback, profile
-        )
-
-    def _is_silent(self, topic: str) -> bool:
-        """Whether a response should be heard and is not; commands may rest."""
-        assert self._watch is not None
-        return topic in self._watch.pairing.response_topics and self._silences[topic].is_odd
-
-    def _doubt(self, topic: str, reason: str) -> None:
-        """Remember why nobody knows whose messages are on a topic; a response is unknown then.
-
-        Transforms have one topic for whoever knows one. Of several publishers of commands all but
-        one may be silent, and the robot hears the same as this node: they are named.
-        """
-        assert self._watch is not None
-        if topic in self._watch.pairing.shared_topics:
-            return
-        news = reason and not self._doubts.get(topic)
-        self._doubts[topic] = reason
-        if news:
-            self.get_logger().warning(reason)
-            if topic in self._watch.pairing.response_topics:
-                self._publish(self._watch.missing(reason))
-
-    def _fitting(self, topic: str, kinds: list[str]) -> str:
-        """The first of the types that carries the signals; BagError about the last if none does."""
-        assert self._watch is not None
-        for kind in kinds:
+        for kind in dict.fromkeys(kinds):
             try:
                 self._watch.pairing.check(topic, kind, installed_types(kind))
             except BagError as error:
-                unfit = error
+                unfit = str(error)
                 continue
+            self._unfit = ""
             return kind
-        raise unfit
+        if unfit != self._unfit:
+            self._unfit = unfit
+            self.get_logger().error(unfit)
+            self._tell(unfit)
+        return ""
+
+    def _doubt(self, topic: str) -> str:
+        """Why nobody knows whose messages are on a topic; transforms have one for all."""
+        assert self._watch is not None
+        return "" if topic in self._watch.pairing.shared_topics else self._topics[topic].several
 
     def _on_signal(self, topic: str, message: Any, info: dict[str, int]) -> None:
         """Decode stamp and values, and judge whatever samples are complete."""
-        watch = self._watch
-        if watch is None:
-            return
+        watch, heard = self._watch, self._topics[topic]
+        assert watch is not None
         logged = watch.pairing.clock == "log"
         stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
-        responds = topic in watch.pairing.response_topics
-        self._silences[topic].end(1)
+        heard.silence.end(1)
         if watch.pairing.measures(topic, message):
-            self._numbers.setdefault(topic, Sequence()).update(info["publication_sequence_number"])
+            heard.numbers.update(info["publication_sequence_number"])
+        responds = topic in watch.pairing.response_topics
         if not responds:
             unfit = self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
             if unfit:  # nor does a stamp far ahead say that no other command is still to come
                 self._publish(watch.missing(unfit, doubted=True))
                 return
-        elif reason := self._distrust(topic, stamp_ns, message, logged=logged):
+        elif reason := self._distrust(topic, message, logged=logged):
             self._publish(watch.refuse(stamp_ns, reason))
             return
         try:
@@ -373,47 +319,44 @@ class FunnelMonitor(ManagedNode):
             self._publish(watch.unreadable(topic, stamp_ns, str(error)))
             return
         self._publish(judged)
-        if not responds:
-            return
+        if responds:
+            self._await_next(topic, None if judged else stamp_ns)
+
+    def _await_next(self, topic: str, waiting_ns: int | None) -> None:
+        """Have the silence noticed after a response, and its sample let go of if it still waits.
+
+        waiting_ns: the stamp of a response that is not judged yet.
+        """
+        assert self._watch is not None
         heard_ns = self._heard_ns[topic] = self._patience.now().nanoseconds
         if self._stale.is_canceled():
-            self._stale.reset()
-        if not judged:
-            if watch.is_waiting:  # also before the first command, without which there is no sample
-                self._say(Reading(0.0, Status.UNKNOWN, reason=WAITING), State.UNKNOWN)
-            due = heard_ns + round(self._command_wait * 1e9)
-            self._deadlines.append((due, stamp_ns))
-            if self._release.is_canceled():
-                self._release_in(due - heard_ns)
+            arm(self._stale, round(self._patient_for * 1e9))
+        if waiting_ns is None:
+            return
+        if self._watch.is_waiting:  # also before the first command, without which is no sample
+            self._say(Reading(0.0, Status.UNKNOWN, reason=WAITING), State.UNKNOWN)
+        wait_ns = round(self.values.command_wait * 1e9)
+        self._deadlines.append((heard_ns + wait_ns, waiting_ns))
+        if self._release.is_canceled():
+            arm(self._release, wait_ns)
 
-    def _distrust(self, topic: str, stamp_ns: int, message: Any, *, logged: bool) -> str:
+    def _distrust(self, topic: str, message: Any, *, logged: bool) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
-        if doubt := self._doubts.get(topic, ""):
-            return doubt
-        for each, numbers in self._numbers.items():
-            if numbers.alternates:
-                return f"messages of several publishers come in turn on {each}"
-        if logged:
-            return ""
-        frame = frame_of(message)
-        wanted = self._frames.setdefault(topic, self._frame or frame)
-        if frame != wanted:
-            return f"the response is in frame '{frame}', not in '{wanted}'"
-        off = ""
-        if not self._allow_old_stamps:
-            off = off_clock(stamp_ns, self.get_clock(), self._patient_for)
-        return off or next(filter(None, self._unfit_commands.values()), "")
+        said = self._doubt(topic)
+        for each in self._topics.values():
+            said = said or each.alternating
+        if said or logged:
+            return said
+        most = math.inf if self.values.allow_old_stamps else self._patient_for
+        said = self._topics[topic].distrust(message, most)
+        return said or next(filter(None, self._unfit_commands.values()), "")
 
     def _off_clock(self, topic: str, stamp_ns: int) -> str:
         """Why the stamp of a command is none; empty if it is one, or a recording is played."""
-        if self._allow_old_stamps:
+        if self.values.allow_old_stamps:
             return ""
         most = max(self._patient_for, LATEST_COMMAND)
         return off_clock(stamp_ns, self.get_clock(), most, f"a command on {topic}")
-
-    def _release_in(self, ahead_ns: int) -> None:
-        self._release.timer_period_ns = ahead_ns
-        self._release.reset()
 
     def _on_release(self) -> None:
         """Let go of samples whose command did not come in time."""
@@ -424,16 +367,15 @@ class FunnelMonitor(ManagedNode):
             self._publish(self._watch.flush(until))
         self._release.cancel()
         if self._deadlines:
-            self._release_in(self._deadlines[0][0] - now)
+            arm(self._release, self._deadlines[0][0] - now)
 
     def _on_stale(self) -> None:
         """A response stopped coming, or did so a while ago: look again when it would have."""
         patience_ns = round(self._patient_for * 1e9)
         heard_ns = min(self._heard_ns.values(), default=0)
         ahead_ns = heard_ns + patience_ns - self._patience.now().nanoseconds
-        self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
         if ahead_ns > 0:  # a reset wakes the executor, so it is not done with every message
-            self._stale.reset()
+            arm(self._stale, ahead_ns)
             return
         self._stale.cancel()
         if self._watch is not None:
@@ -446,51 +388,39 @@ class FunnelMonitor(ManagedNode):
         """Diagnostics first: an alarm should not wait behind a number."""
         for stamp_ns, reading, state in judged:
             self._say(reading, state)
-            self._publish_margin(stamp_ns, reading)
+            latency_ns = self.get_clock().now().nanoseconds - stamp_ns
+            self._slowest_ns = max(self._slowest_ns, latency_ns)
+            self._judged += 1
+            numbers = reading.numbers | self._widths.of(reading) | {"latency": latency_ns * 1e-9}
+            self._margin.publish(numbers_at(stamp_ns, numbers, self._judging))
 
     @property
     def _judging(self) -> str:
         """Of which funnel and run the verdicts are."""
         assert self._watch is not None
-        if not self._controller or self._watch.monitor.goes_on:
+        if not self.values.controller or self._watch.monitor.goes_on:
             return f"{self._digest} {UNANNOUNCED}"
         if self._run is None or self._run.ended or self._run.funnel != self._digest:
             return f"{self._digest} {RUN_WAITING}"
         return self._run.name
 
-    def _publish_margin(self, stamp_ns: int, reading: Reading) -> None:
-        latency_ns = self.get_clock().now().nanoseconds - stamp_ns
-        self._slowest_ns = max(self._slowest_ns, latency_ns)
-        self._judged += 1
-        message = JointState()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        message.header.frame_id = self._judging
-        numbers = reading.numbers | self._widths.of(reading)
-        message.name = [*numbers, "latency"]
-        message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
-        self._margin.publish(message)
-
     def _look_ahead(self) -> None:
         """Publish what the outputs can be, once after a newest sample, while the state is known."""
         watch, (reading, _) = self._watch, self._said
-        if watch is None or not self._forecast or reading.status is Status.UNKNOWN:
+        if watch is None or not self.values.forecast or reading.status is Status.UNKNOWN:
             return
-        steps = min(max(1, round(self._forecast / watch.design.period)), MOST_STEPS)
+        steps = min(max(1, round(self.values.forecast / watch.design.period)), MOST_STEPS)
         found = watch.forecast(steps)
         if found is None or not len(found[1].t) or found[0] == self._foreseen_ns:
             return
         self._foreseen_ns, (_, (t, low, high, _)) = found[0], found
-        message = JointState()
-        stamp_ns = found[0] + round(float(t[-1]) * 1e9)
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        ends = zip(low[-1].tolist(), high[-1].tolist(), strict=True)
-        for i, pair in enumerate(ends):
+        numbers: dict[str, float] = {}
+        for i in range(low.shape[1]):
             index = f"[{i}]" if low.shape[1] > 1 else ""
-            message.name += [f"low{index}", f"high{index}"]
-            message.position.extend(pair)
-        message.name.append("ahead")
-        message.position.append(float(t[-1]))
-        self._ahead.publish(message)
+            numbers |= {f"low{index}": float(low[-1, i]), f"high{index}": float(high[-1, i])}
+        ahead = float(t[-1])
+        stamp_ns = self._foreseen_ns + round(ahead * 1e9)
+        self._ahead.publish(numbers_at(stamp_ns, numbers | {"ahead": ahead}))
 
     def _tell(self, reason: str) -> None:
         """Unknown, and why, at once."""
@@ -510,10 +440,9 @@ class FunnelMonitor(ManagedNode):
         if severity >= SEVERITY[State.ASSUMPTION_VIOLATED]:
             if news:
                 self._latched = state, reading.reason
-            if not self._unanswered:
-                self._call_for_help()
-        message = self._status_message()
-        self._diagnostics.publish(message)
+            if not self._help.is_awaited:
+                self._help.call()
+        message = self._report()
         self._events.publish(message)
         if news and state is not before:
             self._log(message.status[0])
@@ -521,42 +450,11 @@ class FunnelMonitor(ManagedNode):
     def _log(self, said: DiagnosticStatus) -> None:
         """Into the terminal, for whoever sees nothing else."""
         if said.level == DiagnosticStatus.OK:
-            self.get_logger().info(said.message, throttle_duration_sec=HEARTBEAT)
+            self.get_logger().info(said.message, throttle_duration_sec=REPORT)
         elif said.level == DiagnosticStatus.ERROR:
             self.get_logger().error(said.message)
         else:
-            self.get_logger().warning(said.message, throttle_duration_sec=HEARTBEAT)
-
-    def _call_for_help(self) -> None:
-        """Have the configured services stop the robot and keep what led here; ask until they do."""
-        self._unanswered = dict.fromkeys(self._on_exit)
-        self._call()
-        self._retry.reset()
-
-    def _call(self) -> None:
-        """Call those who have not said that they did; the failures are in every status."""
-        for client, future in list(self._unanswered.items()):
-            answer = future.result() if future is not None and future.done() else None
-            if answer is not None and answer.success:
-                self.get_logger().info(f"{client.srv_name}: {answer.message}")
-                del self._unanswered[client]
-                continue
-            if future is not None:
-                client.remove_pending_request(future)
-                why = answer.message if answer is not None else "no answer"
-                self._failures[client.srv_name] = why
-            self._unanswered[client] = None
-            if client.service_is_ready():
-                self._unanswered[client] = client.call_async(Trigger.Request())
-            else:
-                self._failures[client.srv_name] = "not there to be called"
-        asked = {client.srv_name for client in self._unanswered}
-        for name in self._failures.keys() - asked:
-            del self._failures[name]
-        for name, why in self._failures.items():
-            self.get_logger().error(f"{name}: {why}", throttle_duration_sec=THROTTLE)
-        if not self._unanswered:
-            self._retry.cancel()
+            self.get_logger().warning(said.message, throttle_duration_sec=REPORT)
 
     def _on_heartbeat(self) -> None:
         clock_ns = self.get_clock().now().nanoseconds
@@ -566,13 +464,37 @@ class FunnelMonitor(ManagedNode):
                 reason += ": nobody publishes /clock"
             self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN)
         self._beat_ns = clock_ns
-        self._diagnostics.publish(self._status_message())
+        self._report()
         self._slowest_ns = 0
 
-    def _status_message(self) -> DiagnosticArray:
+    def _report(self) -> DiagnosticArray:
+        """Say what was said last, and whatever else is odd; an alarm comes before it."""
         reading, state = self._said
-        watch = self._watch
-        values = {
+        level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
+        if reading.alarm:  # no verdict: it warns, and latches nothing
+            level = max(level, DiagnosticStatus.WARN)
+            text += f"; {reading.alarm}"
+        if named := [each for each in self._odd() if each not in text]:
+            level, text = max(level, DiagnosticStatus.WARN), "; ".join([text, *named])
+        if self._latched is not None:
+            level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
+            text += "".join(f"; {name}: {why}" for name, why in self._help.failures.items())
+        if self._funnel.refusal:
+            level = DiagnosticStatus.ERROR
+            text += f"; {self._funnel.refusal}" if self._watch else ""
+        return self.report(level, text, self._numbers())
+
+    def _odd(self) -> list[str]:
+        """What is odd about the graph: whose messages come, and whose do not; commands may rest."""
+        responses = self._watch.pairing.response_topics if self._watch else ()
+        said = [self._doubt(topic) for topic in self._topics]
+        said += [self._topics[topic].unheard for topic in responses]
+        return [each for each in (*said, graph.namesakes(self)) if each]
+
+    def _numbers(self) -> dict[str, str]:
+        """The reading's numbers, and counts, as diagnostics have them."""
+        (reading, state), watch = self._said, self._watch
+        return {
             **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
             "now": state.value,
             "worst axis": reading.worst_axis,
@@ -589,45 +511,20 @@ class FunnelMonitor(ManagedNode):
             "signals": self._names,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
-        level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
-        if reading.alarm:  # no verdict: it warns, and latches nothing
-            level = max(level, DiagnosticStatus.WARN)
-            text += f"; {reading.alarm}"
-        named = [*self._doubts.values(), *self._unheard.values(), graph.namesakes(self)]
-        if named := [each for each in named if each and each not in text]:
-            level, text = max(level, DiagnosticStatus.WARN), "; ".join([text, *named])
-        if self._latched is not None:
-            level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
-            text += "".join(f"; {name}: {why}" for name, why in self._failures.items())
-        if self._funnel.refusal:
-            level = DiagnosticStatus.ERROR
-            text += f"; {self._funnel.refusal}" if watch else ""
-        stamp = self.get_clock().now().to_msg()
-        return status(stamp, name_of(self), level, text, values)
 
-    def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+    def _on_restart(self) -> tuple[bool, str]:
         """Begin a new run: forget stamps, lags and budget."""
-        answer.success = self._watch is not None
-        answer.message = "new run" if answer.success else "there is no design yet"
-        if self._watch is not None:
-            self._watch.restart()
-            self._run = self._latched = None
-            self._unanswered.clear()
-            self._failures.clear()
-            self._frames.clear()
-            self._numbers.clear()
-            self._deadlines.clear()
-            self._tell("restarted")
-        return answer
+        if self._watch is None:
+            return False, "there is no design yet"
+        self._watch.restart()
+        self._run = self._latched = None
+        self._help.call_off()
+        self._forget()
+        self._tell("restarted")
+        return True, "new run"
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid funnel_monitor`."""
-    try:
-        run(FunnelMonitor, args)
-    except NlsidError as error:
-        sys.exit(f"{NAME}: {error}")
-
+main = entry_point(FunnelMonitor)
 
 if __name__ == "__main__":
     main()

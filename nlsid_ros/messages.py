@@ -3,14 +3,18 @@
 import math
 import re
 import time
+from array import array
+from collections.abc import Mapping
 from copy import deepcopy
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from rclpy.clock import Clock
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.validate_topic_name import validate_topic_name
+from sensor_msgs.msg import JointState
 
 from bags.recordings.message_types import is_stamped
 from bags.signals.signal import SignalPath, numeric_paths
@@ -111,7 +115,7 @@ class SignalMessage:
     def make(self, stamp_ns: int, values: ArrayLike) -> Any:
         """A message stamped `stamp_ns`; all that is not the signal is as `others` says."""
         message = self.kind() if self._base is None else deepcopy(self._base)
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        message.header.stamp = stamp_of(stamp_ns)
         for path, value in zip(
             self._paths, np.broadcast_to(values, len(self._paths)).tolist(), strict=True
         ):
@@ -223,6 +227,19 @@ def off_clock(stamp_ns: int, clock: Clock, most: float, what: str = "a response"
         return f"{what} is stamped 0: its publisher does not fill in the time"
     way = "before" if age > 0 else "after"
     return f"{what} is stamped {abs(age):.3g} s {way} this node's clock; {most:g} s are allowed"
+
+
+def stamp_of(stamp_ns: int) -> Time:
+    """A stamp as messages have it."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> JointState:
+    """Named numbers at a stamp."""
+    message = JointState(name=list(numbers), position=array("d", numbers.values()))
+    message.header.stamp, message.header.frame_id = stamp_of(stamp_ns), frame
+    return message
 
 
 def stamp_ns_of(message: Any) -> int:

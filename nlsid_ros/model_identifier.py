@@ -6,14 +6,11 @@ Recordings that are not closed yet are left out, and so are those without the co
 """
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.chain.background import BackgroundIdentification, Progress
 from bags.chain.config import load_config
@@ -21,32 +18,27 @@ from bags.designs import documents
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.proofs import check
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
+from nlsid_ros.running import ManagedNode, Parameter
+from nlsid_ros.starting import entry_point
 
-NAME = "model_identifier"
 LOOK = 0.1  # s between looks at the worker
-REPORT = 1.0  # s between diagnostics while nothing changes
 
 
 class ModelIdentifier(ManagedNode):
     """One identification at a time; callbacks only start, look at and end the worker."""
 
-    def __init__(self, arguments: Arguments = None) -> None:
-        super().__init__(NAME, arguments)
+    name = "model_identifier"
+    parameters = (
+        Parameter("bags", [""], "bags or folders of bags, read when ~/identify is called"),
+        Parameter("last", 0, "only the last so many of the bags; 0: all", (0, 10_000)),
+        Parameter("config", "", "the robot's YAML configuration"),
+        Parameter("out", "", "folder for model.json and its proof"),
+    )
 
     def read_parameters(self) -> None:
-        """Declare them; take the values that they have now."""
-        bags: Any = declare(
-            self, "bags", [""], "bags or folders of bags, read when ~/identify is called"
-        )
-        self._bags = [Path(bag) for bag in bags if bag]
-        last: Any = declare(
-            self, "last", 0, "only the last so many of the bags; 0: all", between=(0, 10_000)
-        )
-        self._last = last
-        self._config = Path(declare_text(self, "config", "", "the robot's YAML configuration"))
-        self._out = Path(declare_text(self, "out", "", "folder for model.json and its proof"))
+        """Take the paths."""
+        self._bags = [Path(bag) for bag in self.values.bags if bag]
+        self._config, self._out = Path(self.values.config), Path(self.values.out)
 
     def prepare(self) -> None:
         """Refuse to wait for a request that could not be served."""
@@ -58,34 +50,30 @@ class ModelIdentifier(ManagedNode):
         """Wait for requests."""
         self._work: BackgroundIdentification | None = None
         self._said = Progress("idle", 0.0)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self.keep_reporting(self._report)
         self._model = self.create_publisher(String, "~/model", qos.DOCUMENT)
-        self.create_service(Trigger, "~/identify", self._on_identify)
-        self.create_service(Trigger, "~/cancel", self._on_cancel)
-        self.create_timer(LOOK, self._look)
-        self.create_timer(REPORT, self._report)
+        self.serve("identify", self._on_identify)
+        self.serve("cancel", self._on_cancel)
+        self.every(LOOK, self._look)
 
     def stop(self) -> None:
         """Call off what runs."""
         if self._work is not None:
             self._work.cancel()
 
-    def _on_identify(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success = self._work is None
-        answer.message = "started" if answer.success else f"busy: {self._said.what}"
-        if answer.success:
-            self._work = BackgroundIdentification(
-                self._bags, self._config, self._out, last=self._last
-            )
-        return answer
-
-    def _on_cancel(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success = self._work is not None
-        answer.message = "cancelled" if answer.success else "nothing runs"
+    def _on_identify(self) -> tuple[bool, str]:
         if self._work is not None:
-            self._work.cancel()
-            self._look()
-        return answer
+            return False, f"busy: {self._said.what}"
+        last = self.values.last
+        self._work = BackgroundIdentification(self._bags, self._config, self._out, last=last)
+        return True, "started"
+
+    def _on_cancel(self) -> tuple[bool, str]:
+        if self._work is None:
+            return False, "nothing runs"
+        self._work.cancel()
+        self._look()
+        return True, "cancelled"
 
     def _look(self) -> None:
         """Pass on the worker's progress; on success check the proof and publish the model."""
@@ -116,20 +104,13 @@ class ModelIdentifier(ManagedNode):
         said = self._said
         level = DiagnosticStatus.ERROR if said.error else DiagnosticStatus.OK
         text = said.what + (f": {said.error}" if said.error else "")
-        now = self.get_clock().now().to_msg()
         values = {"progress": f"{said.fraction:.2f}", "out": str(self._out)}
         if said.left_out:
             values["left out"] = "; ".join(said.left_out)
-        self._diagnostics.publish(status(now, name_of(self), level, text, values))
+        self.report(level, text, values)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid model_identifier`."""
-    try:
-        run(ModelIdentifier, args)
-    except (NlsidError, OSError) as error:
-        sys.exit(f"{NAME}: {error}")
-
+main = entry_point(ModelIdentifier)
 
 if __name__ == "__main__":
     main()

@@ -1,19 +1,13 @@
-"""What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
+"""What every node shares: its lifecycle, its parameters, its timers, services and diagnostics."""
 
-import gc
-import os
-import signal
 import socket
-import subprocess
-import sys
-import threading
 import traceback
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
-import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
@@ -23,45 +17,81 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as Given
 from rclpy.qos import QoSProfile
-from rclpy.service import Service
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from rclpy.utilities import try_shutdown
+from std_srvs.srv import Trigger
 
 from nlsid_core.errors import DataError, NlsidError
-from nlsid_ros import shared_memory, watchdog
+from nlsid_ros import qos
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+REPORT = 1.0  # s between diagnostics while nothing changes
 Arguments = Sequence[str] | None  # of a node that shares its process: `--ros-args ...`
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
 
-class Declared(NamedTuple):
-    """A parameter as a node declared it."""
+class Parameter(NamedTuple):
+    """An option of a node. The default's type is its own; 2 is taken where 2.0 is meant.
+
+    between: least and greatest number. tunable: it can be changed while the node runs. several: a
+    list of numbers is taken, too.
+    """
 
     name: str
     default: Value
-    description: str
-    between: tuple[float, float] | None
-    tunable: bool
+    what: str
+    between: tuple[float, float] | None = None
+    tunable: bool = False
     several: bool = False
 
+    @property
+    def said(self) -> str:
+        """Its name and what it is, for a message."""
+        return f"parameter {self.name} ({self.what})"
 
-class PlainNode(Node):
-    """A node without a lifecycle, which remembers what it declared."""
+    def descriptor(self) -> ParameterDescriptor:
+        """What ROS knows of it."""
+        described = ParameterDescriptor(name=self.name, description=self.what)
+        described.dynamic_typing = isinstance(self.default, float)  # or ROS would refuse 2 for 2.0
+        if self.between is None:
+            return described
+        lo, hi = self.between
+        if isinstance(self.default, int):
+            described.integer_range = [IntegerRange(from_value=int(lo), to_value=int(hi))]
+        else:
+            described.floating_point_range = [FloatingPointRange(from_value=lo, to_value=hi)]
+        return described
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self.declared: list[Declared] = []
+    def meant(self, given: Any) -> Value:
+        """The value given, a number as float where one is meant.
+
+        Raises DataError if it is no number where one is meant, or is out of range.
+        """
+        if not isinstance(self.default, float):
+            value: Value = given
+            return value
+        if self.several and isinstance(given, array | list | tuple) and len(given):
+            return [self._number(each) for each in given]
+        return self._number(given)
+
+    def _number(self, given: Any) -> float:
+        if isinstance(given, bool) or not isinstance(given, int | float):
+            raise DataError(f"{self.said}: {given!r} is not a number")
+        if self.between is not None and not self.between[0] <= given <= self.between[1]:
+            raise DataError(
+                f"{self.said}: {given} is not in [{self.between[0]}, {self.between[1]}]"
+            )
+        return float(given)
+
+
+AUTOSTART = Parameter("autostart", True, "start at once; false: wait for a lifecycle manager")
 
 
 class ManagedNode(LifecycleNode):
@@ -70,38 +100,41 @@ class ManagedNode(LifecycleNode):
 
     Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
-    those instead of the process's. is_watched: it ends if its executor stands still
-    (`nlsid_ros.watchdog`); so it must not sleep for long.
+    those instead of the process's.
+
+    name: the node's. parameters: what it declares; their values are in `values`, read anew when it
+    is configured. is_watched: it ends if its executor stands still (`nlsid_ros.watchdog`); so it
+    must not sleep for long. is_over: it has nothing left to do, and its process ends.
     """
 
+    name: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
     is_watched: ClassVar[bool] = False
 
-    def __init__(self, name: str, arguments: Arguments = None) -> None:
+    def __init__(self, arguments: Arguments = None) -> None:
         try:
-            super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
+            super().__init__(self.name, cli_args=arguments, use_global_arguments=arguments is None)
         except (RuntimeError, NameValidationException, ParameterException) as error:
-            raise _unreadable(error) from error
-        self.declared: list[Declared] = []
-        self._is_configured = False
-        self.add_on_set_parameters_callback(self._on_parameters)
-        self.autostart = bool(
-            declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
-        )
-        self._started_itself = False
+            raise unreadable(error) from error
+        self.failure: Exception | None = None
+        self.is_over = False
+        self.values = SimpleNamespace()
+        self._is_configured = self._is_running = self._started_itself = False
+        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._made_before: set[object] = set()
         manager = next(each for each in self.services if each.srv_type is ChangeState)
         self._change_state, manager.callback = manager.callback, self._on_change_state
-        self.failure: Exception | None = None
-        self._running = False
-        self._made_before: set[object] = set()
+        self.autostart = bool(self._declared(AUTOSTART))
         try:
-            self.read_parameters()
+            self._read()
         except NlsidError as error:
             if self.autostart:
                 raise
             self.get_logger().warning(f"cannot be configured as it is: {error}")
+        self.add_on_set_parameters_callback(self._on_parameters)
 
     def read_parameters(self) -> None:
-        """Declare the parameters and take their values; called again when it is configured."""
+        """Check `values`, and derive from them what is not read as it is."""
 
     def prepare(self) -> None:
         """Check whatever can be checked before starting: files, names."""
@@ -112,16 +145,51 @@ class ManagedNode(LifecycleNode):
     def stop(self) -> None:
         """Finish: send the last command, close files."""
 
-    def tune(self, values: Mapping[str, Any]) -> None:
-        """Use these values of the tunable parameters from now on.
+    def tune(self, values: SimpleNamespace) -> None:
+        """Use these values of the parameters from now on; those that are not tunable are as before.
 
         Raises NlsidError or OSError to refuse them; all stays as it was then.
         """
 
-    def tunable(self) -> dict[str, Any]:
-        """The tunable parameters' values."""
-        tunable = (declared for declared in self.declared if declared.tunable)
-        return {d.name: _as_meant(d, self.get_parameter(d.name).value) for d in tunable}
+    def every(self, period: float, callback: Callable[[], None]) -> Timer:
+        """Make a timer on the wall's time, which also goes on while simulated time stands still."""
+        return self.create_timer(period, callback, clock=self.steady)
+
+    def later(self, callback: Callable[[], None], clock: Clock | None = None) -> Timer:
+        """Make a timer that waits to be armed (`arm`), on this clock or on the wall's time."""
+        timer = self.create_timer(1.0, callback, clock=clock or self.steady)
+        timer.cancel()
+        return timer
+
+    def serve(self, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+        """Make the service ~/name, which says whether it did it and what, or why it could not."""
+
+        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = answer()
+            except (NlsidError, OSError) as error:
+                response.success, response.message = False, str(error)
+            return response
+
+        self.create_service(Trigger, f"~/{name}", serve)
+
+    def keep_reporting(self, callback: Callable[[], None]) -> None:
+        """Make /diagnostics, and have `callback` `report` to it every second."""
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self.every(REPORT, callback)
+
+    def report(self, level: bytes, text: str, values: Mapping[str, str]) -> DiagnosticArray:
+        """Say how the node is; level: a constant of DiagnosticStatus. Return what was published.
+
+        The status has the node's name with its namespace, so that two robots' are told apart.
+        """
+        status = DiagnosticStatus(level=level, message=text, hardware_id=socket.gethostname())
+        status.name = self.get_fully_qualified_name().removeprefix("/")
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+        return message
 
     def signal_topic(self, topic: str) -> str:
         """Where a signal that a bag or a model calls `topic` is: in the node's namespace.
@@ -138,6 +206,10 @@ class ManagedNode(LifecycleNode):
             if transition() != TransitionCallbackReturn.SUCCESS and self.failure is not None:
                 raise self.failure
         self._started_itself = True
+
+    def end(self, failure: Exception | None = None) -> None:
+        """Have the process end, and fail if something failed."""
+        self.is_over, self.failure = True, failure
 
     def _on_change_state(
         self, request: ChangeState.Request, answer: ChangeState.Response
@@ -164,7 +236,7 @@ class ManagedNode(LifecycleNode):
         """Transition: unconfigured to inactive."""
 
         def configure() -> None:
-            self.read_parameters()
+            self._read()
             self.prepare()
             self._is_configured = True
 
@@ -174,14 +246,14 @@ class ManagedNode(LifecycleNode):
         """Transition: inactive to active."""
         self._made_before = set(self.entities())
         result = self._attempt(self.start)
-        self._running = result == TransitionCallbackReturn.SUCCESS
-        if not self._running:
+        self._is_running = result == TransitionCallbackReturn.SUCCESS
+        if not self._is_running:
             self._destroy_made()
         return result
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: active to inactive."""
-        self._running = self._started_itself = False
+        self._is_running = self._started_itself = False
         result = self._attempt(self.stop)
         self._destroy_made()
         return result
@@ -193,29 +265,45 @@ class ManagedNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: to finalized."""
-        return self.on_deactivate(state) if self._running else TransitionCallbackReturn.SUCCESS
+        return self.on_deactivate(state) if self._is_running else TransitionCallbackReturn.SUCCESS
 
     def destroy_node(self) -> None:
         """Stop, then destroy the node."""
-        if self._running:
-            self._running = False
+        if self._is_running:
+            self._is_running = False
             self.stop()
         super().destroy_node()
 
-    def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
-        values = self.tunable()
-        asked = {parameter.name: parameter.value for parameter in changed}
+    def _read(self) -> None:
+        """Take the parameters as they are now; DataError if they make no sense."""
+        read = {each.name: self._declared(each) for each in self.parameters}
+        self.values = SimpleNamespace(**read)
+        self.read_parameters()
+        self.tune(self.values)
+
+    def _declared(self, parameter: Parameter) -> Any:
+        """A parameter's value; it is declared with the first look at it."""
+        if not self.has_parameter(parameter.name):
+            try:
+                self.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+            except ParameterException as error:
+                raise DataError(f"{parameter.said}: {error}") from error
+        return parameter.meant(self.get_parameter(parameter.name).value)
+
+    def _on_parameters(self, changed: list[Given]) -> SetParametersResult:
+        rows = {each.name: each for each in (AUTOSTART, *self.parameters)}
         try:
-            for each in self.declared:
-                if each.name in asked:
-                    asked[each.name] = _as_meant(each, asked[each.name])
-            if not self._is_configured:
-                return SetParametersResult(successful=True)  # read when it is configured
-            if fixed := {d.name for d in self.declared} & asked.keys() - values.keys():
-                raise DataError(f"{', '.join(sorted(fixed))}: read when the node is configured")
-            if not asked.keys() & values.keys():
-                return SetParametersResult(successful=True)
-            self.tune({name: asked.get(name, value) for name, value in values.items()})
+            asked = {
+                each.name: rows[each.name].meant(each.value)
+                for each in changed
+                if each.name in rows
+            }
+            if asked and self._is_configured:
+                if fixed := sorted(name for name in asked if not rows[name].tunable):
+                    raise DataError(f"{', '.join(fixed)}: read when the node is configured")
+                values = SimpleNamespace(**vars(self.values) | asked)
+                self.tune(values)
+                self.values = values
         except (NlsidError, OSError) as refusal:
             return SetParametersResult(successful=False, reason=str(refusal))
         return SetParametersResult(successful=True)
@@ -225,7 +313,7 @@ class ManagedNode(LifecycleNode):
             try:
                 work()
             except NameValidationException as error:
-                raise _unreadable(error) from error
+                raise unreadable(error) from error
         except (NlsidError, OSError) as error:
             self.failure = error
             self.get_logger().error(str(error))
@@ -262,34 +350,32 @@ class ManagedNode(LifecycleNode):
         subscription.callback = _let_go
         return bool(super().destroy_subscription(subscription))
 
-    def destroy_timer(self, timer: Timer) -> bool:
-        """As rclpy does it; if it was due, it is no longer."""
-        timer.callback = _let_go
-        return bool(super().destroy_timer(timer))
-
-    def destroy_service(self, service: Service) -> bool:
-        """As rclpy does it; a request that had arrived stays without an answer."""
-        service.callback = _let_go  # type: ignore[assignment]
-        service.send_response = _let_go  # type: ignore[assignment, method-assign]
-        return bool(super().destroy_service(service))
-
-    def entities(self) -> list[object]:
+    def entities(self) -> list[Any]:
         """Everything the node communicates with, and its timers."""
-        kinds = (self.publishers, self.subscriptions, self.services, self.timers, self.clients)
+        kinds = (self.timers, self.subscriptions, self.services, self.clients, self.publishers)
         return [entity for kind in kinds for entity in kind]
 
     def _destroy_made(self) -> None:
-        destroy: tuple[tuple[Iterable[Any], Callable[[Any], bool]], ...] = (
-            (self.timers, self.destroy_timer),
-            (self.subscriptions, self.destroy_subscription),
-            (self.services, self.destroy_service),
-            (self.clients, self.destroy_client),
-            (self.publishers, self.destroy_publisher),
+        """Destroy what `start` made; a request that had arrived stays without an answer."""
+        made = [each for each in self.entities() if each not in self._made_before]
+        destroy: tuple[tuple[list[Any], Callable[[Any], bool]], ...] = (
+            (list(self.timers), self.destroy_timer),
+            (list(self.subscriptions), self.destroy_subscription),
+            (list(self.services), self.destroy_service),
+            (list(self.clients), self.destroy_client),
+            (list(self.publishers), self.destroy_publisher),
         )
         for entities, remove in destroy:
-            for entity in list(entities):
-                if entity not in self._made_before:
+            for entity in entities:
+                if entity in made:
+                    entity.callback = entity.send_response = _let_go
                     remove(entity)
+
+
+def arm(timer: Timer, ahead_ns: int) -> None:
+    """Have a timer call back after so many ns, and again, until it is cancelled."""
+    timer.timer_period_ns = ahead_ns
+    timer.reset()
 
 
 def _let_go(*_given: object) -> None:
@@ -298,168 +384,8 @@ def _let_go(*_given: object) -> None:
     """
 
 
-def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
-    """`run_all` of one node, which takes `args`."""
-    run_all([make], args)
-
-
-def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) -> None:
-    """Make the nodes, start each that starts itself, and spin until SIGINT, SIGTERM
-    or SIGHUP (a terminal that is closed, unless `nohup` says that it does not matter).
-
-    The signals are waited for here and not left to rclpy, which would end all communication before
-    the node could send a last command. Raises what made the node fail to start.
-    """
-    woken = _wake_on_signals()
-    shared_memory.avoid_what_is_stale()
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        raise _unreadable(error) from error
-    nodes: list[ManagedNode] = []
-    try:
-        for make in makes:
-            nodes.append(make())
-            if nodes[-1].autostart:
-                nodes[-1].start_itself()
-        gc.collect()
-        gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        with _watched(nodes):
-            _spin_until_signalled(nodes, woken)
-    finally:
-        with ExitStack() as ending:  # each is stopped, also if another cannot be
-            ending.callback(try_shutdown)
-            for node in reversed(nodes):
-                ending.callback(node.destroy_node)
-
-
-@contextmanager
-def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
-    """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
-    if not all(node.is_watched for node in nodes):
-        yield
-        return
-    names = ", ".join(node.get_name() for node in nodes)
-    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
-        try:
-            yield
-        finally:
-            watching.kill()
-
-
-def _unreadable(error: Exception) -> DataError:
+def unreadable(error: Exception) -> DataError:
     """What ROS cannot use of arguments or names, without where its code says so."""
     said = str(error).partition(". Error:")[0].partition(", at /")[0]
     hint = "; a namespace begins with a slash: /robot1" if "__ns" in said else ""
     return DataError(f"ROS refuses: {' '.join(said.split())}{hint}")
-
-
-def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
-    """What had arrived when the signal came is still handed on.
-
-    By `spin_once` with a timeout: without one the executor hears nothing.
-    """
-    executor = EventsExecutor()
-    for node in nodes:
-        executor.add_node(node)
-    asked = threading.Event()
-
-    def wait() -> None:
-        woken.recv(1)
-        executor.create_task(asked.set)  # goes to the end of the queue
-
-    threading.Thread(target=wait, daemon=True).start()
-    while not asked.is_set():
-        executor.spin_once(timeout_sec=0.1)
-
-
-def _wake_on_signals() -> socket.socket:
-    """A socket that gets a byte at once when a stop signal comes, whatever Python is waiting in."""
-    receiver, sender = socket.socketpair()
-    sender.setblocking(False)
-    signal.set_wakeup_fd(sender.detach())
-    for number in STOP_SIGNALS:
-        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda _number, _frame: None)
-    return receiver
-
-
-def declare(
-    node: Node,
-    name: str,
-    default: Value,
-    description: str,
-    *,
-    between: tuple[float, float] | None = None,
-    tunable: bool = False,
-    several: bool = False,
-) -> Value:
-    """Declare a parameter with its description and range, once, and return its value.
-
-    Of a ManagedNode it can be changed while the node is unconfigured, and while it runs only if
-    `tunable`: `ManagedNode.tune` is told then. several: a list of numbers is taken, too.
-
-    The default's type is the parameter's, and 2 is taken where 2.0 is meant. Raises DataError if
-    the value given has another type or is out of range.
-    """
-    declared = Declared(name, default, description, between, tunable, several)
-    if node.has_parameter(name):
-        return _as_meant(declared, node.get_parameter(name).value)
-    is_fixed = not isinstance(node, ManagedNode)
-    descriptor = ParameterDescriptor(name=name, description=description, read_only=is_fixed)
-    descriptor.dynamic_typing = isinstance(default, float)  # or ROS would refuse 2 for 2.0
-    if between is not None:
-        lo, hi = between
-        if isinstance(default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(lo), to_value=int(hi))]
-        else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=lo, to_value=hi)]
-    try:
-        given = node.declare_parameter(name, default, descriptor).value
-    except ParameterException as error:
-        raise DataError(f"parameter {name} ({description}): {error}") from error
-    if isinstance(node, ManagedNode | PlainNode):
-        node.declared.append(declared)
-    return _as_meant(declared, given)
-
-
-def _as_meant(declared: Declared, given: Any) -> Value:
-    """A number as float where one is meant; DataError if it is none or is out of range."""
-    value: Value = given
-    if not isinstance(declared.default, float):
-        return value
-    what = f"parameter {declared.name} ({declared.description})"
-    if declared.several and isinstance(given, array | list | tuple) and len(given):
-        return [_a_number(declared, what, each) for each in given]
-    return _a_number(declared, what, given)
-
-
-def _a_number(declared: Declared, what: str, given: Any) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float):
-        raise DataError(f"{what}: {given!r} is not a number")
-    if declared.between is not None and not declared.between[0] <= given <= declared.between[1]:
-        raise DataError(f"{what}: {given} is not in [{declared.between[0]}, {declared.between[1]}]")
-    return float(given)
-
-
-def declare_number(
-    node: Node,
-    name: str,
-    default: float,
-    description: str,
-    *,
-    between: tuple[float, float],
-    tunable: bool = False,
-) -> float:
-    """`declare` for a float parameter."""
-    value = declare(node, name, float(default), description, between=between, tunable=tunable)
-    assert isinstance(value, float)
-    return value
-
-
-def declare_text(
-    node: Node, name: str, default: str, description: str, *, tunable: bool = False
-) -> str:
-    """`declare` for a string parameter."""
-    return str(declare(node, name, default, description, tunable=tunable))

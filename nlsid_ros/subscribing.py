@@ -1,12 +1,12 @@
-"""Topics asked for by name or pattern, subscribed to as their publishers appear."""
+"""Subscriptions that follow their publishers: one topic's, and those of a recorder by pattern."""
 
 import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -15,12 +15,14 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile, profile_of
+from bags.signals.arrivals import Sequence
 from nlsid_core.errors import NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.message_classes import message_class
+from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
 from nlsid_ros.type_descriptions import TypeDescriptions
 
-Received = Callable[[bytes, dict[str, int]], None]
+Received = Callable[[Any, dict[str, int]], None]
 STREAMED = 10  # messages, after which a topic's pace is known
 OVERDUE = 5.0  # times the longest time between two messages of a topic
 SHARED = {"diagnostic_msgs/msg/DiagnosticArray", "visualization_msgs/msg/Marker"}  # by many nodes
@@ -56,7 +58,7 @@ class Informed:
 
     __signature__ = inspect.signature(lambda _message, _info: None)  # rclpy asks it for how many
 
-    def __init__(self, callback: Callable[[Any, dict[str, int]], None]) -> None:
+    def __init__(self, callback: Received) -> None:
         self._callback = callback
 
     def __call__(self, *arrived: Any) -> None:
@@ -93,31 +95,135 @@ class Silence:
         return past > max(graph.SILENT, OVERDUE * self._longest)
 
 
-@dataclass
+class Topic:
+    """A topic's subscription, as its publishers offer it, and what is known of what comes.
+
+    publishers: those of the type that is subscribed to. silence, numbers: of its messages, noted by
+    whoever hears them. frame: the one that its messages have to be in; None: that of the next.
+    anew: which publisher made it be subscribed to anew.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        callback: Received,
+        profile: QoSProfile = qos.STREAM,
+        *,
+        raw: bool = False,
+    ) -> None:
+        self.name, self.profile, self.kind, self.anew = name, profile, "", ""
+        self.publishers: list[TopicEndpointInfo] = []
+        self.silence, self.numbers = Silence(), Sequence()
+        self.frame: str | None = None
+        self._node, self._raw, self._callback = node, raw, Informed(callback)
+        self._subscription: Subscription | None = None
+
+    def look(self, kind: str, found: list[TopicEndpointInfo] | None = None) -> None:
+        """Subscribe with this type, and anew where it or what its publishers offer has changed.
+
+        found: the topic's publishers, if they are known. Raises BagError if there is no such type.
+        """
+        if found is None:
+            found = self._node.get_publishers_info_by_topic(self.name)
+        self.publishers = [each for each in found if each.topic_type == kind]
+        wanted = qos.following(self.profile, [each.qos_profile for each in self.publishers])
+        if self._subscription is not None:
+            if (kind, wanted) == (self.kind, self.profile):
+                return
+            self._say_anew()
+            self._node.destroy_subscription(self._subscription)
+        else:
+            self.silence = Silence()
+        self._subscription = self._node.create_subscription(
+            message_class(kind), self.name, self._callback, wanted, raw=self._raw
+        )
+        self.kind, self.profile = kind, wanted
+
+    def drop(self) -> None:
+        """Unsubscribe."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+
+    @property
+    def several(self) -> str:
+        """Why nobody knows whose messages come: there are several publishers; else empty."""
+        return graph.several(self.name, self.publishers)
+
+    @property
+    def unheard(self) -> str:
+        """Who publishes without being heard, for longer than is usual; else empty."""
+        return graph.unheard(self.name, self.publishers) if self.silence.is_odd else ""
+
+    @property
+    def alternating(self) -> str:
+        """Whether the messages' numbers are those of several publishers, in turn; else empty."""
+        turns = self.numbers.alternates
+        return f"messages of several publishers come in turn on {self.name}" if turns else ""
+
+    def distrust(self, message: Any, most: float) -> str:
+        """Why a response is not to be trusted though its number could be; empty if it is.
+
+        most: s that its stamp may be off this node's clock.
+        """
+        frame = frame_of(message)
+        if self.frame is None:
+            self.frame = frame
+        if frame != self.frame:
+            return f"the response is in frame '{frame}', not in '{self.frame}'"
+        return off_clock(stamp_ns_of(message), self._node.get_clock(), most)
+
+    def _say_anew(self) -> None:
+        self.anew = "; ".join(
+            f"{self.name}: {graph.names([publisher])} came later and offers less ({why}): "
+            "subscribed to anew"
+            for publisher in self.publishers
+            if (why := graph.mismatch(publisher.qos_profile, self.profile))
+        )
+        said = f"{self.name} is subscribed to anew, as {graph.names(self.publishers)} offers it"
+        self._node.get_logger().warning(self.anew or said)
+
+
+class Recording(Protocol):
+    """What becomes of a recorder's topics."""
+
+    def expect(self, topic: str) -> None:
+        """A topic is to be recorded, as soon as somebody publishes it."""
+
+    def begin(self, topic: str, definition: Definition, offered: tuple[Profile, ...]) -> Received:
+        """A topic's type is known, and what its publishers offered; what takes its messages."""
+
+    def lose(self, topic: str, count: int) -> None:
+        """So many messages on a topic came and could not wait."""
+
+
 class Source:
     """A topic's serialised messages with what the middleware says of each, as they came.
 
     They wait, as many as its quality of service keeps, until there is a callback and `take`.
 
-    lost: those that did not wait until the callback was there; later ones are missing in the
-    publisher's count of what it sent. followed: why it was subscribed to anew.
+    type_hash, offered: of the publishers that it was found by. lost: those messages that did not
+    wait until the callback was there; later ones are missing in the publisher's count of what it
+    sent.
 
     The middleware's own event of lost messages is not asked for: rclpy takes it under a lock that
     Fast DDS holds while it tells of the next one, and both wait for ever.
     """
 
-    msgtype: str
-    profile: QoSProfile
-    callback: Received | None = None
-    subscription: Subscription | None = None
-    lost: int = 0
-    followed: str = ""
-    _waiting: deque[tuple[bytes, dict[str, int]]] = field(default_factory=deque)
-    silence: Silence = field(default_factory=Silence)
+    def __init__(
+        self, node: Node, name: str, msgtype: str, publishers: list[TopicEndpointInfo]
+    ) -> None:
+        self.topic = Topic(node, name, self._keep, qos.RECORDED, raw=True)
+        self.topic.look(msgtype, publishers)
+        self.type_hash = str(publishers[0].topic_type_hash)
+        self.offered = tuple(profile_of(publisher.qos_profile) for publisher in publishers)
+        self.callback: Received | None = None
+        self.lost = 0
+        self._waiting: deque[tuple[bytes, dict[str, int]]] = deque()
 
-    def keep(self, data: bytes, info: dict[str, int]) -> None:
+    def _keep(self, data: bytes, info: dict[str, int]) -> None:
         """Keep a message until `take`."""
-        if len(self._waiting) >= self.profile.depth:
+        if len(self._waiting) >= self.topic.profile.depth:
             self._waiting.popleft()
             self.lost += self.callback is None
         self._waiting.append((data, info))
@@ -125,166 +231,100 @@ class Source:
     def take(self) -> None:
         """Call back for every message that waits."""
         if self._waiting:
-            self.silence.end(len(self._waiting))
-        if self.callback is None:
-            return
-        while self._waiting:
+            self.topic.silence.end(len(self._waiting))
+        while self._waiting and self.callback is not None:
             self.callback(*self._waiting.popleft())
 
-
-class _Undefined(NamedTuple):
-    source: Source
-    type_hash: str
-    offered: tuple[Profile, ...]
-
-
-@dataclass
-class Listener:
-    """What becomes of the topics: all called with the topic's name first."""
-
-    expect: Callable[[str], None]
-    begin: Callable[[str, Definition, tuple[Profile, ...]], Received]
-    lose: Callable[[str, int], None]
+    def odd(self) -> str:
+        """Ask for what the publishers offer now; what is odd about them."""
+        self.topic.look(self.topic.kind)
+        said = [self.topic.anew, self.topic.unheard]
+        if _has_one_publisher(self.topic.kind):
+            said.append(self.topic.several)
+        return "; ".join(filter(None, said))
 
 
-@dataclass
 class Subscriptions:
     """Call `look` and `take` now and then, `follow` about every second.
 
     problems: why a topic is not recorded as wanted. warnings: what is odd about one that is.
     """
 
-    node: Node
-    types: TypeDescriptions
-    listener: Listener
-    problems: dict[str, str] = field(default_factory=dict)
-    warnings: dict[str, str] = field(default_factory=dict)
-    _waiting: dict[str, str] = field(default_factory=dict)
-    _patterns: list[str] = field(default_factory=list)
-    _undefined: dict[str, _Undefined] = field(default_factory=dict)
-    _sources: dict[str, Source] = field(default_factory=dict)
-    _known: set[str] = field(default_factory=lambda: set(UNASKED))
-
-    def want(self, wanted: Iterable[Wanted]) -> None:
-        """Wait for these."""
+    def __init__(
+        self,
+        node: Node,
+        types: TypeDescriptions,
+        recording: Recording,
+        wanted: Iterable[Wanted],
+    ) -> None:
+        self.problems: dict[str, str] = {}
+        self.warnings: dict[str, str] = {}
+        self._node, self._types, self._recording = node, types, recording
+        self._patterns = [each.topic for each in wanted if each.is_pattern]
+        self._waiting: dict[str, str] = {}
+        self._sources: dict[str, Source] = {}
+        self._known = set(UNASKED)
         for each in wanted:
-            if each.is_pattern:
-                self._patterns.append(each.topic)
-            else:
+            if not each.is_pattern:
                 self._expect(each.topic, each.msgtype)
 
     def look(self) -> None:
         """Subscribe to topics that have publishers now; begin those whose type is defined."""
-        for topic, _ in self.node.get_topic_names_and_types() if self._patterns else ():
+        for topic, _ in self._node.get_topic_names_and_types() if self._patterns else ():
             if topic not in self._known and any(fnmatchcase(topic, p) for p in self._patterns):
                 self._expect(topic, "")
         for topic in list(self._waiting):
-            self._subscribe(topic)
-        for topic in list(self._undefined):
-            self._define(topic)
+            if publishers := self._node.get_publishers_info_by_topic(topic):
+                self._attempt(topic, partial(self._subscribe, topic, publishers))
+        for topic, source in list(self._sources.items()):
+            if source.callback is None:
+                self._attempt(topic, partial(self._begin, topic, source))
 
     def take(self) -> None:
         """Hand on what has come."""
         for topic, source in self._sources.items():
             source.take()
             if source.lost:
-                self.listener.lose(topic, source.lost)
+                self._recording.lose(topic, source.lost)
                 source.lost = 0
 
     def follow(self) -> None:
         """Ask for what the publishers offer now, and say what is odd about a topic."""
-        self.warnings.clear()
-        for topic, source in self._sources.items():
-            publishers = [
-                publisher
-                for publisher in self.node.get_publishers_info_by_topic(topic)
-                if publisher.topic_type == source.msgtype
-            ]
-            self._match(topic, source, publishers)
-            said = [source.followed]
-            if source.silence.is_odd:
-                said.append(graph.unheard(topic, publishers))
-            if _has_one_publisher(source):
-                said.append(graph.several(topic, publishers))
-            if text := "; ".join(filter(None, said)):
-                self.warnings[topic] = text
-
-    def _match(self, topic: str, source: Source, publishers: list[TopicEndpointInfo]) -> None:
-        """Subscribe anew where the quality of service is not what the publishers offer now."""
-        assert source.subscription is not None
-        wanted = qos.following(source.profile, [p.qos_profile for p in publishers])
-        if not publishers or wanted == source.profile:
-            return
-        source.followed = "; ".join(
-            f"{topic}: {graph.names([publisher])} came later and offers less ({why}): subscribed "
-            "to anew"
-            for publisher in publishers
-            if (why := graph.mismatch(publisher.qos_profile, source.profile))
-        )
-        self.node.get_logger().warning(source.followed or f"{topic} is subscribed to anew")
-        kind = source.subscription.msg_type
-        self.node.destroy_subscription(source.subscription)
-        source.profile = wanted
-        source.subscription = self.node.create_subscription(
-            kind, topic, Informed(source.keep), wanted, raw=True
-        )
+        said = {topic: source.odd() for topic, source in self._sources.items()}
+        self.warnings = {topic: text for topic, text in said.items() if text}
 
     def drop_all(self) -> None:
         """Unsubscribe from everything."""
-        for topic in list(self._sources):
-            self._drop(topic)
-
-    def _drop(self, topic: str) -> None:
-        subscription = self._sources.pop(topic).subscription
-        if subscription is not None:
-            self.node.destroy_subscription(subscription)
+        for source in self._sources.values():
+            source.topic.drop()
+        self._sources.clear()
 
     def _expect(self, topic: str, msgtype: str) -> None:
         self._waiting[topic] = msgtype
         self._known.add(topic)
-        self.listener.expect(topic)
+        self._recording.expect(topic)
 
-    def _subscribe(self, topic: str) -> None:
-        publishers = self.node.get_publishers_info_by_topic(topic)
-        if not publishers:
-            return
+    def _subscribe(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
         msgtype = self._waiting.pop(topic) or publishers[0].topic_type
+        self._sources[topic] = Source(self._node, topic, msgtype, publishers)
+
+    def _begin(self, topic: str, source: Source) -> None:
+        definition = self._types.find(source.topic.kind, source.type_hash)
+        if definition is not None:
+            source.callback = self._recording.begin(topic, definition, source.offered)
+
+    def _attempt(self, topic: str, work: Callable[[], None]) -> None:
+        """Do it, or give up recording the topic, and say why."""
         try:
-            kind = message_class(msgtype)
+            work()
         except NlsidError as error:
-            self._refuse(topic, error)
-            return
-        profile = qos.recording_of([publisher.qos_profile for publisher in publishers])
-        source = self._sources[topic] = Source(msgtype, profile)
-        source.subscription = self.node.create_subscription(
-            kind, topic, Informed(source.keep), profile, raw=True
-        )
-        self._undefined[topic] = _Undefined(
-            source,
-            str(publishers[0].topic_type_hash),
-            tuple(profile_of(publisher.qos_profile) for publisher in publishers),
-        )
-
-    def _define(self, topic: str) -> None:
-        found = self._undefined[topic]
-        try:
-            definition = self.types.find(found.source.msgtype, found.type_hash)
-            if definition is None:
-                return
-            found.source.callback = self.listener.begin(topic, definition, found.offered)
-        except NlsidError as error:
-            self._drop(topic)
-            self._refuse(topic, error)
-        del self._undefined[topic]
-
-    def _refuse(self, topic: str, error: NlsidError) -> None:
-        self.problems[topic] = str(error)
-        self.node.get_logger().error(f"{topic} is not recorded: {error}")
+            if topic in self._sources:
+                self._sources.pop(topic).topic.drop()
+            self.problems[topic] = str(error)
+            self._node.get_logger().error(f"{topic} is not recorded: {error}")
 
 
-def _has_one_publisher(source: Source) -> bool:
-    """Whether the topic is one robot's signal: stamped, and not of a kind that many nodes share."""
-    assert source.subscription is not None
-    kind: Any = source.subscription.msg_type
-    fields = kind.get_fields_and_field_types()
-    return "header" in fields and source.msgtype not in SHARED
+def _has_one_publisher(kind: str) -> bool:
+    """Whether a topic is one robot's signal: stamped, and not of a kind that many nodes share."""
+    fields = message_class(kind).get_fields_and_field_types()
+    return "header" in fields and kind not in SHARED

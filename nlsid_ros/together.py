@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from nlsid_core.errors import DataError, NlsidError
-from nlsid_ros.running import ManagedNode, run_all
+from nlsid_ros.running import ManagedNode
+from nlsid_ros.starting import run_all
 
 NODES = {
     "tracking_controller": "TrackingController",
@@ -25,7 +26,14 @@ NODES = {
     "viewer": "Viewer",
     "model_identifier": "ModelIdentifier",
     "funnel_publisher": "FunnelPublisher",
+    "bag_player": "BagPlayer",
 }  # in the order in which they start, and end
+
+
+def node_class(name: str) -> type[ManagedNode]:
+    """The class of a node of NODES."""
+    found: type[ManagedNode] = getattr(importlib.import_module(f"nlsid_ros.{name}"), NODES[name])
+    return found
 
 
 def makers(commands: Sequence[Sequence[str]]) -> list[Callable[[], ManagedNode]]:
@@ -33,11 +41,10 @@ def makers(commands: Sequence[Sequence[str]]) -> list[Callable[[], ManagedNode]]
     order = list(NODES)
     if unknown := {name for name, *_ in commands} - set(order):
         raise DataError(f"{', '.join(sorted(unknown))}: not one of {', '.join(order)}")
-    made: list[Callable[[], ManagedNode]] = []
-    for name, *arguments in sorted(commands, key=lambda command: order.index(command[0])):
-        module = importlib.import_module(f"nlsid_ros.{name}")
-        made.append(partial(getattr(module, NODES[name]), arguments))
-    return made
+    return [
+        partial(node_class(name), arguments)
+        for name, *arguments in sorted(commands, key=lambda command: order.index(command[0]))
+    ]
 
 
 def main() -> None:

@@ -9,20 +9,14 @@ second and into the bag's metadata.
 own.
 """
 
-import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.recordings.definitions import Definition, read_definitions
@@ -36,80 +30,46 @@ from bags.signals.recording import Recording
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
-from nlsid_ros.subscribing import Listener, Received, Subscriptions, Wanted
+from nlsid_ros.running import ManagedNode, Parameter
+from nlsid_ros.starting import entry_point
+from nlsid_ros.subscribing import Received, Subscriptions, Wanted
 from nlsid_ros.type_descriptions import TypeDescriptions
 
-NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
-REPORT = 1.0  # s between diagnostics
-EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said it did
+SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
+EXPERIMENT = "experiment"  # and the custom datum that holds it
 
 
 class TrajectoryRecorder(ManagedNode):
     """Records topics into one new bag after another."""
 
+    name = "trajectory_recorder"
     is_watched = True
-
-    def __init__(self, arguments: Arguments = None) -> None:
-        super().__init__(NAME, arguments)
-        self._bags = 0
+    parameters = (
+        Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
+        Parameter("bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"),
+        Parameter("at_once", True, "begin a bag when activated; false: wait for ~/start"),
+        Parameter("compression", "zstd", "of the chunks, one of " + ", ".join(COMPRESSIONS)),
+        Parameter("split_size", 0.0, "MB after which a new file begins; 0: never", (0.0, 1e6)),
+        Parameter("split_time", 0.0, "s after which a new file begins; 0: never", (0.0, 1e6)),
+        Parameter("chunk_period", 0.5, "s of messages a kill may lose", (0.05, 0.9)),
+        Parameter("least_free", 200.0, "MB left on the disk at which recording stops", (0.0, 1e12)),
+        Parameter("snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", (0.0, 600.0)),
+        Parameter("repair", True, "finish unfinished bags beside the new one first"),
+        Parameter("definitions", [""], ".msg files and packages' share folders of custom types"),
+        Parameter("config", "", "a robot's configuration: its signals' topics are recorded too"),
+    )
+    _bags = 0
 
     def read_parameters(self) -> None:
-        """Declare them; take the values that they have now."""
-        topics: Any = declare(
-            self, "topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"
-        )
-        number = partial(declare_number, self)
-        self._name = declare_text(
-            self, "bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"
-        )
-        self._at_once = bool(
-            declare(self, "at_once", True, "begin a bag when activated; false: wait for ~/start")
-        )
-        self._compression = declare_text(
-            self, "compression", "zstd", "of the chunks, one of " + ", ".join(COMPRESSIONS)
-        )
-        self._split_size = number(
-            "split_size", 0.0, "MB after which a new file begins; 0: never", between=(0.0, 1e6)
-        )
-        self._split_time = number(
-            "split_time", 0.0, "s after which a new file begins; 0: never", between=(0.0, 1e6)
-        )
-        self._period = number(
-            "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 0.9)
-        )
-        self._least_free = number(
-            "least_free",
-            200.0,
-            "MB left on the disk at which recording stops",
-            between=(0.0, 1e12),
-        )
-        self._snapshot = number(
-            "snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", between=(0.0, 600.0)
-        )
-        self._repair = bool(
-            declare(self, "repair", True, "finish unfinished bags beside the new one first")
-        )
-        given: Any = declare(
-            self, "definitions", [""], ".msg files and packages' share folders of custom types"
-        )
-        self._said_by = declare_text(
-            self,
-            "experiment",
-            "excitation/experiment",
-            "topic whose JSON goes into the bag's metadata; empty: none",
-        )
-        config = declare_text(
-            self, "config", "", "a robot's configuration: its signals' topics are recorded too"
-        )
-        self._given = [Path(path) for path in given if path]
-        entries = [entry for entry in topics if entry]
-        if config:
-            settings = load_config(Path(config))
+        """Find what is to be recorded; DataError if that is nothing."""
+        values = self.values
+        self._given = [Path(path) for path in values.definitions if path]
+        entries = [entry for entry in values.topics if entry]
+        if values.config:
+            settings = load_config(Path(values.config))
             entries += [self.signal_topic(topic) for topic in settings.signals.topics]
             self._given += settings.definitions
         parsed = [Wanted.parse(entry, self.get_namespace()) for entry in entries]
@@ -121,18 +81,16 @@ class TrajectoryRecorder(ManagedNode):
 
     def prepare(self) -> None:
         """Finish what a killed recorder left, and refuse what could not be recorded."""
-        if self._compression not in COMPRESSIONS:
-            raise DataError(
-                f"compression is '{self._compression}'; it should be one of "
-                + ", ".join(COMPRESSIONS)
-            )
+        compression, known = self.values.compression, ", ".join(COMPRESSIONS)
+        if compression not in COMPRESSIONS:
+            raise DataError(f"compression is '{compression}'; it should be one of {known}")
         for wanted in self._wanted:
             if wanted.is_pattern and wanted.msgtype:
                 raise DataError("a pattern cannot have a type; topics found by it have their own")
             if wanted.msgtype:
                 message_class(wanted.msgtype)
         self._definitions = read_definitions(self._given)
-        for bag in unfinished_bags(Path(self._name).parent) if self._repair else []:
+        for bag in unfinished_bags(Path(self.values.bag).parent) if self.values.repair else []:
             try:
                 count = repair(bag)
             except (NlsidError, OSError) as error:
@@ -145,37 +103,27 @@ class TrajectoryRecorder(ManagedNode):
         self._expected: list[str] = []
         self._recorded: dict[str, Definition] = {}
         self._offered: dict[str, tuple[Profile, ...]] = {}
-        self._recent = Recent(self._snapshot) if self._snapshot else None
+        self._recent = Recent(self.values.snapshot) if self.values.snapshot else None
         self._snapshots = 0
         self._experiment: dict[str, str] = {}
         self._recording: Recording | None = None
         self._warned = ""
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._clock_of_log = LogClock()
-        if self._at_once:
+        if self.values.at_once:
             self._begin()
         else:
             self.get_logger().info("waiting for ~/start")
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._topics = Subscriptions(
-            self,
-            TypeDescriptions(self, self._definitions),
-            Listener(expect=self._expect, begin=self._begin_topic, lose=self._lose),
-        )
-        self._topics.want(self._wanted)
-        if self._said_by:
-            self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
-        wall = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulated time stands still
-        self.create_timer(WRITE, self._take, clock=wall)
-        self.create_timer(DISCOVERY, self._topics.look, clock=wall)
-        self.create_timer(self._period, self._keep_up, clock=wall)
-        self.create_timer(REPORT, self._report, clock=wall)
-        for name, serve in (
-            ("start", self._on_start),
-            ("stop", self._on_stop),
-            ("snapshot", self._on_snapshot),
-        ):
-            self.create_service(Trigger, f"~/{name}", _answering(serve))
+        self.keep_reporting(self._report)
+        types = TypeDescriptions(self, self._definitions)
+        self._topics = Subscriptions(self, types, self, self._wanted)
+        self.create_subscription(String, SAID_BY, self._on_experiment, qos.DOCUMENT)
+        self.every(WRITE, self._take)
+        self.every(DISCOVERY, self._topics.look)
+        self.every(self.values.chunk_period, self._keep_up)
+        self.serve("start", self._on_start)
+        self.serve("stop", self._on_stop)
+        self.serve("snapshot", self._on_snapshot)
         self._topics.look()
 
     def stop(self) -> None:
@@ -204,19 +152,19 @@ class TrajectoryRecorder(ManagedNode):
 
     def _begin(self) -> Path:
         """Open the next bag."""
-        name = self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S")
-        path = Path(name if not (self._name and self._bags) else f"{name}_{self._bags + 1}")
+        values = self.values
+        name = values.bag or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S")
+        path = Path(name if not (values.bag and self._bags) else f"{name}_{self._bags + 1}")
         writer = BagWriter(
             path,
             in_place=True,
-            max_chunk_age=self._period,
-            compression=self._compression,
-            split_bytes=round(self._split_size * 1e6) or None,
-            split_seconds=self._split_time or None,
+            compression=values.compression,
+            split_bytes=round(values.split_size * 1e6) or None,
+            split_seconds=values.split_time or None,
         )
         self._bags += 1
         self._ended = ""
-        self._recording = Recording(writer, least_free=self._least_free)
+        self._recording = Recording(writer, least_free=values.least_free)
         for topic in self._expected:
             self._recording.expect(topic)
         for topic, definition in self._recorded.items():
@@ -227,14 +175,14 @@ class TrajectoryRecorder(ManagedNode):
         )
         return path
 
-    def _expect(self, topic: str) -> None:
+    def expect(self, topic: str) -> None:
+        """Say what is missing while nobody publishes a topic."""
         self._expected.append(topic)
         if self._recording is not None:
             self._recording.expect(topic)
 
-    def _begin_topic(
-        self, topic: str, definition: Definition, offered: tuple[Profile, ...]
-    ) -> Received:
+    def begin(self, topic: str, definition: Definition, offered: tuple[Profile, ...]) -> Received:
+        """Take a topic's messages from now on."""
         if self._recording is not None:
             self._recording.add_topic(topic, definition, offered)
         self._recorded[topic], self._offered[topic] = definition, offered
@@ -256,7 +204,8 @@ class TrajectoryRecorder(ManagedNode):
         if self._recording is not None:
             self._recording.add(arrival, stamp_ns)
 
-    def _lose(self, topic: str, count: int) -> None:
+    def lose(self, topic: str, count: int) -> None:
+        """Count messages that could not wait."""
         if self._recording is not None:
             self._recording.lose(topic, count)
 
@@ -265,7 +214,7 @@ class TrajectoryRecorder(ManagedNode):
         try:
             said = files.parse_document(message.data)
         except NlsidError as error:
-            self.get_logger().warning(f"{self._said_by} is not in the bag's metadata: {error}")
+            self.get_logger().warning(f"{SAID_BY} is not in the bag's metadata: {error}")
             return
         ended = "ended" in said
         if ended and not self._experiment:  # latched, of an experiment before this recorder
@@ -307,7 +256,11 @@ class TrajectoryRecorder(ManagedNode):
             return False, "no snapshots are kept; set the parameter snapshot to seconds"
         self._take()
         self._snapshots += 1
-        base = self._recording.bag.path if self._recording is not None else Path(self._name or NAME)
+        base = (
+            self._recording.bag.path
+            if self._recording is not None
+            else Path(self.values.bag or self.name)
+        )
         path = base.with_name(f"{base.name}_snapshot_{self._snapshots}")
         count = self._recent.save(path, definitions=self._recorded, offered=self._offered)
         return True, f"{count} messages in {path}"
@@ -332,32 +285,10 @@ class TrajectoryRecorder(ManagedNode):
         if level == DiagnosticStatus.WARN and text != self._warned:
             self.get_logger().warning(text)
         self._warned = text
-        now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, text, values))
+        self.report(level, text, values)
 
 
-def _answering(
-    serve: Callable[[], tuple[bool, str]],
-) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
-    """A service that answers what `serve` returns or why it could not."""
-
-    def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.success, response.message = serve()
-        except (NlsidError, OSError) as error:
-            response.success, response.message = False, str(error)
-        return response
-
-    return answer
-
-
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid trajectory_recorder`."""
-    try:
-        run(TrajectoryRecorder, args)
-    except (NlsidError, OSError) as error:
-        sys.exit(f"{NAME}: {error}")
-
+main = entry_point(TrajectoryRecorder)
 
 if __name__ == "__main__":
     main()

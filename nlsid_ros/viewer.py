@@ -5,50 +5,42 @@ the margins as best effort, so that a slow viewer never holds up the monitor; wh
 monitor's word, while that is fresh (`bags.viewing.scene`).
 """
 
-import sys
 from contextlib import ExitStack
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 
 from bags.viewing.page import LOCAL, PORT, serve_page
 from bags.viewing.scene import Scene
-from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
+from nlsid_ros.running import ManagedNode, Parameter
+from nlsid_ros.starting import entry_point
 
-NAME = "viewer"
 NAMES = "signals"  # where the monitor's diagnostics name the measured signals, one a line
 
 
 class Viewer(ManagedNode):
     """Feeds a scene from what it hears; a server in threads of its own shows it."""
 
-    def __init__(self, arguments: Arguments = None) -> None:
-        super().__init__(NAME, arguments)
-        self._served = ExitStack()
-
-    def read_parameters(self) -> None:
-        """Declare them; take the values that they have now."""
-        self._monitor = declare_text(self, "monitor", "funnel_monitor", "node that is shown")
-        self._host = declare_text(
-            self, "host", LOCAL, "address to serve on; 0.0.0.0: the whole network"
-        )
-        port: Any = declare(self, "port", PORT, "port; 0: one that is free", between=(0, 65535))
-        self._port = port
+    name = "viewer"
+    parameters = (
+        Parameter("monitor", "funnel_monitor", "node that is shown"),
+        Parameter("host", LOCAL, "address to serve on; 0.0.0.0: the whole network"),
+        Parameter("port", PORT, "port; 0: one that is free", (0, 65535)),
+    )
 
     def start(self) -> None:
         """Listen, and serve."""
-        topic = self.resolve_topic_name(f"{self._monitor}/margin")
+        topic = self.resolve_topic_name(f"{self.values.monitor}/margin")
         self._shown = topic.removesuffix("/margin").removeprefix("/")
         self._scene = Scene(f"live: {self._shown}", self._shown)
         self.create_subscription(JointState, topic, self._on_margin, qos.SENSOR)
         ahead = f"/{self._shown}/forecast"
         self.create_subscription(JointState, ahead, self._on_forecast, qos.SENSOR)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, qos.EVENTS)
-        server = serve_page(self._scene, host=self._host, port=self._port)
+        server = serve_page(self._scene, host=self.values.host, port=self.values.port)
+        self._served = ExitStack()
         address = self._served.enter_context(server)
         self.get_logger().info(f"{self._shown} is shown at {address}")
 
@@ -76,13 +68,7 @@ class Viewer(ManagedNode):
             )
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of `ros2 run nlsid viewer`."""
-    try:
-        run(Viewer, args)
-    except (NlsidError, OSError) as error:
-        sys.exit(f"{NAME}: {error}")
-
+main = entry_point(Viewer)
 
 if __name__ == "__main__":
     main()

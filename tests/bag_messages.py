@@ -1,13 +1,17 @@
 """Serialised standard messages and small bags for the tests of bags."""
 
 from collections.abc import Container, Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
+from bags.tools.copying import Copied
+from bags.tools.edit import convert, stretch
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 25_000_000
@@ -91,3 +95,10 @@ def speed_bag(
             if k not in lost:
                 bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
     return path
+
+
+def converted(out: Path, *bags: Path, start: float = 0.0) -> Copied:
+    """A new bag of what was logged from `start` s on."""
+    with ExitStack() as stack:
+        opened = [stack.enter_context(Bag(bag)) for bag in bags]
+        return convert(opened, [stretch(opened, out, start, None)])

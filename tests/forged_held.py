@@ -40,14 +40,14 @@ def _bare(files: Files) -> None:
 
 
 HELD_FORGERIES: dict[str, tuple[Callable[[Files], None], str]] = {
-    "a longer hold": (_longer, "not positive"),
-    "a state that is measured worse": (_measured_worse, "not positive"),
-    "an input that turns more slowly": (_slower, "not positive"),
-    "a rate piece less": (_fewer, "a piece of interval .* is missing"),
-    "rates of one sign": (_one_way, "is missing"),
-    "a rate of 0": (_still, "hold and rates should be positive"),
-    "gains that jump at a knot": (_jumping, "the policy jumps at a knot"),
-    "rates and no hold": (_bare, "unknown member"),
+    "a longer hold": (_longer, "not_positive"),
+    "a state that is measured worse": (_measured_worse, "not_positive"),
+    "an input that turns more slowly": (_slower, "not_positive"),
+    "a rate piece less": (_fewer, "not_covered"),
+    "rates of one sign": (_one_way, "not_covered"),
+    "a rate of 0": (_still, "not_below"),
+    "gains that jump at a knot": (_jumping, "not_valid"),
+    "rates and no hold": (_bare, "malformed"),
 }
 
 

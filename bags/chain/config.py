@@ -1,6 +1,7 @@
 """The YAML configuration of one robot: which signals, which split, which model, which tube."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,7 +20,7 @@ from bags.chain.sections import (
     read_yaml,
 )
 from bags.signals.expressions import parse_factors
-from bags.signals.sampling import Sampler, sampled_path
+from bags.signals.sampling import Grid, Sampler
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.running.comparison import Centre
 
@@ -85,6 +86,10 @@ class GridConfig(Section):
             example=True,
         ),
     ] = False
+
+    def rules(self, clock: str) -> Grid:
+        """The same as the reader's noun, with the clock."""
+        return Grid(clock=clock, **self.model_dump())
 
 
 class SplitConfig(Section):
@@ -297,18 +302,11 @@ def refusals(config: Config) -> list[str]:
 
 def signal_texts(config: Config) -> tuple[list[str], list[str]]:
     """Responses and excitations as the steps read them, with clock, holding and resampling."""
-    grid, clock = config.grid, config.clock
+    rules = config.grid.rules(config.clock)
+    rules = replace(rules, hold=rules.hold or rules.max_gap)
     return (
-        [
-            sampled_path(
-                s.path, clock=clock, resample=grid.resample, max_gap=grid.max_gap, response=True
-            )
-            for s in config.signals.response
-        ],
-        [
-            sampled_path(s.path, clock=clock, hold=grid.hold or grid.max_gap, response=False)
-            for s in config.signals.excitation
-        ],
+        [rules.path(signal.path, response=True) for signal in config.signals.response],
+        [rules.path(signal.path, response=False) for signal in config.signals.excitation],
     )
 
 

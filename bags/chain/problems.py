@@ -11,6 +11,7 @@ import numpy as np
 
 from bags.monitoring.catching import Breaking, breaking
 from bags.signals.grid import read_dataset
+from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
@@ -29,7 +30,6 @@ MEMBERS = (
     "format",
     "version",
     "shape",
-    "gain",
     "vector_field",
     "nominal",
     "goal",
@@ -57,7 +57,6 @@ class FunnelProblem:
     R: FloatArray | None = None
     goal: Goal | None = None
     shape: str = "rho"
-    gain: str = "constant"
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
@@ -70,7 +69,6 @@ class FunnelProblem:
             "format": FORMAT,
             "version": files.VERSION,
             "shape": self.shape,
-            "gain": self.gain,
             "vector_field": self.field.document(),
             "nominal": {
                 "t": self.nominal.t.tolist(),
@@ -110,11 +108,7 @@ class FunnelProblem:
         hold = document.get("hold")
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
-        usual = {
-            "shape": "rho",
-            "gain": "constant",
-        }
-        words = usual | document
+        words = {"shape": "rho"} | document
         return cls(
             field,
             Nominal(*parts),
@@ -122,7 +116,6 @@ class FunnelProblem:
             _array(document, "R", (field.m, field.m), source),
             _goal(document, field.n, source),
             files.member(words, "shape", str, source=source),
-            files.member(words, "gain", str, source=source),
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
@@ -140,7 +133,6 @@ class FunnelProblem:
             shape=self.shape,  # type: ignore[arg-type]  # checked by the problem
             Q=self.Q,
             R=self.R,
-            gain=self.gain,
             limits=self.limits if len(self.limits) else None,
             hold=self.hold,
             error=self.error,
@@ -165,9 +157,8 @@ def measured(
     `read_dataset`, whose errors pass through.
     """
     problem = FunnelProblem.load(path)
-    trials = read_dataset(
-        bags, responses=responses, excitations=excitations, period=period, resample=resample
-    )
+    grid = Grid(period=period, resample=resample)
+    trials = read_dataset(bags, responses=responses, excitations=excitations, grid=grid)
     push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
     found = breaking(trials, lambda trial: push.used(problem.field, trial))
     return dataclasses.replace(problem, push=push), found

@@ -175,28 +175,18 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
 
 
 def read_signals_of(
-    bags: Sequence[Path],
-    config: Config,
-    *,
-    names: Sequence[str] | None = None,
-    progress: Progress = silent,
+    bags: Sequence[Path] | Mapping[str, Path], config: Config, *, progress: Progress = silent
 ) -> Dataset:
     """The configured signals of bags on the configured grid, with the configured names and units.
 
-    names: what the trials are called (None: as their bags are).
+    bags: by what the trials are called, which else is as their bags are.
     """
     responses, excitations = config.signals.response, config.signals.excitation
     dataset = read_dataset(
         bags,
         responses=[signal.path for signal in responses],
         excitations=[signal.path for signal in excitations],
-        names=names,
-        period=config.grid.period,
-        max_gap=config.grid.max_gap,
-        clock=config.clock,
-        resample=config.grid.resample,
-        hold=config.grid.hold,
-        split_gaps=config.grid.split_gaps,
+        grid=config.grid.rules(config.clock),
         definitions=read_definitions(config.definitions),
         progress=progress,
     )

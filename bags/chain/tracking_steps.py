@@ -30,7 +30,7 @@ from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress
-from nlsid_core.running.assumption import disturbance_of
+from nlsid_core.running.assumption import disturbance_of, meter_of
 from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Reading
 
@@ -42,12 +42,7 @@ def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
         bags,
         responses=[signal.path for signal in signals.states],
         excitations=[signal.path for signal in signals.inputs],
-        period=config.grid.period,
-        max_gap=config.grid.max_gap,
-        clock=config.clock,
-        resample=config.grid.resample,
-        hold=config.grid.hold,
-        split_gaps=config.grid.split_gaps,
+        grid=config.grid.rules(config.clock),
     )
     labelled = [
         replace(
@@ -179,20 +174,11 @@ def widest_start(made: TrackingDesign, runs: Dataset) -> float:
 
 def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
     """By fault, how many of these runs' copies that have it break the proof's assumption."""
-    funnel, a = made.funnel, made.funnel.assumption
+    meter = meter_of(made.funnel)
 
     def used(run: Trajectory) -> float:
-        sizes = disturbance_of(
-            made.model,
-            made.policy,
-            run,
-            S=funnel.S,
-            A=funnel.A,
-            form=a.form,
-            rate=a.rate,
-            gain=a.gain,
-        )
-        return float(np.max(sizes)) / a.bound
+        sizes = disturbance_of(made.model, made.policy, run, meter)
+        return float(np.max(sizes)) / made.funnel.assumption.bound
 
     return breaking(runs, used)
 

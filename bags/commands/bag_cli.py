@@ -49,14 +49,6 @@ class Format(StrEnum):
     PARQUET = "parquet"
 
 
-class Resampling(StrEnum):
-    """How a signal is put on a grid."""
-
-    LINEAR = "linear"
-    CUBIC = "cubic"
-    HOLD = "hold"
-
-
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
 SignalsOption = Annotated[
     list[str] | None,
@@ -123,22 +115,21 @@ def plot(
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
+    from bags.recordings.bag import Bag
     from bags.signals.reader import read_signals
+    from bags.signals.sampling import Grid
 
     if not report_available():
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
     drawn = signals or [signal for part in _likeliest([bag], definitions) for signal in part]
-    with progress_bar("reading", after=PROGRESS_AFTER) as progress:
-        samples = read_signals(
-            bag,
-            drawn,
-            clock=_clock(clock),
-            unfinished=unfinished,
-            definitions=_definitions(definitions),
-            progress=progress,
-        )
+    texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
+    with (
+        Bag(bag, unfinished=unfinished, definitions=_definitions(definitions)) as source,
+        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+    ):
+        samples = read_signals(source, texts, progress=progress)
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
 
@@ -224,9 +215,6 @@ def export_command(
     hold: Annotated[
         list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
     ] = None,
-    method: Annotated[
-        Resampling, typer.Option(help="Of the other signals, on the grid.")
-    ] = Resampling.LINEAR,
     max_gap: Annotated[
         float | None, typer.Option(help="s without a sample; default 1.5 periods.")
     ] = None,
@@ -238,44 +226,36 @@ def export_command(
 
     By default in the folder BAG_tables, or as the file BAG.csv.
     """
+    from bags.recordings.bag import Bag
+    from bags.signals.sampling import Grid
     from bags.tools import export
 
     named = Path(f"{bag.stem}.{form.value}") if period is not None else _beside(bag, "tables")
     target = target or named
-    if period is None:
-        with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
-            rows = export.export_topics(
-                bag,
-                target,
-                form=form.value,
-                signals=signals,
-                unfinished=unfinished,
-                definitions=_definitions(definitions),
-                progress=progress,
-            )
-        for file, count in rows.counts.items():
-            out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
-        for what in rows.left_out:
-            out.print(f"left out: {what}", soft_wrap=True, markup=False)
-        _say_notes(rows.notes)
-        return
-    if not signals:
-        raise BagError("a common grid needs to know which signals: --signal")
-    errors = export.export_grid(
-        bag,
-        target,
-        form=form.value,
-        signals=signals,
-        period=period,
-        method=method.value,
-        hold=hold or (),
-        max_gap=1.5 * period if max_gap is None else max_gap,
-        clock=clock.value,
-        unfinished=unfinished,
-        definitions=_definitions(definitions),
-    )
-    for name, error in errors.items():
-        out.print(f"{name}: off by at most {error:.2g}", soft_wrap=True, markup=False)
+    with Bag(bag, unfinished=unfinished, definitions=_definitions(definitions)) as source:
+        if period is None:
+            with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
+                rows = export.export_topics(
+                    source, target, form=form.value, signals=signals or (), progress=progress
+                )
+            for file, count in rows.counts.items():
+                out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+            for what in rows.left_out:
+                out.print(f"left out: {what}", soft_wrap=True, markup=False)
+            _say_notes(rows.notes)
+            return
+        if not signals:
+            raise BagError("a common grid needs to know which signals: --signal")
+        did = export.export_grid(
+            source,
+            target,
+            form=form.value,
+            signals=signals,
+            hold=hold or (),
+            grid=Grid(period=period, max_gap=max_gap, clock=clock.value),
+        )
+    for what in did:
+        out.print(what, soft_wrap=True, markup=False)
     out.print(f"wrote {target}", soft_wrap=True, markup=False)
 
 
@@ -300,44 +280,41 @@ def convert(
     Several are merged by log time. Parts are OUT_01, OUT_02, ... The default of --out is
     BAG_converted.
     """
+    from contextlib import ExitStack
+
+    from bags.recordings.bag import Bag
     from bags.recordings.folders import expand_bags
     from bags.tools import edit
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    is_part = bool(start or end is not None or topics)
-    is_split = every is not None or repeats is not None
-    if is_part + is_split + (len(folders) > 1) > 1:
-        raise DataError(
-            "one at a time: merge several bags, or take a stretch of one (--start, --end, "
-            "--topic), or cut one into parts (--every or --repeats)"
-        )
-    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
-        if is_split:
-            copied = edit.split(folders[0], target, repeats=repeats, every=every, progress=progress)
-        elif len(folders) > 1:
-            copied = edit.merge(folders, target, progress=progress)
+    if every is not None and repeats is not None:
+        raise DataError("parts begin every so many seconds or at repeats: --every or --repeats")
+    if (every is not None or repeats is not None) and (start or end is not None):
+        raise DataError("take the stretch first (--start, --end), then cut that into parts")
+    given = _definitions(definitions)
+    with ExitStack() as stack:
+        opened = [
+            stack.enter_context(Bag(folder, unfinished=unfinished, definitions=given))
+            for folder in folders
+        ]
+        if every is not None:
+            parts = edit.parts_every(opened, target, every)
+        elif repeats is not None:
+            parts = edit.parts_at_repeats(opened[0], target, repeats)
         else:
-            copied = edit.cut(
-                folders[0],
-                target,
-                start=start,
-                end=end,
-                topics=topics or None,
-                unfinished=unfinished,
-                definitions=_definitions(definitions),
-                progress=progress,
-            )
+            parts = [edit.stretch(opened, target, start, end)]
+        progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
+        copied = edit.convert(opened, parts, topics=topics or (), progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
-    if not copied.parts:
-        out.print(f"wrote {target}, {copied.messages} messages", soft_wrap=True, markup=False)
+    out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
     _say_notes(copied.notes)
 
 
 @bag_app.command("import")
 def import_command(
-    tables: Annotated[list[Path], typer.Argument(help="CSV or MAT files.")],
+    table: Annotated[Path, typer.Argument(help="A CSV file.")],
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
@@ -354,7 +331,8 @@ def import_command(
     ] = None,
     period: Annotated[float | None, typer.Option(help="s between rows.")] = None,
     time_column: Annotated[
-        str | None, typer.Option("--time", help="The column with the rows' times in s.")
+        str | None,
+        typer.Option("--time", help="The column with the rows' times, with its unit: t|unit(ms)."),
     ] = None,
     drop_repeats: Annotated[
         bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
@@ -364,27 +342,26 @@ def import_command(
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
 ) -> None:
-    """Write columns of tables as a bag of standard messages, named as the first table."""
-    from bags.tools.importing import every_column, import_tables, said_units
+    """Write columns of a table as a bag of standard messages, named as the table."""
+    from bags.tools.importing import Rows, every_column, import_table, said_units
 
     kinds = _pairs(types or (), "--type")
-    bag_out = bag_out or Path(tables[0].stem)
+    bag_out = bag_out or Path(table.stem)
+    rows = Rows(period, time_column, drop_repeats, round(start * 1e9))
     if not assignments:
-        time_column, assignments, numbers = every_column(tables, time_column, period)
+        rows, assignments, numbers = every_column(table, rows)
         kinds = numbers | kinds
-    counts = import_tables(
-        tables,
+    imported = import_table(
+        table,
         bag_out,
         assignments,
         types=kinds,
-        period=period,
-        time=time_column,
-        drop_repeats=drop_repeats,
-        start_ns=round(start * 1e9),
+        rows=rows,
         custom=_pairs(custom or (), "--custom"),
     )
-    listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())
+    listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
+    out.print(imported.times, soft_wrap=True, markup=False)
     if units := said_units(assignments, kinds):
         out.print(
             f"units by the message types, not by the table: {units}; where a column is in another, "
@@ -433,9 +410,3 @@ def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
             raise DataError(f"{option} {text}: expected key=value")
         pairs[key] = value
     return pairs
-
-
-def _clock(clock: Clock) -> str:
-    from bags.signals.reader import CLOCKS
-
-    return next(name for name in CLOCKS if name.startswith(clock.value))

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bags.tools.fitness import Fitness, Level
-from bags.tools.info import BagInfo
+from bags.tools.info import BagInfo, TopicInfo
 from bags.tools.listing import Listed
 
 WORDS = {Level.GOOD: "good", Level.LOOK: "look", Level.BAD: "bad"}
@@ -48,18 +48,18 @@ def show_info(console: Console, info: BagInfo) -> None:
             Text(topic.topic),
             Text(topic.msgtype.replace("/msg/", "/")),
             str(topic.count),
-            "-" if math.isnan(topic.rate) else f"{topic.rate:.4g} Hz",
-            topic.jitter,
-            str(topic.gaps) if topic.gaps else "-",
-            "-" if math.isnan(topic.longest) else f"{topic.longest:.3g} s",
+            "-" if math.isnan(topic.times.rate) else f"{topic.times.rate:.4g} Hz",
+            topic.times.jitter,
+            str(topic.times.gaps) if topic.times.gaps else "-",
+            "-" if math.isnan(topic.times.longest) else f"{topic.times.longest:.3g} s",
             _size(topic.size),
         )
     console.print(table)
     for topic in info.topics:
-        if topic.clock is not None:
-            latency, spread = 1e3 * topic.clock.latency, 1e3 * topic.clock.spread
-            clock = f"{topic.clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)"
-            _say(console, f"{topic.topic}: {clock}")
+        if topic.stamps is not None and (clock := topic.stamps.clock) is not None:
+            latency, spread = 1e3 * clock.latency, 1e3 * clock.spread
+            said = f"{clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)"
+            _say(console, f"{topic.topic}: {said}")
         for what in topic.odd:
             _say(console, f"{topic.topic}: {what}")
     for key, value in info.custom.items():
@@ -96,28 +96,30 @@ def info_json(info: BagInfo) -> str:
             "unfinished": info.ending,
             "not_as_stated": list(info.notes),
             "custom": dict(info.custom),
-            "topics": [
-                {
-                    "topic": topic.topic,
-                    "type": topic.msgtype,
-                    "count": topic.count,
-                    "size": topic.size,
-                    "rate": topic.rate,
-                    "gaps": topic.gaps,
-                    "longest_interval": topic.longest,
-                    "first_log_time_ns": topic.first_ns if topic.count else None,
-                    "last_log_time_ns": topic.last_ns if topic.count else None,
-                    "stamps_back": topic.backward,
-                    "stamps_repeated": topic.duplicates,
-                    "stamps_zero": topic.unstamped,
-                    "missing": topic.missing,
-                    "clock": None if topic.clock is None else asdict(topic.clock),
-                    "unreadable": topic.unreadable or None,
-                }
-                for topic in info.topics
-            ],
+            "topics": [_topic(topic) for topic in info.topics],
         }
     )
+
+
+def _topic(topic: TopicInfo) -> dict[str, object]:
+    stamps = topic.stamps
+    return {
+        "topic": topic.topic,
+        "type": topic.msgtype,
+        "count": topic.count,
+        "size": topic.size,
+        "rate": topic.times.rate,
+        "gaps": topic.times.gaps,
+        "longest_interval": topic.times.longest,
+        "first_log_time_ns": topic.times.first_ns if topic.count else None,
+        "last_log_time_ns": topic.times.last_ns if topic.count else None,
+        "stamps_back": stamps.backward if stamps else 0,
+        "stamps_repeated": stamps.duplicates if stamps else 0,
+        "stamps_zero": stamps is not None and stamps.clock is None,
+        "missing": topic.missing,
+        "clock": asdict(stamps.clock) if stamps and stamps.clock else None,
+        "unreadable": topic.unreadable or None,
+    }
 
 
 def signals_json(found: Sequence[Listed]) -> str:

@@ -194,8 +194,10 @@ def check(
     ] = False,
     seconds: Annotated[
         int, typer.Option(min=1, help="Processor time that a proof may take.")
-    ] = deciding.SECONDS,
-    memory: Annotated[int, typer.Option(min=1, help="MB that a proof may take.")] = deciding.MEMORY,
+    ] = deciding.USUAL.seconds,
+    memory: Annotated[
+        int, typer.Option(min=1, help="MB that a proof may take.")
+    ] = deciding.USUAL.memory,
 ) -> None:
     """Decide proofs without a solver: PROVED (status 0), or REJECTED (status 1).
 
@@ -210,8 +212,8 @@ def check(
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            at_work = deciding.Deciding(path, seconds=seconds, memory=memory, remembered=False)
-            said = str(at_work.wait())
+            limits = deciding.Limits(seconds, memory)
+            said = str(deciding.Deciding(path, limits, remembered=False).wait())
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
             provenance = of_proof(path)

@@ -45,14 +45,12 @@ def listen(bag: Path, seconds: float) -> Path:
             recorder.send_signal(signal.SIGINT)
         said = recorder.communicate(timeout=PATIENCE)[0]
     finally:
-        if recorder.poll() is None:
-            recorder.kill()
-            recorder.wait()
+        recorder.kill()  # nothing happens to one that has ended
+        recorder.wait()
     if recorder.returncode or not bag.is_dir():
         raise DataError(f"the recorder ended with status {recorder.returncode}: {said[-500:]}")
     with Bag(bag) as recorded:
-        others = [topic for topic in recorded.topics if not topic.startswith(OWN)]
-        if not any(recorded.count(topic) for topic in others):
+        if all(topic.startswith(OWN) or not recorded.count(topic) for topic in recorded.topics):
             raise BagError(
                 f"nothing was heard in {seconds:g} s; is the robot running, and is this its "
                 "ROS_DOMAIN_ID?"

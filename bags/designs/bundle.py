@@ -15,7 +15,7 @@ from bags.designs.design import AnyDesign, Wiring, read_design
 from bags.designs.provenance import of_funnel
 from nlsid_core import designs, files
 from nlsid_core.arrays import Json
-from nlsid_core.deciding import Deciding
+from nlsid_core.deciding import USUAL, Deciding, Limits
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.files import read_regular
@@ -96,20 +96,20 @@ class Bundle:
                     found[name] = self.contents[inner + part]
         return found
 
-    def decided(self) -> Verdict:
+    def decided(self, limits: Limits = USUAL) -> Verdict:
         """The kernel's verdict about these files and no others.
 
         Raises CertificateRejected or CertificateMismatch with the reason.
         """
-        verdict = self.deciding().wait()
+        verdict = self.deciding(limits).wait()
         self.refuse_others(verdict)
         return verdict
 
-    def deciding(self) -> Deciding:
+    def deciding(self, limits: Limits = USUAL) -> Deciding:
         """The kernel at work on these files; CertificateRejected if there is no proof."""
         if PROOF not in self.contents:
             raise CertificateRejected("there is no proof in the bundle")
-        return Deciding.of(self.contents[PROOF], self._files())
+        return Deciding.of(self.contents[PROOF], self._files(), limits)
 
     def refuse_others(self, verdict: Verdict) -> None:
         """Raise CertificateMismatch if the verdict is about other files than these."""
@@ -147,12 +147,12 @@ class Bundle:
 class Check:
     """Has the kernel decide a bundle's text in a process of its own; `poll` until it answers."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, limits: Limits = USUAL) -> None:
         self.text, self._deciding = text, None
         self._refusal = ""
         try:
             self._bundle = Bundle.parse(text)
-            self._deciding = self._bundle.deciding()
+            self._deciding = self._bundle.deciding(limits)
         except NlsidError as refusal:
             self._refusal = str(refusal)
 

@@ -96,7 +96,7 @@ class CheckBag:
             )
         refused, samples, excited = "", "", False
         try:
-            own = read_signals_of([bag], self.config, names=[name]).trajectories
+            own = read_signals_of({name: bag}, self.config).trajectories
         except DataError as error:
             if not is_of_content(error):
                 raise

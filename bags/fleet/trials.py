@@ -45,7 +45,7 @@ class ReadTrials:
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """The trials, as `training.encoded` writes them."""
-        trials = read_signals_of([bag], self.config, names=[name])
+        trials = read_signals_of({name: bag}, self.config)
         return encoded({"": trials}, compressed=False)
 
 

@@ -245,7 +245,7 @@ def _recordings(recordings: Sequence[BagInfo]) -> str:
     listed = [(info, topic) for info in recordings for topic in info.topics]
     quiet: dict[str, list[tuple[BagInfo, TopicInfo]]] = {}
     for info, topic in listed:
-        if not (topic.gaps or info.lost(topic) or _remarks(info, topic)):
+        if not (topic.times.gaps or info.lost(topic) or _remarks(info, topic)):
             quiet.setdefault(topic.topic, []).append((info, topic))
     together = {id(topic) for alike in quiet.values() for _, topic in alike}
     apart = [pair for pair in listed if id(pair[1]) not in together]
@@ -269,9 +269,9 @@ def _recorded(alike: Sequence[tuple[BagInfo, TopicInfo]]) -> str:
         f"{info.path.name} and {len(others)} more" if others else info.path.name,
         topic.topic,
         _between([each.count for each in topics]),
-        _between([each.rate for each in topics], " Hz"),
-        str(topic.gaps),
-        _between([max(each.longest for each in topics)], " s"),
+        _between([each.times.rate for each in topics], " Hz"),
+        str(topic.times.gaps),
+        _between([max(each.times.longest for each in topics)], " s"),
         "not counted" if None in lost else _between([of for of in lost if of is not None]),
         "; ".join(_remarks(info, topic)) or "none",
     ]

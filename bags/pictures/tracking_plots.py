@@ -19,7 +19,7 @@ from nlsid_core.identification.states import free_run_error, stretches_in_box
 from nlsid_core.models import Signal
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.running.assumption import disturbance_of
+from nlsid_core.running.assumption import disturbance_of, meter_of
 from nlsid_core.running.reading import Reading, Status
 
 TUBE = "#c9deef"
@@ -249,9 +249,7 @@ def _disturbance(
 ) -> None:
     a, t = funnel.assumption, _times(policy)
     for index, run in enumerate(runs):
-        sizes = disturbance_of(
-            model, policy, run, S=funnel.S, A=funnel.A, form=a.form, rate=a.rate, gain=a.gain
-        )
+        sizes = disturbance_of(model, policy, run, meter_of(funnel))
         axes.plot(t, sizes, color=GREY, lw=0.6, label=None if index else "commissioning runs")
     axes.axhline(a.measured, color=INK, lw=LINE, ls="--", label="largest measured")
     axes.axhline(a.bound, color=RED, lw=1.5, label=f"assumed bound, {a.safety_factor:g} times")

@@ -21,6 +21,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.remote import place
 from bags.recordings.storage import Channel, Raw, Storage, defined
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 RECOVER: Final = "`nlsid bag recover`"
 
@@ -76,8 +77,10 @@ class Bag:
 
     def _encoded(self, channel: Channel) -> Channel:
         """The channel, with the encoding that the metadata state where its file says CDR."""
-        stated = self._described.encodings.get(channel.topic, "cdr")
-        return replace(channel, encoding=stated) if channel.encoding == "cdr" else channel
+        described = (self._described.topics or {}).get(channel.topic)
+        if described is None or channel.encoding != "cdr":
+            return channel
+        return replace(channel, encoding=described.encoding)
 
     def close(self) -> None:
         """Close the bag's files."""
@@ -124,7 +127,7 @@ class Bag:
     def statements(self) -> tuple[str, ...]:
         """What in the bag says how many messages there should be."""
         said = {
-            METADATA: self._described.counts is not None,
+            METADATA: self._described.topics is not None,
             "the files' statistics and indexes": self._storage.stated is not None,
         }
         return tuple(name for name, there in said.items() if there)
@@ -133,7 +136,7 @@ class Bag:
     def disagreements(self) -> tuple[str, ...]:
         """Where what the bag states and what is there differ, in words."""
         found = [*self._described.notes]
-        said = {METADATA: self._described.counts, "the file": self._storage.stated}
+        said = {METADATA: self._counts, "the file": self._storage.stated}
         for name, counts in said.items():
             for topic in {**counts, **self.topics} if counts is not None else ():
                 stated, there = (counts or {}).get(topic, 0), self._there(topic)
@@ -187,13 +190,21 @@ class Bag:
         metadata.yaml goes before the files, as it does for rosbag2.
         """
         found = [p for c in self.channels if c.topic == topic for p in c.offered]
-        return tuple(dict.fromkeys(self._described.offered.get(topic) or found))
+        described = (self._described.topics or {}).get(topic)
+        return tuple(dict.fromkeys((described and described.offered) or found))
 
     def count(self, topic: str) -> int:
         """How many messages the bag says it has on `topic`."""
-        if self._described.counts is not None and self.ending is None:
-            return self._described.counts.get(topic, 0)
+        if self._counts is not None and self.ending is None:
+            return self._counts.get(topic, 0)
         return self._there(topic)
+
+    @cached_property
+    def _counts(self) -> dict[str, int] | None:
+        """Messages of each topic as metadata.yaml states them."""
+        if self._described.topics is None:
+            return None
+        return {topic: described.messages for topic, described in self._described.topics.items()}
 
     def _there(self, topic: str) -> int:
         return sum(channel.count for channel in self.channels if channel.topic == topic)
@@ -202,18 +213,26 @@ class Bag:
         """Which of its topic's channels it is; sequence numbers are counted in each."""
         return self._storage.strands[channel.key]
 
-    def batches(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch]]:
+    def batches(
+        self, topics: Sequence[str] | None = None, *, progress: Progress = silent
+    ) -> Iterator[tuple[Channel, Batch]]:
         """The messages on `topics` (None: on all), many at once, in the order of the files.
 
         Memory: one batch. Raises BagError where the bag is damaged.
         """
-        for channel, batch, _ in self.parts(topics):
+        for channel, batch, _ in self.parts(topics, progress=progress):
             yield channel, batch
 
-    def parts(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch, int]]:
+    def parts(
+        self, topics: Sequence[str] | None = None, *, progress: Progress = silent
+    ) -> Iterator[tuple[Channel, Batch, int]]:
         """As `batches`, with the log time in ns that no message from here on goes below."""
-        for key, batch, later_ns in self._storage.parts(self._keys(topics)):
+        keys = self._keys(topics)
+        total, done = max(sum(self.channels[key].count for key in keys), 1), 0
+        for key, batch, later_ns in self._storage.parts(keys):
             yield self.channels[key], batch, later_ns
+            done += len(batch)
+            progress("reading", done / total)
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""

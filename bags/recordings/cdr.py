@@ -10,8 +10,9 @@ four-byte encapsulation header.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,27 +45,34 @@ MAX_LAYOUTS: Final = 16  # per batch; beyond that lengths vary freely and messag
 MAX_STEPS: Final = 10_000_000  # elements walked in one message; more is a type made to hang readers
 
 
-class Hop(Protocol):
-    """One field on the way to a number, and which element of it: see `bags.signals.signal.Step`."""
+@dataclass(frozen=True)
+class Step:
+    """One field on the way to the number, and which element of it if it is an array.
+
+    index: the element. key: (array of strings beside the field, the string at the element's place).
+    every: `[*]`, all elements. length: how many elements there must be (None: any number).
+    """
+
+    field: str
+    index: int | None = None
+    key: tuple[str, str] | None = None
+    every: bool = False
+    length: int | None = None
+
+    def __str__(self) -> str:
+        if self.index is not None:
+            return f"{self.field}[{self.index}]"
+        if self.key is not None:
+            return f"{self.field}[{self.key[0]}={self.key[1]}]"
+        return f"{self.field}[*]" if self.every else self.field
 
     @property
-    def field(self) -> str:
-        """The field's name."""
-
-    @property
-    def index(self) -> int | None:
-        """The element, if the field is an array."""
-
-    @property
-    def key(self) -> tuple[str, str] | None:
-        """(array of strings beside it, the string whose place is the element)."""
-
-    @property
-    def length(self) -> int | None:
-        """The length the array must have, if that matters."""
+    def picks(self) -> bool:
+        """Whether it names an element."""
+        return self.index is not None or self.key is not None or self.every
 
 
-Target = Sequence[Hop]
+Target = Sequence[Step]
 Numbers = NDArray[Any]  # (N,) of any type of number
 
 
@@ -269,7 +277,7 @@ class _Walk:
     def _field(
         self,
         description: FieldDesc,
-        here: list[tuple[int, int, Hop]],
+        here: list[tuple[int, int, Step]],
         keys: dict[str, list[str]],
     ) -> bool:
         if description[0] == Nodetype.NAME:
@@ -303,7 +311,7 @@ class _Walk:
             self._count_step()
         return True
 
-    def _place(self, hop: Hop, count: int, keys: dict[str, list[str]]) -> int:
+    def _place(self, hop: Step, count: int, keys: dict[str, list[str]]) -> int:
         if hop.length is not None and count != hop.length:
             raise BagError(
                 f"'{hop.field}' has {count} elements, the first message has {hop.length}"

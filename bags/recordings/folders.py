@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import yaml
 
@@ -28,18 +28,24 @@ MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
+class DescribedTopic(NamedTuple):
+    """What metadata.yaml says of a topic: messages, how they are serialised, what was offered."""
+
+    messages: int
+    encoding: str
+    offered: tuple[Profile, ...]
+
+
 @dataclass(frozen=True)
 class BagFiles:
     """What a bag is made of: its data files in order, and what its metadata.yaml says of it.
 
-    total: messages in all. release: of ROS 2; empty if it is not named. notes: what in the metadata
-    is not as it should be.
+    topics: None without metadata. total: messages in all. release: of ROS 2; empty if it is not
+    named. notes: what in the metadata is not as it should be.
     """
 
     files: tuple[Path, ...]
-    counts: dict[str, int] | None = None
-    encodings: dict[str, str] = field(default_factory=dict)
-    offered: dict[str, tuple[Profile, ...]] = field(default_factory=dict)
+    topics: dict[str, DescribedTopic] | None = None
     custom: dict[str, str] = field(default_factory=dict)
     total: int | None = None
     finished: bool = True
@@ -199,16 +205,16 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         files = [*data_files(path)]
         there = ", ".join(found.name for found in files if found)
         notes.append(f"{METADATA} names {', '.join(missing)}, which is not there; read: {there}")
-    counts: dict[str, int] = {}
-    encodings: dict[str, str] = {}
-    profiles: dict[str, tuple[Profile, ...]] = {}
+    topics: dict[str, DescribedTopic] = {}
     try:
         for entry in metadata["topics_with_message_count"] or ():
             topic = str(entry["topic_metadata"]["name"])
-            counts[topic] = counts.get(topic, 0) + int(entry["message_count"])
-            encodings[topic] = str(entry["topic_metadata"].get("serialization_format", "cdr"))
-            found = offered(entry["topic_metadata"].get(KEY))
-            profiles[topic] = (*profiles.get(topic, ()), *found)
+            before = topics.get(topic, DescribedTopic(0, "", ()))
+            topics[topic] = DescribedTopic(
+                before.messages + int(entry["message_count"]),
+                str(entry["topic_metadata"].get("serialization_format", "cdr")),
+                (*before.offered, *offered(entry["topic_metadata"].get(KEY))),
+            )
     except (KeyError, TypeError, ValueError) as error:
         raise _bad(file, f"topics_with_message_count: {type(error).__name__} {error}") from error
     total = metadata.get("message_count")
@@ -217,9 +223,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         raise BagError(f"{path}: custom_data in {METADATA} is not a mapping")
     return BagFiles(
         tuple(found for found in files if found),
-        counts=counts,
-        encodings=encodings,
-        offered=profiles,
+        topics=topics,
         custom={str(key): str(value) for key, value in custom.items()},
         total=total if isinstance(total, int) else None,
         release=str(metadata.get("ros_distro") or ""),

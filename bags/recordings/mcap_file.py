@@ -30,18 +30,17 @@ from bags.recordings.mcap_records import (
     RECORD,
     Block,
     Contents,
-    add_channel,
-    add_schema,
     counted,
     index_entries,
     messages_at,
     parse,
+    rest_said,
     uncompressed,
     unpack,
-    walk_channels,
+    walk_declared,
     walk_messages,
 )
-from bags.recordings.mcap_summary import ListedBlock, Prepared, summarised
+from bags.recordings.mcap_summary import Prepared, summarised
 from bags.recordings.remote import RemotePath, place
 from nlsid_core.errors import BagError
 
@@ -121,45 +120,35 @@ class McapFile:
 
         Raises BagError if a block is damaged or not what its index says.
         """
-        if self._prepared is not None:
-            for blocks in self._prepared.groups(channels):
-                yield blocks[-1], self._prepared_batches(blocks, channels)
-            return
-        for block in self.contents.blocks:
-            yield block, self.block_batches(block, channels)
+        alone = ([block] for block in self.contents.blocks)
+        groups = alone if self._prepared is None else self._prepared.groups(channels)
+        for blocks in groups:
+            yield blocks[-1], self._batches(blocks, channels)
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Batches:
         """The messages of one block, one batch per channel that has any."""
-        index = block.index
-        if index is not None and not any(channel in index for channel in channels):
-            return
-        if isinstance(block, ListedBlock):
-            yield from self._prepared_batches([block], channels)
-            return
-        where = f"the message index of the chunk at byte {block.offset}"
-        buffer = self.content(block)
-        if index is None:
-            walked = walk_messages(buffer)
-            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
-            where = f"the block at byte {block.offset}"
-        else:
-            wanted = [c for c in channels if c in index]
-            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
-        for channel in channels:
-            if channel in offsets and len(offsets[channel]):
-                batch = messages_at(buffer, offsets[channel], channel, where)
-                _refuse_earlier(batch, block)
-                yield channel, batch
+        return self._batches([block], channels)
 
-    def _prepared_batches(
-        self, blocks: Sequence[ListedBlock], channels: Collection[int]
-    ) -> Batches:
-        """The messages of blocks that the summary lists, one batch per channel that has any."""
-        assert self._prepared is not None
-        buffer, offsets, edges = self._prepared.records(blocks, channels)
-        where = f"the message index of the chunk at byte {blocks[0].offset}"
+    def _batches(self, blocks: Sequence[Block], channels: Collection[int]) -> Batches:
+        first = blocks[0]
+        index = first.index
+        if index is not None and len(blocks) == 1 and not any(c in index for c in channels):
+            return
+        where = f"the message index of the chunk at byte {first.offset}"
         if len(blocks) > 1:
             where += f", or of one up to byte {blocks[-1].offset},"
+        edges = None
+        if self._prepared is not None:
+            buffer, offsets, edges = self._prepared.records(blocks, channels)
+        elif index is None:
+            where = f"the block at byte {first.offset}"
+            buffer = self.content(first)
+            walked = walk_messages(buffer)
+            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
+        else:
+            buffer = self.content(first)
+            wanted = [c for c in channels if c in index]
+            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
         for channel in channels:
             found = offsets.get(channel)
             if found is not None and len(found):
@@ -196,7 +185,7 @@ class McapFile:
         found = Contents(ending="it stops without the end of an MCAP file")
         if self._read(0, len(MAGIC)) != MAGIC:
             raise BagError("not an MCAP file")
-        at = found.good_bytes = len(MAGIC)
+        at = good_bytes = len(MAGIC)
         repeating = False
         while at + RECORD.size <= self._size:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
@@ -214,7 +203,7 @@ class McapFile:
                 pass  # what is salvaged is not what a summary says
             else:
                 self._try_note(found, opcode, content, length)
-            at = found.good_bytes = end
+            at = good_bytes = end
             repeating |= self._salvage and opcode == Opcode.DATA_END
             if opcode == Opcode.FOOTER:
                 if self._read(at, len(MAGIC)) == MAGIC:
@@ -225,6 +214,8 @@ class McapFile:
         if found.ending is not None and found.blocks:  # its index may be cut off
             last = found.blocks[-1]
             found.blocks[-1] = replace(last, index=None)
+        if found.ending is not None:
+            found.ending += rest_said(self._size - good_bytes)
         return found
 
     def _try_note(self, found: Contents, opcode: int, content: int, length: int) -> None:
@@ -262,12 +253,11 @@ class McapFile:
         elif opcode == Opcode.MESSAGE_INDEX and found.blocks:
             self._note_index(found.blocks, content, length)
         elif opcode == Opcode.HEADER:
-            header = self._parse(Header.read, content, length)
-            found.profile, found.library = header.profile, header.library
+            self._parse(Header.read, content, length)
         elif opcode == Opcode.SCHEMA:
-            add_schema(found.schemas, self._parse(Schema.read, content, length))
+            found.declared.add(self._parse(Schema.read, content, length))
         elif opcode == Opcode.CHANNEL:
-            add_channel(found.channels, self._parse(Channel.read, content, length))
+            found.declared.add(self._parse(Channel.read, content, length))
         elif opcode == Opcode.METADATA:
             found.metadata.append(self._parse(Metadata.read, content, length))
         elif opcode == Opcode.ATTACHMENT:
@@ -340,7 +330,7 @@ class McapFile:
         kept: list[Block] = []  # whole, and with a message, so that it has a time
         for block in found.blocks:
             start_ns = block.start_ns
-            if block.index is not None and all(map(self._is_known, block.index)):
+            if block.index is not None and all(map(found.declared.knows, block.index)):
                 entries = {c: length - INDEX.size for c, (_, length) in block.index.items()}
                 counts = {c: length // INDEX_ENTRY.itemsize for c, length in entries.items()}
             else:
@@ -356,7 +346,7 @@ class McapFile:
             for channel_id, count in counts.items():
                 found.counts[channel_id] = found.counts.get(channel_id, 0) + count
         found.blocks = kept
-        if lost := found.counts.keys() - found.channels.keys():
+        if lost := found.counts.keys() - found.declared.channels.keys():
             if not self._salvage:
                 raise BagError(f"messages on channel {min(lost)}, which nothing declares")
             found.lost += [f"{found.counts[c]} messages of unknown channel {c}" for c in lost]
@@ -365,11 +355,8 @@ class McapFile:
     def _declared_in(self, block: Block) -> tuple[dict[int, int], int]:
         """Note the schemas and channels a block declares; each channel's messages, first time."""
         content = self.content(block)
-        schemas, channels = walk_channels(content)
-        for schema in schemas:
-            add_schema(self.contents.schemas, schema)
-        for channel in channels:
-            add_channel(self.contents.channels, channel)
+        for record in walk_declared(content):
+            self.contents.declared.add(record)
         walked, where = walk_messages(content), f"the block at byte {block.offset}"
         starts = [
             int(messages_at(content, np.array(at, np.int64), channel_id, where).log_ns.min())
@@ -377,13 +364,6 @@ class McapFile:
         ]
         counts = {channel_id: len(at) for channel_id, at in walked.items()}
         return counts, min(starts, default=block.start_ns)
-
-    def _is_known(self, channel_id: int) -> bool:
-        """Whether a channel and its schema have been declared so far."""
-        channel = self.contents.channels.get(channel_id)
-        if channel is None:
-            return False
-        return channel.schema_id == 0 or channel.schema_id in self.contents.schemas
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""

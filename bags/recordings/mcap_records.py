@@ -66,20 +66,38 @@ class Block:
 
 
 @dataclass
+class Declared:
+    """The schemas and channels of a file by their ids."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+
+    def add(self, record: Schema | Channel) -> None:
+        """Keep one; BagError if its id already names another."""
+        if isinstance(record, Schema):
+            kept, kind = self.schemas.setdefault(record.id, record), "schema"
+        else:
+            kept, kind = self.channels.setdefault(record.id, record), "channel"  # type: ignore[assignment]
+        if kept != record:
+            raise BagError(f"{kind} {record.id} is declared twice, and differently")
+
+    def knows(self, channel_id: int) -> bool:
+        """Whether a channel and its schema have been declared so far."""
+        channel = self.channels.get(channel_id)
+        return channel is not None and (channel.schema_id == 0 or channel.schema_id in self.schemas)
+
+
+@dataclass
 class Contents:
     """What a file holds. `ending`: why the file stops early, None if it is finished."""
 
-    profile: str = ""
-    library: str = ""
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
+    declared: Declared = field(default_factory=Declared)
     counts: dict[int, int] = field(default_factory=dict)
     blocks: list[Block] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[tuple[int, int]] = field(default_factory=list)  # offset, bytes of the content
     stated: dict[int, int] | None = None  # the statistics' count of messages per channel
     ending: str | None = None
-    good_bytes: int = 0
     lost: list[str] = field(default_factory=list)
 
 
@@ -129,15 +147,17 @@ def walk_messages(content: bytes) -> dict[int, list[int]]:
     return found
 
 
-def walk_channels(content: bytes) -> tuple[list[Schema], list[Channel]]:
+def walk_declared(content: bytes) -> Iterator[Schema | Channel]:
     """The schemas and channels declared in a chunk."""
-    schemas, channels = [], []
+    readers = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read}
     for opcode, at, end in walk_records(content):
-        if opcode == Opcode.SCHEMA:
-            schemas.append(parse(Schema.read, content[at + RECORD.size : end]))
-        elif opcode == Opcode.CHANNEL:
-            channels.append(parse(Channel.read, content[at + RECORD.size : end]))
-    return schemas, channels
+        if opcode in readers:
+            yield parse(readers[Opcode(opcode)], content[at + RECORD.size : end])
+
+
+def rest_said(rest: int) -> str:
+    """What is behind the last whole record of a file that stops early, in words."""
+    return f"; the last {rest} bytes hold no whole chunk" if rest > 0 else ""
 
 
 def messages_at(
@@ -199,18 +219,6 @@ def counted(statistics: Statistics) -> dict[int, int] | None:
     """Messages of each channel; None of a writer that states only how many there are in all."""
     counts = dict(statistics.channel_message_counts)
     return counts if counts or not statistics.message_count else None
-
-
-def add_schema(schemas: dict[int, Schema], schema: Schema) -> None:
-    """Keep a schema; BagError if its id already names another."""
-    if schemas.setdefault(schema.id, schema) != schema:
-        raise BagError(f"schema {schema.id} is declared twice, and differently")
-
-
-def add_channel(channels: dict[int, Channel], channel: Channel) -> None:
-    """Keep a channel; BagError if its id already names another."""
-    if channels.setdefault(channel.id, channel) != channel:
-        raise BagError(f"channel {channel.id} is declared twice, and differently")
 
 
 def parse(read: Callable[[Any], Record], content: bytes) -> Record:

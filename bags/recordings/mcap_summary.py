@@ -34,8 +34,6 @@ from bags.recordings.mcap_records import (
     Block,
     Contents,
     Record,
-    add_channel,
-    add_schema,
     counted,
     index_entries,
     parse,
@@ -95,14 +93,14 @@ def summarised(path: RemotePath) -> Contents | None:
 
 
 def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
-    found = Contents(good_bytes=path.entry.size)
+    found = Contents()
     metadata: list[MetadataIndex] = []
     for opcode, at, record_end in walk_records(summary):
         content = summary[at + RECORD.size : record_end]
         if opcode == Opcode.SCHEMA:
-            add_schema(found.schemas, _declared(Schema.read, content))
+            found.declared.add(_declared(Schema.read, content))
         elif opcode == Opcode.CHANNEL:
-            add_channel(found.channels, _declared(Channel.read, content))
+            found.declared.add(_declared(Channel.read, content))
         elif opcode == Opcode.STATISTICS:
             statistics = parse(Statistics.read, content)
             found.stated = counted(statistics)
@@ -126,11 +124,8 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
                 f"the summary's chunks at bytes {block.offset} and {after.offset} overlap"
             )
     named = {channel for block in found.blocks for channel in block.index or ()}
-    declared = {
-        c.id for c in found.channels.values() if not c.schema_id or c.schema_id in found.schemas
-    }
     filled = {channel for channel, count in found.counts.items() if count}
-    if not named | filled <= declared or not filled <= named:  # some are told elsewhere
+    if not all(map(found.declared.knows, named)) or not filled <= named:  # some stand elsewhere
         return None
     if any(not (len(MAGIC) <= m.offset <= m.offset + m.length <= start) for m in metadata):
         raise BagError("the summary names metadata outside the file")
@@ -192,7 +187,7 @@ class Prepared:
         self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
         self._runs: tuple[IntArray, IntArray] = _sorted(), _sorted()  # first bytes, ends
 
-    def groups(self, channels: Collection[int]) -> Iterator[list[ListedBlock]]:
+    def groups(self, channels: Collection[int]) -> Iterator[Sequence[Block]]:
         """What `records` takes, in the order of the file: the chunks of a window that are not
         compressed together, a compressed one alone.
         """
@@ -205,7 +200,7 @@ class Prepared:
             at = self._place[window[-1].offset] + 1
 
     def records(
-        self, blocks: Sequence[ListedBlock], channels: Collection[int]
+        self, wanted: Sequence[Block], channels: Collection[int]
     ) -> tuple[bytes, dict[int, IntArray], IntArray]:
         """Records of one of the `groups`, or of any one block; where in them each channel's
         messages begin; and where any of them ends at the latest.
@@ -213,6 +208,7 @@ class Prepared:
         They are those of the wanted messages, one behind the other; of a compressed block, all.
         """
         self._want(channels)
+        blocks = [block for block in wanted if isinstance(block, ListedBlock)]
         first, last = blocks[0], blocks[-1]
         if first.offset not in self._ready:
             self._prepare(list(self._window(self._place[first.offset])))

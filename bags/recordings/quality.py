@@ -37,6 +37,14 @@ class Span(NamedTuple):
     nsec: int = 854775807
 
 
+class Times(NamedTuple):
+    """The times of a profile, by their names in rmw."""
+
+    deadline: Span = Span()
+    lifespan: Span = Span()
+    liveliness_lease_duration: Span = Span()
+
+
 class Profile(NamedTuple):
     """What one publisher offered, in the words of rmw."""
 
@@ -44,10 +52,8 @@ class Profile(NamedTuple):
     depth: int = 10
     reliability: str = "reliable"
     durability: str = "volatile"
-    deadline: Span = Span()
-    lifespan: Span = Span()
+    times: Times = Times()
     liveliness: str = "automatic"
-    liveliness_lease_duration: Span = Span()
     avoid_ros_namespace_conventions: bool = False
 
     @property
@@ -58,8 +64,15 @@ class Profile(NamedTuple):
     def document(self) -> dict[str, Any]:
         """As metadata.yaml of version 9 says it."""
         return {
-            key: value._asdict() if isinstance(value, Span) else value
-            for key, value in self._asdict().items()
+            "history": self.history,
+            "depth": self.depth,
+            "reliability": self.reliability,
+            "durability": self.durability,
+            "deadline": self.times.deadline._asdict(),
+            "lifespan": self.times.lifespan._asdict(),
+            "liveliness": self.liveliness,
+            "liveliness_lease_duration": self.times.liveliness_lease_duration._asdict(),
+            "avoid_ros_namespace_conventions": self.avoid_ros_namespace_conventions,
         }
 
 
@@ -91,10 +104,8 @@ def profile_of(qos: Any) -> Profile:
         int(qos.depth),
         qos.reliability.name.lower(),
         qos.durability.name.lower(),
-        _span_of(qos.deadline),
-        _span_of(qos.lifespan),
+        Times(*(_span_of(getattr(qos, name)) for name in Times._fields)),
         qos.liveliness.name.lower(),
-        _span_of(qos.liveliness_lease_duration),
         bool(qos.avoid_ros_namespace_conventions),
     )
 
@@ -117,10 +128,8 @@ def _profile(entry: Any) -> Profile:
         depth,
         _word(entry["reliability"], RELIABILITIES),
         _word(entry["durability"], DURABILITIES),
-        _span(entry["deadline"]),
-        _span(entry["lifespan"]),
+        Times(*(_span(entry[name]) for name in Times._fields)),
         _word(entry["liveliness"], LIVELINESSES),
-        _span(entry["liveliness_lease_duration"]),
         bool(entry["avoid_ros_namespace_conventions"]),
     )
 

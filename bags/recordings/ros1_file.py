@@ -19,7 +19,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from bags.recordings.batch import Batch, batch_of
-from bags.recordings.mcap_records import MAX_CHUNK_BYTES, Block, Contents
+from bags.recordings.mcap_records import MAX_CHUNK_BYTES, Block, Contents, rest_said
 from bags.recordings.quality import KEY, LATCHED, offered_text
 from nlsid_core.errors import BagError
 
@@ -43,7 +43,7 @@ class Ros1File:
 
     def __init__(self, path: Path, *, salvage: bool = False) -> None:
         self.path = path
-        self.contents = Contents(good_bytes=len(ROS1_MAGIC))
+        self.contents = Contents()
         self._salvage = salvage
         with path.open("rb") as stream:
             self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
@@ -79,6 +79,7 @@ class Ros1File:
     def _walk(self) -> None:
         found = self.contents
         header: Fields = {}
+        good_bytes = len(ROS1_MAGIC)
         try:
             for fields, start, end in _records(self._content, len(ROS1_MAGIC), len(self._content)):
                 kind = _number(fields, b"op")
@@ -91,8 +92,8 @@ class Ros1File:
                 elif kind == INDEX:
                     self._add_index(fields, start, end)
                 elif kind == MESSAGE:
-                    self._add_loose(found.good_bytes, end)
-                found.good_bytes = end
+                    self._add_loose(good_bytes, end)
+                good_bytes = end
         except BagError as error:
             found.ending = str(error)
         if header.get(b"encryptor"):
@@ -102,6 +103,8 @@ class Ros1File:
         chunks = sum(block.compression != LOOSE for block in found.blocks)
         if found.ending is None and chunks != _number(header, b"chunk_count"):
             found.ending = f"it has {chunks} chunks, and says another number at its start"
+        if found.ending is not None:
+            found.ending += rest_said(len(self._content) - good_bytes)
 
     def _add_loose(self, start: int, end: int) -> None:
         """A message outside chunks: of the chunk in which a recorder was killed."""
@@ -117,8 +120,9 @@ class Ros1File:
         kind = said.get(b"type", b"").decode("utf-8", "replace")
         profiles = {KEY: offered_text([LATCHED])} if said.get(b"latching") == b"1" else {}
         schema = Schema(number, said.get(b"message_definition", b""), "ros1msg", kind)
-        self.contents.schemas.setdefault(number, schema)
-        self.contents.channels.setdefault(number, Channel(number, topic, "ros1", profiles, number))
+        declared = self.contents.declared
+        declared.schemas.setdefault(number, schema)
+        declared.channels.setdefault(number, Channel(number, topic, "ros1", profiles, number))
 
     def _add_index(self, fields: Fields, start: int, end: int) -> None:
         count = _number(fields, b"count")
@@ -139,7 +143,7 @@ class Ros1File:
         found, kept = self.contents, []
         found.stated = None if found.ending else _counts(found.blocks)
         for block in found.blocks:
-            told = block.index is not None and block.index.keys() <= found.channels.keys()
+            told = block.index is not None and block.index.keys() <= found.declared.channels.keys()
             try:
                 kept.append(block if told and not self._salvage else self._indexed(block))
             except BagError as error:
@@ -148,7 +152,7 @@ class Ros1File:
                 found.lost.append(str(error))
         found.blocks = kept
         found.counts = _counts(kept)
-        for number in found.counts.keys() - found.channels.keys():
+        for number in found.counts.keys() - found.declared.channels.keys():
             if not self._salvage:
                 raise BagError(f"messages of connection {number}, which nothing declares")
             found.lost.append(f"{found.counts.pop(number)} messages of unknown connection {number}")

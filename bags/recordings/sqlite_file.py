@@ -127,12 +127,12 @@ class SqliteFile:
             topic = {column: str(value) for column, value in zip(columns, row, strict=True)}
             number, kind = int(topic["id"]), topic["type"]
             encoding, text = definitions.get(kind, ("", ""))
-            self.contents.schemas[number] = Schema(number, text.encode(), encoding, kind)
+            self.contents.declared.schemas[number] = Schema(number, text.encode(), encoding, kind)
             said = {
                 KEY: topic.get("offered_qos_profiles", ""),
                 TYPE_HASH: topic.get("type_description_hash", ""),
             }
-            self.contents.channels[number] = Channel(
+            self.contents.declared.channels[number] = Channel(
                 number, topic["name"], topic["serialization_format"], said, number
             )
 
@@ -167,7 +167,7 @@ class SqliteFile:
 
     def _add_block(self, run: Sequence[tuple[int, int, int, int]]) -> None:
         counts = Counter(topic for _, topic, _, _ in run)
-        for topic in counts.keys() - self.contents.channels.keys():
+        for topic in counts.keys() - self.contents.declared.channels.keys():
             if not self._salvage:
                 raise BagError(f"messages on topic {topic}, which nothing declares")
             self.contents.lost.append(f"{counts.pop(topic)} messages of unknown topic {topic}")

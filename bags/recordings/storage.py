@@ -196,8 +196,8 @@ class Storage:
                 self.records.append(record)
         keys: dict[int, int] = {}
         strands: dict[str, int] = {}
-        for number, recorded in found.channels.items():
-            schema = found.schemas.get(recorded.schema_id)
+        for number, recorded in found.declared.channels.items():
+            schema = found.declared.schemas.get(recorded.schema_id)
             if schema is None and recorded.schema_id:
                 raise BagError(f"channel {number} has schema {recorded.schema_id}, not declared")
             keys[number] = len(self.channels)
@@ -249,12 +249,11 @@ class Storage:
         """Of what cannot be read, with `salvage=True`, why, as far as it was found by now."""
         found = [*self._refused]
         for file in self.files:
-            contents = file.contents
-            found += [f"{file.path.name}: {what}" for what in contents.lost]
-            if contents.ending is not None:
-                rest = file.path.stat().st_size - contents.good_bytes
-                cut = f"; the last {rest} bytes hold no whole chunk" if rest > 0 else ""
-                found.append(f"{file.path.name}: {contents.ending}{cut}")
+            ending = file.contents.ending
+            found += [
+                f"{file.path.name}: {what}"
+                for what in (*file.contents.lost, *([] if ending is None else [ending]))
+            ]
         return found
 
     @property

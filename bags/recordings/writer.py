@@ -2,7 +2,6 @@
 
 import shutil
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -32,11 +31,10 @@ class BagWriter:
     whose disk is full spends the room that was kept for the bag's end and says so in `full`. A
     killed process loses nothing of a closed chunk; a power cut may.
 
-    `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `max_chunk_age` in s
-    of wall time closes a chunk at the first message after that age; where messages may pause, call
-    `close_chunk` from a timer too. `compression` of the chunks: zstd, lz4 or none. `split_bytes`
-    and `split_seconds` (of log time) begin another file, NAME_0.mcap, NAME_1.mcap and so on, at the
-    first message beyond them.
+    `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
+    from a timer, limits what a kill loses. `compression` of the chunks: zstd, lz4 or none.
+    `split_bytes` and `split_seconds` (of log time) begin another file, NAME_0.mcap, NAME_1.mcap
+    and so on, at the first message beyond them.
 
     Raises BagError if `path` exists or a setting makes no sense; OS errors pass through.
     """
@@ -47,7 +45,6 @@ class BagWriter:
         *,
         custom: Mapping[str, str] | None = None,
         in_place: bool = False,
-        max_chunk_age: float | None = None,
         compression: str = "zstd",
         split_bytes: int | None = None,
         split_seconds: float | None = None,
@@ -58,8 +55,6 @@ class BagWriter:
         self._numbers: dict[str, int] = {}  # topic -> its place in `_topics`, of those not copied
         self._copies: dict[tuple[object, ...], int] = {}
         self._custom = dict(custom or {})
-        self._max_chunk_age = max_chunk_age
-        self._chunk_opened: float | None = None
         self._compression = compression
         self._split_bytes = split_bytes
         self._split_ns = None if split_seconds is None else round(split_seconds * 1e9)
@@ -180,15 +175,9 @@ class BagWriter:
         if self._is_full(part, log_ns):
             self._open_part()
             part.finish()
-            part, self._chunk_opened = self._parts[-1], None
+            part = self._parts[-1]
         part.write(number, data, log_ns, publish_ns, sequence)
         self.counts[self._topics[number].name] += 1
-        if self._max_chunk_age is not None:
-            now = time.monotonic()
-            if self._chunk_opened is None:
-                self._chunk_opened = now
-            elif now - self._chunk_opened >= self._max_chunk_age:
-                self.close_chunk()
 
     def _is_full(self, part: Part, log_time_ns: int) -> bool:
         if part.first_ns is None:
@@ -205,7 +194,6 @@ class BagWriter:
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
         self._parts[-1].close_chunk()
-        self._chunk_opened = None
 
     def close(self) -> None:
         """Finish the file, write metadata.yaml, give the folder its name; once.

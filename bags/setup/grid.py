@@ -9,10 +9,12 @@ from typing import Any, Final
 import numpy as np
 from scipy.signal import welch
 
+from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.setup.proposal import Proposal, Signal
 from bags.signals.expressions import factors
-from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from bags.signals.reader import Samples, read_signals
+from bags.signals.sampling import Grid
 from bags.signals.timing import held
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
@@ -57,21 +59,17 @@ def read_paces(
     types: Mapping[str, Definition] | None,
 ) -> Paces:
     """The paces of the chosen signals over all bags; BagError where a period cannot be said."""
-    y_paths = [signal.path for signal in chosen["response"]]
-    drives = [factors(signal.path) for signal in chosen["excitation"]]
+    rules = Grid(clock=clock)
+    y_paths = [rules.path(signal.path, response=True) for signal in chosen["response"]]
+    u_texts = [rules.path(signal.path, response=False) for signal in chosen["excitation"]]
+    drives = [factors(text) for text in u_texts]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
     steps, commanded, bands, u_steps = [], [], [], []
     ranges: dict[str, list[list[tuple[float, float]]]] = {"u": [], "y": []}
     repeated = 0
     for path in bags:
-        read = read_signals(
-            path,
-            [*y_paths, *u_paths],
-            clock=HEADER_STAMP if clock == "header" else LOG_TIME,
-            sort=True,
-            gaps_in=y_paths,
-            definitions=types,
-        )
+        with Bag(path, definitions=types) as bag:
+            read = read_signals(bag, [*y_paths, *u_paths], sort=True, gaps_in=y_paths)
         for name in y_paths:
             diffs = np.diff(read[name].stamp_ns) / 1e9
             repeated += int((diffs <= 0).sum())

@@ -12,10 +12,10 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, Numbers, UnreadableMessageError
+from bags.recordings.cdr import Gatherer, Numbers, Step, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.publishers import counted_in_turn, two_curves
-from bags.signals.signal import SignalPath, Step
+from bags.signals.signal import SignalPath
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -102,12 +102,8 @@ def read_columns(
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
     growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
-    total = sum(c.count for c in bag.channels if c.topic in readers)
-    done = 0
-    for channel, batch in bag.batches(list(readers)):
+    for channel, batch in bag.batches(list(readers), progress=progress):
         growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
-        done += len(batch)
-        progress("reading", done / max(total, 1))
     return {topic: growing.pop(topic).columns() for topic in topics}
 
 

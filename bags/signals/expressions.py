@@ -7,7 +7,7 @@ from left to right, and use no later sample, so that a monitor gives the same nu
 - `unwrap`: an angle without jumps of a turn, 360 where its unit is deg (see `unit`), else 2π; it
   begins within half a turn of 0.
 - `derivative(T s)`: the slope over the last T s, see `derivative`.
-- `washout(T s)`: what it moved, fading with time constant T, see `washout`.
+- `washout(T s)`: what it moved, fading with time constant T.
 
 These say when the signal is sampled (`bags.signals.sampling`):
 
@@ -25,10 +25,10 @@ values in a sample.
 import math
 import re
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from rosbags.typesys.store import Typestore
@@ -158,43 +158,27 @@ class Expression:
 
     def unit_of(self, unit: str) -> str:
         """The unit of the result of numbers recorded in `unit`; BagError as `unit`."""
-        for operation in self.operations:
-            if operation.name == "unit":
-                unit = operation.unit
-            elif operation.name == "to":
-                self._conversion(unit, operation.unit)
-                unit = operation.unit
-            elif operation.name == "derivative":
-                unit = per_second(unit)
-        return unit
+        return self._steps(unit)[1]
 
     def apply(self, values: FloatArray, stamp_ns: IntArray, unit: str) -> FloatArray:
         """(N,) results from (N,) recorded values in `unit` at `stamp_ns` (N,), increasing.
 
         NaN where a derivative has too few samples before it.
         """
-        for operation in self.operations:
-            if operation.name == "unit":
-                unit = operation.unit
-            elif operation.name == "to":
-                factor, shift = self._conversion(unit, operation.unit)
-                values, unit = values * factor + shift, operation.unit
-            elif operation.name == "unwrap":
-                turn = turn_of(unit)
-                turns = np.cumsum(_turns(np.diff(values, prepend=0.0), turn))
-                values = values - turn * turns
-            elif operation.name in ("derivative", "washout"):
-                slope = operation.name == "derivative"
-                try:
-                    values = (derivative if slope else washout)(values, stamp_ns, operation.window)
-                except BagError as error:
-                    raise BagError(f"{self}: {error}") from error
-                unit = per_second(unit) if slope else unit
+        for step in self._steps(unit)[0]:
+            try:
+                values = step.all(values, stamp_ns)
+            except BagError as error:
+                raise BagError(f"{self}: {error}") from error
         return values
 
     def running(self, unit: str) -> "Running":
         """The same, one message after the other, of numbers in `unit`."""
-        steps: list[_Scaled | _Unwrapped | _Slope | _Washout] = []
+        return Running(self._steps(unit)[0])
+
+    def _steps(self, unit: str) -> "tuple[list[_Step], str]":
+        """What is done to numbers in `unit`, and the unit of the result."""
+        steps: list[_Step] = []
         for operation in self.operations:
             if operation.name == "unit":
                 unit = operation.unit
@@ -208,7 +192,7 @@ class Expression:
                 unit = per_second(unit)
             elif operation.name == "washout":
                 steps.append(_Washout(operation.window))
-        return Running(steps)
+        return steps, unit
 
     def recorded_unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the number at the path, before any operation."""
@@ -242,7 +226,7 @@ def parse_factors(text: str) -> tuple[Expression, ...]:
 class Running:
     """An expression's operations on one message after the other: bit for bit what `apply` gives."""
 
-    def __init__(self, steps: "list[_Scaled | _Unwrapped | _Slope | _Washout]") -> None:
+    def __init__(self, steps: "Sequence[_Step]") -> None:
         self._steps = steps
 
     @property
@@ -257,10 +241,21 @@ class Running:
         return value
 
 
+class _Step(Protocol):
+    """An operation on all numbers (N,) with their stamps at once, or on one after the other."""
+
+    def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray: ...
+
+    def update(self, stamp_ns: int, value: float) -> float: ...
+
+
 @dataclass
 class _Scaled:
     factor: float
     shift: float
+
+    def all(self, values: FloatArray, _stamp_ns: IntArray) -> FloatArray:
+        return values * self.factor + self.shift
 
     def update(self, _stamp_ns: int, value: float) -> float:
         return value * self.factor + self.shift
@@ -270,6 +265,10 @@ class _Unwrapped:
     def __init__(self, turn: float) -> None:
         self._turn, self._turns, self._last = turn, 0.0, 0.0
 
+    def all(self, values: FloatArray, _stamp_ns: IntArray) -> FloatArray:
+        turns = np.cumsum(_turns(np.diff(values, prepend=0.0), self._turn))
+        return values - self._turn * turns
+
     def update(self, _stamp_ns: int, value: float) -> float:
         self._turns += float(_turns(np.array(value - self._last), self._turn))
         self._last = value
@@ -278,9 +277,13 @@ class _Unwrapped:
 
 class _Slope:
     def __init__(self, window: float) -> None:
+        self._window = window
         self._window_ns = round(window * 1e9)
         self._first_ns: int | None = None
         self._near: deque[tuple[int, float]] = deque()
+
+    def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray:
+        return derivative(values, stamp_ns, self._window)
 
     def update(self, stamp_ns: int, value: float) -> float:
         if self._first_ns is None:
@@ -297,10 +300,25 @@ class _Slope:
 
 
 class _Washout:
+    """What each step of the numbers added, fading with time constant `window` s.
+
+    q = 0 at the first finite value p, then q⁺ = exp(-Δt/window) q + (p⁺ - p): a first-order high
+    pass, -3 dB near 1/(2π window). What adds up its command for ever, a position, becomes a signal
+    of a stable model. Nothing is lost: Σ q⁺ - exp(-Δt/window) q is p again, but for its start. NaN
+    where the numbers are, which the next step bridges.
+
+    Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation (washout filter).
+    """
+
     def __init__(self, window: float) -> None:
         self._window_ns = window * 1e9
         self._last: tuple[int, float] | None = None
         self._moved = 0.0
+
+    def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray:
+        _require_increasing(stamp_ns, "washout")
+        moved = map(self.update, stamp_ns.tolist(), values.tolist())
+        return np.fromiter(moved, np.float64, len(values))
 
     def update(self, stamp_ns: int, value: float) -> float:
         if not math.isfinite(value):
@@ -311,22 +329,6 @@ class _Washout:
             self._moved = left * self._moved + (value - before)
         self._last = stamp_ns, value
         return self._moved
-
-
-def washout(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatArray:
-    """(N,) in the unit of `values`: what each step added, fading with time constant `window` s.
-
-    q = 0 at the first finite value p, then q⁺ = exp(-Δt/window) q + (p⁺ - p): a first-order high
-    pass, -3 dB near 1/(2π window). What adds up its command for ever, a position, becomes a signal
-    of a stable model. Nothing is lost: Σ q⁺ - exp(-Δt/window) q is p again, but for its start. NaN
-    where `values` are, which the next step bridges. Raises BagError if stamps do not increase.
-
-    Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation (washout filter).
-    """
-    _require_increasing(stamp_ns, "washout")
-    step = _Washout(window)
-    moved = map(step.update, stamp_ns.tolist(), values.tolist())
-    return np.fromiter(moved, np.float64, len(values))
 
 
 def derivative(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatArray:

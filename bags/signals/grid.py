@@ -3,9 +3,9 @@
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import Final, overload
 
 import numpy as np
 
@@ -27,11 +27,11 @@ from bags.signals.sampling import (
     BRIDGED,
     LOST,
     MOST_FILLED,
+    Grid,
     Sample,
     Sampler,
     held_values,
     one_clock,
-    sampled_path,
 )
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -64,46 +64,44 @@ def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
 def to_trajectories(
     responses: Sequence[Samples],
     excitations: Sequence[Samples | Sequence[Samples]],
+    grid: Grid,
     *,
-    period: float | None = None,
-    max_gap: float | None = None,
-    split_gaps: bool = False,
-    name: str = "",
-    group: str = "",
-    digest: str = "",
-    provenance: str = "",
+    name: str = "signals",
 ) -> list[Trajectory]:
-    """The samples of `bags.signals.sampling` as trajectories on a uniform grid, t = 0 at the first.
+    """Put signals on a uniform grid by the rules of `bags.signals.sampling`, t = 0 at the first.
 
-    period: s (None: the median step of the first response). max_gap: s (None: 1.5 periods, so no
-    sample may be missing). Responses that are samples as they come are used as they are, one on
-    each point of the grid, where they follow each other in a period give or take GRID_TOLERANCE,
-    as the monitor takes them; a point without one, in a gap of at most `max_gap`, is filled in on
-    the line between its neighbours. A command without a limit of its own, `|hold(T s)`, gets one of
-    `max_gap`, which its path says from then on. Samples that are filled in, here or by the rule of
-    `bags.signals.sampling`, are counted: `filled` in the provenance, `filled_samples`.
+    Responses that are samples as they come are used as they are, one on each point of the grid,
+    where they follow each other in a period give or take GRID_TOLERANCE, as the monitor takes
+    them; a point without one, in a gap of at most `max_gap`, is filled in on the line between its
+    neighbours. A command without a limit of its own, `|hold(T s)`, gets one of `max_gap`, which
+    its path says from then on. Samples that are filled in, here or by the rule of
+    `bags.signals.sampling`, are counted: `filled` in the provenance, `filled_samples`. Samples
+    without every signal are left out at the start and the end, and logged if they are more than
+    FEW.
 
-    Samples without every signal are left out at the start and the end, and logged if they are more
-    than FEW. Between them
-    they raise DataError, or with `split_gaps` end one trajectory and begin the next.
+    Args:
+        responses: signals whose paths say how they are sampled (`Grid.path`).
+        excitations: likewise; of several samples one is their product.
+        grid: period, max_gap and split_gaps are used.
+        name: of the trajectories, with a number behind it where there are several.
 
-    Raises DataError, saying where, if stamps repeat, a gap is too long, a response that is not
-    resampled is not sampled at the period, or fewer than two samples are left. An excitation of
-    several samples is their product.
+    Returns:
+        One trajectory, or with `split_gaps` one for each stretch without a gap.
+
+    Raises:
+        DataError: says where, if stamps repeat, a gap is too long, a response that is not
+            resampled is not sampled at the period, or fewer than two samples are left.
     """
-    label = name or "signals"
     parts = [(e,) if isinstance(e, Samples) else tuple(e) for e in excitations]
     drives = [samples for part in parts for samples in part]
     if not responses or not excitations:
-        raise DataError(f"{label}: needs at least one response and one excitation")
+        raise DataError(f"{name}: needs at least one response and one excitation")
     for samples in responses:
-        _refuse_repeated_stamps(samples, label)
+        _refuse_repeated_stamps(samples, name)
     signals = [Expression.parse(samples.path) for samples in responses]
-    on_grid = signals[0].operation("hold", "linear") is not None
-    base = responses[0].stamp_ns
-    where = f"{label}: {responses[0].path}"
-    period_ns = _period_ns(base, period, where, on_grid=on_grid)
-    gap_ns = round(BRIDGED * period_ns if max_gap is None else max_gap * 1e9)
+    where = f"{name}: {responses[0].path}"
+    period_ns = _period_ns(responses[0].stamp_ns, grid.period, where, on_grid=_on_grid(signals[0]))
+    gap_ns = round(BRIDGED * period_ns if grid.max_gap is None else grid.max_gap * 1e9)
     held = [product(_held_for(samples, gap_ns) for samples in part) for part in parts]
     sampler = Sampler(list(map(str, signals)), held, period=period_ns / 1e9)
     found = [
@@ -111,42 +109,48 @@ def to_trajectories(
     ]
     complete = [k for k, sample in enumerate(found) if not sample.missing]
     if len(complete) < 2:
-        raise DataError(_no_overlap(label, responses, drives, len(complete)))
+        raise DataError(_no_overlap(name, responses, drives, len(complete)))
     last = complete[-1]
     left_out = sampler.incomplete + len(found) - last - 1
-    if left_out > FEW * len(complete) and not split_gaps:
+    if left_out > FEW * len(complete) and not grid.split_gaps:
         log.warning(
             "%s: %d of %d samples left out, where a signal is missing at the start or the end",
-            label,
+            name,
             left_out,
             sampler.incomplete + len(found),
         )
     runs = [found[: last + 1]]
-    if split_gaps:
+    if grid.split_gaps:
         runs = [run for run in _whole_runs(runs[0], gap_ns) if len(run) >= MIN_STRETCH]
         if not runs:
-            raise DataError(f"{label}: no stretch of {MIN_STRETCH} samples without a gap")
-    return [
-        _trajectory(
-            run,
-            sampler,
-            parts,
-            period_ns=period_ns,
-            gap_ns=gap_ns,
-            label=label,
-            labels={
-                "y_units": tuple(samples.unit for samples in responses),
-                "u_units": tuple(part[0].unit if len(part) == 1 else "" for part in parts),
-                "y_paths": tuple(samples.path for samples in responses),
-                "u_paths": tuple(held),
-                "name": name if len(runs) == 1 else f"{name}.{k}",
-                "group": group if len(runs) == 1 else "",
-                "digest": digest,
-                "provenance": provenance,
-            },
+            raise DataError(f"{name}: no stretch of {MIN_STRETCH} samples without a gap")
+    y_paths = tuple(samples.path for samples in responses)
+    trials = []
+    for k, run in enumerate(runs, start=1):
+        _refuse_incomplete(run, name)
+        y, u, counted = _numbers(run, sampler, parts, gap_ns, name)
+        t = seconds(period_ns * np.arange(len(y)), 0)
+        said = {what: count for what, count in counted.items() if count}
+        trials.append(
+            Trajectory(
+                t=t,
+                y=y,
+                u=u,
+                name=name if len(runs) == 1 else f"{name}.{k}",
+                provenance=canonical(said).decode() if said else "",
+                y_names=y_paths,
+                u_names=tuple(product(samples.path for samples in part) for part in parts),
+                y_units=tuple(samples.unit for samples in responses),
+                u_units=tuple(part[0].unit if len(part) == 1 else "" for part in parts),
+                y_paths=y_paths,
+                u_paths=tuple(held),
+            )
         )
-        for k, run in enumerate(runs, start=1)
-    ]
+    return trials
+
+
+def _on_grid(response: Expression) -> bool:
+    return response.operation("hold", "linear") is not None
 
 
 def _held_for(samples: Samples, gap_ns: int) -> str:
@@ -187,16 +191,7 @@ def _whole_runs(found: Sequence[Sample], gap_ns: int) -> Iterator[list[Sample]]:
         yield run
 
 
-def _trajectory(
-    run: Sequence[Sample],
-    sampler: Sampler,
-    drives: Sequence[Sequence[Samples]],
-    *,
-    period_ns: int,
-    gap_ns: int,
-    label: str,
-    labels: dict[str, Any],
-) -> Trajectory:
+def _refuse_incomplete(run: Sequence[Sample], label: str) -> None:
     for sample in run:
         if sample.missing:
             raise DataError(
@@ -204,45 +199,39 @@ def _trajectory(
                 f"({sum(bool(s.missing) for s in run)} of {len(run)} samples are not complete); "
                 "split_gaps leaves out such stretches"
             )
+
+
+def _numbers(
+    run: Sequence[Sample],
+    sampler: Sampler,
+    drives: Sequence[Sequence[Samples]],
+    gap_ns: int,
+    label: str,
+) -> tuple[FloatArray, FloatArray, dict[str, int]]:
+    """Responses and excitations (N, ...) of complete samples; how many were filled in, and how
+    often a monitor begins a new run.
+    """
     stamps = np.array([sample.stamp_ns for sample in run], dtype=np.int64)
     y = np.array([sample.y for sample in run])
     u = np.array([sample.u for sample in run])
-    filled, restarts = sum(bool(sample.filled) for sample in run), 0
-    if not sampler.on_grid:
-        where = f"{label}: {sampler.responses[0]}"
-        _refuse_gaps(stamps, gap_ns, where)
-        points = _points(stamps, period_ns, where)
-        grid = np.arange(points[-1][0] + 1)
-        at, rows = (np.array(column) for column in zip(*points, strict=True))
-        filled = len(grid) - len(rows)
-        restarts = _restarts(stamps[rows], at, period_ns)
-        y = np.column_stack([np.interp(grid, at, column) for column in y[rows].T])
-        u = u[rows]
-        if filled:
-            before = np.searchsorted(at, grid, side="right") - 1
-            at_ns = stamps[rows[before]] + period_ns * (grid - at[before])
-            u = np.column_stack(
-                [
-                    np.prod(
-                        [
-                            held_values(samples, signal, at_ns.tolist())
-                            for samples, signal in zip(part, rules, strict=True)
-                        ],
-                        axis=0,
-                    )
-                    for part, rules in zip(drives, sampler.excitations, strict=True)
-                ]
-            )
-    t = seconds(period_ns * np.arange(len(y)), 0)
-    counted = {"filled": filled, "restarts": restarts}
-    if counted := {what: count for what, count in counted.items() if count}:
-        origin = json.loads(labels["provenance"] or "{}") | counted
-        labels = labels | {"provenance": canonical(origin).decode()}
-    names = {
-        "y_names": labels["y_paths"],
-        "u_names": tuple(product(samples.path for samples in part) for part in drives),
-    }
-    return Trajectory(t=t, y=y, u=u, **names, **labels)
+    if sampler.on_grid:
+        return y, u, {"filled": sum(bool(sample.filled) for sample in run)}
+    period_ns, where = sampler.period_ns, f"{label}: {sampler.responses[0]}"
+    _refuse_gaps(stamps, gap_ns, where)
+    points = _points(stamps, period_ns, where)
+    grid = np.arange(points[-1][0] + 1)
+    at, rows = (np.array(column) for column in zip(*points, strict=True))
+    restarts = _restarts(stamps[rows], at, period_ns)
+    y = np.column_stack([np.interp(grid, at, column) for column in y[rows].T])
+    if len(grid) == len(rows):
+        return y, u[rows], {"restarts": restarts}
+    before = np.searchsorted(at, grid, side="right") - 1
+    at_ns = stamps[rows[before]] + period_ns * (grid - at[before])
+    u = np.ones((len(grid), len(drives)))
+    for column, part, rules in zip(u.T, drives, sampler.excitations, strict=True):
+        for samples, signal in zip(part, rules, strict=True):
+            column *= held_values(samples, signal, at_ns.tolist())
+    return y, u, {"filled": len(grid) - len(rows), "restarts": restarts}
 
 
 def _points(stamps: IntArray, period_ns: int, where: str) -> list[tuple[int, int]]:
@@ -287,117 +276,97 @@ def _no_overlap(
 
 
 def read_dataset(
-    bags: Sequence[Path | str],
+    bags: Sequence[Path | str] | Mapping[str, Path | str],
     *,
     responses: Sequence[str],
     excitations: Sequence[str],
-    period: float | None = None,
-    max_gap: float | None = None,
-    clock: str = "header",
-    resample: str = "none",
-    hold: float | None = None,
-    sort: bool = False,
-    drop_duplicates: bool = False,
-    split_gaps: bool = False,
-    unfinished: bool = False,
+    grid: Grid | None = None,
     definitions: Mapping[str, Definition] | None = None,
-    names: Sequence[str] | None = None,
     progress: Progress = silent,
 ) -> Dataset:
-    """The signals (see `bags.signals.expressions`) of several bags, one trajectory a bag.
+    """Read signals of several bags as trajectories, one a bag.
 
-    A trajectory has the bag's name and digest, and as group its custom datum `repeat_group`. Its
-    provenance is the bag's digest, files and custom data, the signals and the options.
+    A trajectory has the bag's digest, and as group its custom datum `repeat_group`. Its provenance
+    is the bag's digest, files and custom data, the signals and the rules.
 
-    clock: `header` or `log`; resample: `none`, `last` or `linear`; hold: s. They are written into
-    the signals' paths (`sampled_path`), so that a model knows how its samples are made; what they
-    and period and max_gap mean is in `bags.signals.sampling` and `to_trajectories`. For sort,
-    drop_duplicates and unfinished see `read_signals`.
+    Args:
+        bags: where they are; by the trajectories' names, which are else those of the bags.
+        responses: their texts (see `bags.signals.expressions`).
+        excitations: likewise.
+        grid: how messages become samples (None: samples as they come, none missing). The rules are
+            written into the signals' paths, so that a model knows how its samples are made. With
+            `split_gaps` the stretches of a bag are `name.1`, `name.2`, ...; they are no repeats,
+            and `skipped_samples` counts what is in none of them.
+        definitions: of message types that the bags do not define (`bags.recordings.definitions`).
+        progress: told after each bag.
 
-    split_gaps: a bag in which a signal is missing, or NaN, for more than `max_gap` gives one
-    trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
-    are no repeats, and `skipped_samples` counts what is in none of them. definitions: of message
-    types that the bags do not define (`bags.recordings.definitions`). names: of the trajectories
-    (None: their bags'). progress: told after each bag. Raises BagError and
-    DataError as `read_signals`, `to_trajectories` and `Dataset` do.
+    Returns:
+        The trajectories, in the order of the bags.
+
+    Raises:
+        BagError: as `read_signals`.
+        DataError: as `to_trajectories` and `Dataset`.
     """
-    paths = [place(bag) for bag in bags]
-    names = list(map(trial_name, paths)) if names is None else names
-    if len(set(names)) < len(names):
-        name = min(name for name in names if names.count(name) > 1)
-        own = [str(path) for path, called in zip(paths, names, strict=True) if called == name]
-        raise DataError(
-            f"two bags are called '{name}': {own[0]} and {own[1]}; trials are told apart by name "
-            "(with --workers 1 `nlsid identify` and `select` take their folders into the name)"
-        )
-    options = {
-        "period": period,
-        "max_gap": max_gap,
-        "clock": clock,
-        "resample": resample,
-        "hold": hold,
-        "sort": sort,
-        "drop_duplicates": drop_duplicates,
-        "split_gaps": split_gaps,
-        "unfinished": unfinished,
-    }
+    named = bags if isinstance(bags, Mapping) else _named(list(map(place, bags)))
     signals = {"responses": list(responses), "excitations": list(excitations)}
     trajectories: list[Trajectory] = []
-    for done, (path, name) in enumerate(zip(paths, names, strict=True), start=1):
-        trajectories += _read_trials(
-            path, name, signals=signals, options=options, definitions=definitions
-        )
-        progress("reading bags", done / len(paths))
+    for done, (name, path) in enumerate(named.items(), start=1):
+        with Bag(path, definitions=definitions) as bag:
+            trajectories += _read_trials(bag, name, signals, grid or Grid())
+        progress("reading bags", done / len(named))
     return Dataset(tuple(trajectories))
 
 
+def _named(paths: Sequence[Path]) -> dict[str, Path]:
+    """The bags by their names; DataError for two of one name."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        first = found.setdefault(trial_name(path), path)
+        if first is not path:
+            raise DataError(
+                f"two bags are called '{trial_name(path)}': {first} and {path}; trials are told "
+                "apart by name (with --workers 1 `nlsid identify` takes their folders into the "
+                "name)"
+            )
+    return found
+
+
 def _read_trials(
-    path: Path,
-    name: str,
-    *,
-    signals: Mapping[str, list[str]],
-    options: Json,
-    definitions: Mapping[str, Definition] | None,
+    bag: Bag, name: str, signals: Mapping[str, list[str]], grid: Grid
 ) -> list[Trajectory]:
     """The trajectories of one bag."""
-    rule = {key: options[key] for key in ("clock", "resample", "hold", "max_gap")}
     texts = {
-        role: [sampled_path(text, **rule, response=role == "responses") for text in paths]
+        role: [grid.path(text, response=role == "responses") for text in paths]
         for role, paths in signals.items()
     }
-    named = [part for paths in texts.values() for text in paths for part in factors(text)]
-    named = list(dict.fromkeys(named))
-    if several := [text for text in named if Expression.parse(text).path.every]:
+    parts = [part for paths in texts.values() for text in paths for part in factors(text)]
+    parts = list(dict.fromkeys(parts))
+    if several := [text for text in parts if Expression.parse(text).path.every]:
         raise BagError(f"{several[0]} is several signals; name one element of it for each")
-    wanted = one_clock([Expression.parse(text) for text in named])
-    with Bag(path, unfinished=options["unfinished"], definitions=definitions) as bag:
-        read = read_signals(
-            bag,
-            named,
-            sort=options["sort"],
-            drop_duplicates=options["drop_duplicates"],
-            gaps_in=texts["responses"] if options["split_gaps"] else (),
+    wanted = one_clock([Expression.parse(text) for text in parts])
+    read = read_signals(bag, parts, gaps_in=texts["responses"] if grid.split_gaps else ())
+    _refuse_other_clocks(bag.path, read, wanted)
+    for text, samples in read.items():
+        if doubt := samples.doubt(responds=text in texts["responses"]):
+            raise SamplesError(f"{bag.path}: {doubt}; record it again with one of them")
+    measured = [read[text] for text in texts["responses"]]
+    drives = [[read[part] for part in factors(text)] for text in texts["excitations"]]
+    trials = to_trajectories(measured, drives, grid, name=name)
+    origin = bag_origin(bag)
+    said: Json = {"bag": origin, "signals": dict(signals), "grid": asdict(grid)}
+    if grid.split_gaps:
+        base = measured[0].stamp_ns
+        span = seconds(int(base[-1]), int(base[0]))
+        said["skipped"] = 1 + round(span / trials[0].period) - sum(map(len, trials))
+    return [
+        replace(
+            trial,
+            group=origin["custom"].get(REPEAT_GROUP, "") if len(trials) == 1 else "",
+            digest=origin["digest"],
+            provenance=canonical(said | json.loads(trial.provenance or "{}")).decode(),
         )
-        _refuse_other_clocks(path, read, wanted)
-        for text, samples in read.items():
-            if doubt := samples.doubt(responds=text in texts["responses"]):
-                raise SamplesError(f"{path}: {doubt}; record it again with one of them")
-        origin = bag_origin(bag)
-    responses = [read[text] for text in texts["responses"]]
-    trials = to_trajectories(
-        responses,
-        [[read[part] for part in factors(text)] for text in texts["excitations"]],
-        period=options["period"],
-        max_gap=options["max_gap"],
-        split_gaps=options["split_gaps"],
-        name=name,
-        group=origin["custom"].get(REPEAT_GROUP, ""),
-        digest=origin["digest"],
-        provenance=canonical({"bag": origin, "signals": signals, "options": options}).decode(),
-    )
-    if options["split_gaps"]:
-        return _with_skipped(trials, responses[0])
-    return trials
+        for trial in trials
+    ]
 
 
 def _refuse_other_clocks(path: Path, read: Mapping[str, Samples], wanted: str) -> None:
@@ -410,19 +379,6 @@ def _refuse_other_clocks(path: Path, read: Mapping[str, Samples], wanted: str) -
         f"{path}: not every signal has a {clock}, and times of two clocks cannot be paired: "
         f"{said}; set `clock: log` to pair all of them by the times at which they were logged"
     )
-
-
-def _with_skipped(trials: list[Trajectory], base: Samples) -> list[Trajectory]:
-    """The trials of one bag with the number of samples between its first and last not in them."""
-    span = seconds(int(base.stamp_ns[-1]), int(base.stamp_ns[0]))
-    skipped = 1 + round(span / trials[0].period) - sum(map(len, trials))
-    return [
-        replace(
-            trial,
-            provenance=canonical(json.loads(trial.provenance) | {"skipped": skipped}).decode(),
-        )
-        for trial in trials
-    ]
 
 
 def skipped_samples(dataset: Dataset) -> int:

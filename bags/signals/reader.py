@@ -1,30 +1,26 @@
 """Read signals from a bag: numbers with the stamps of the messages they came in."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
-from bags.recordings.definitions import Definition
 from bags.recordings.remote import RemotePath
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.publishers import two_curves
-from bags.signals.timing import without_duplicates
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
 HEADER_STAMP: Final = "header stamp"
 LOG_TIME: Final = "log time"
-PUBLISH_TIME: Final = "publish time"
-CLOCKS: Final = (HEADER_STAMP, LOG_TIME, PUBLISH_TIME)
 
 
 class SamplesError(BagError):
@@ -36,8 +32,8 @@ class Samples:
     """A signal as recorded; arrays are read-only.
 
     stamp_ns: (N,) ns since the epoch, not decreasing. values: (N,) finite, in `unit` ("": unknown).
-    clock: where the stamps come from, one of CLOCKS. counted: why the messages' counts are not of
-    one publisher; empty if they can be.
+    clock: where the stamps come from, HEADER_STAMP or LOG_TIME. counted: why the messages' counts
+    are not of one publisher; empty if they can be.
     """
 
     path: str
@@ -67,52 +63,49 @@ def read_signals(
     bag: Bag | Path | str,
     paths: Sequence[str],
     *,
-    clock: str | None = None,
     sort: bool = False,
-    drop_duplicates: bool = False,
-    unfinished: bool = False,
     gaps_in: Sequence[str] = (),
-    definitions: Mapping[str, Definition] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Samples]:
-    """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
+    """Read the signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
 
-    bag: where it is; or one that is open, for which unfinished and definitions were said then.
-    clock: which times are the stamps of the signals whose text has no `|clock(...)` (None: header
-    stamps, log time for types without a header).
-    sort: put messages in the order of their stamps instead of refusing stamps that go back.
-    drop_duplicates: of messages with one stamp keep the first.
-    unfinished: read what there is of a recording that was not closed.
-    gaps_in: those of `paths` whose messages without a finite number are left out, not refused.
-    definitions: of message types that the bag does not define.
-    `[*]` gives one entry per element. Every path is checked against the types in the bag before a
-    message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
-    if a topic or field does not exist or is no number; if a topic has no messages; SamplesError if
-    a value is not finite or time goes back.
+    `[*]` gives one entry per element. Stamps are the header's, the log times for types without a
+    header; a text with `|clock(...)` says itself which. Every path is checked against the types in
+    the bag before a message is read.
+
+    Args:
+        bag: where it is, or one that is open.
+        paths: the signals' texts.
+        sort: put messages in the order of their stamps instead of refusing stamps that go back.
+        gaps_in: those of `paths` whose messages without a finite number are left out, not refused.
+        progress: told how far it is.
+
+    Returns:
+        Samples by the signals' texts.
+
+    Raises:
+        BagError: names the bag, if it is missing, unfinished or damaged; if a topic or field does
+            not exist or is no number; if a topic has no messages.
+        SamplesError: if a value is not finite or time goes back.
     """
-    if clock is not None and clock not in CLOCKS:
-        raise BagError(f"no clock '{clock}'; there are: {', '.join(CLOCKS)}")
-    named = {"header": HEADER_STAMP, "log": LOG_TIME, "": clock}
-    with _opened(bag, unfinished, definitions) as source:
+    with _opened(bag) as source:
         wanted = expanded(source, paths)
         kinds = {e.path.topic: source.types_on(e.path.topic) for e in wanted.values()}
-        for expression in wanted.values():
-            _checked_unit(source, expression, *kinds[expression.path.topic])
+        with _naming(source):
+            for expression in wanted.values():
+                expression.unit(*kinds[expression.path.topic])
         columns = read_columns(
             source, {name: e.path for name, e in wanted.items()}, progress=progress
         )
-        topics: dict[tuple[str, str | None], _Topic] = {}
+        stamped: dict[tuple[str, str], _Stamped] = {}
         samples = {}
         for name, expression in wanted.items():
             topic = expression.path.topic
-            key = topic, named[expression.clock]
-            if key not in topics:
-                topics[key] = _Topic(source, columns[topic], key[1], sort=sort)
-                topics[key].check_stamps(source.count(topic))
-                if drop_duplicates:
-                    topics[key].drop_duplicates()
+            key = topic, expression.clock
+            if key not in stamped:
+                stamped[key] = _stamped(source, columns[topic], expression.clock, sort=sort)
             gaps = name in gaps_in or expression.path.framed
-            recorded = topics[key].samples(name, gaps=gaps)
+            recorded = _recorded(source, name, stamped[key], gaps=gaps)
             recorded = replace(recorded, counted=columns[topic].doubt(name, responds=False))
             samples[name] = _applied(source, expression, recorded, kinds[topic], gaps=gaps)
     return samples
@@ -137,13 +130,13 @@ def bag_digest(bag: Path | str) -> str:
     return digest
 
 
-def bag_origin(bag: Bag | Path | str, *, unfinished: bool = False) -> Json:
+def bag_origin(bag: Bag | Path | str) -> Json:
     """What a dataset's provenance says of a bag: digest, files with their sizes, custom data.
 
     The digest of a remote file is of what storage says of it and of its end (docs/decisions/0027):
     its content is not read for it.
     """
-    with _opened(bag, unfinished) as source:
+    with _opened(bag) as source:
         digest = hashlib.sha256()
         for file in source.files:
             if isinstance(file, RemotePath):
@@ -159,34 +152,24 @@ def bag_origin(bag: Bag | Path | str, *, unfinished: bool = False) -> Json:
         }
 
 
-def bag_metadata(bag: Path | str) -> dict[str, str]:
-    """The bag's own key-value pairs (`custom_data`); empty if it has none. BagError as above."""
-    with Bag(bag) as source:
-        return source.custom
-
-
-def _opened(
-    bag: Bag | Path | str,
-    unfinished: bool,
-    definitions: Mapping[str, Definition] | None = None,
-) -> AbstractContextManager[Bag]:
+def _opened(bag: Bag | Path | str) -> AbstractContextManager[Bag]:
     """The bag, opened and closed here unless it is open."""
-    if isinstance(bag, Bag):
-        return nullcontext(bag)
-    return Bag(bag, unfinished=unfinished, definitions=definitions)
+    return nullcontext(bag) if isinstance(bag, Bag) else Bag(bag)
+
+
+@contextmanager
+def _naming(source: Bag) -> Iterator[None]:
+    """Let errors name the bag."""
+    try:
+        yield
+    except BagError as error:
+        raise BagError(f"{source.path}: {error}") from error
 
 
 def stamp_text(stamp_ns: int) -> str:
     """A stamp for people: seconds with all nine decimals."""
     sign = "-" if stamp_ns < 0 else ""
     return f"{sign}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d} s"
-
-
-def _checked_unit(source: Bag, expression: Expression, msgtype: str, types: Typestore) -> str:
-    try:
-        return expression.unit(msgtype, types)
-    except BagError as error:
-        raise BagError(f"{source.path}: {error}") from error
 
 
 def _applied(
@@ -201,12 +184,10 @@ def _applied(
     unit = expression.unit(*kind)
     if not expression.numbers.operations:
         return replace(recorded, unit=unit)
-    try:
+    with _naming(source):
         values = expression.apply(
             recorded.values, recorded.stamp_ns, expression.recorded_unit(*kind)
         )
-    except BagError as error:
-        raise BagError(f"{source.path}: {error}") from error
     finite = np.isfinite(values)
     kept = finite if gaps else np.arange(len(values)) >= int(np.argmax(finite))
     if not (finite[kept].all() and kept.any()):
@@ -219,71 +200,57 @@ def _applied(
     return replace(recorded, stamp_ns=recorded.stamp_ns[kept], values=values[kept], unit=unit)
 
 
-class _Topic:
-    """One topic's columns, with the stamps of the chosen clock, checked."""
+class _Stamped(NamedTuple):
+    """One topic's columns by the stamps of a clock, which were checked."""
 
-    def __init__(self, source: Bag, columns: Columns, clock: str | None, *, sort: bool) -> None:
-        self._where = f"{source.path}: {columns.topic}"
-        self._bag = source.path
-        self._values = columns.values
-        if clock is None:
-            clock = LOG_TIME if columns.stamp_ns is None else HEADER_STAMP
-        self._clock = clock
-        if clock == HEADER_STAMP:
-            if columns.stamp_ns is None:
-                raise BagError(
-                    f"{self._where}: its messages have no header stamp; choose {LOG_TIME}"
-                )
-            self._stamps = columns.stamp_ns
-        else:
-            self._stamps = columns.log_ns if clock == LOG_TIME else columns.publish_ns
-        self._back = columns.back if clock == LOG_TIME and not sort else ()
-        if sort and (np.diff(self._stamps) < 0).any():
-            order = np.argsort(self._stamps, kind="stable")
-            self._stamps = self._stamps[order]
-            self._values = {name: values[order] for name, values in columns.values.items()}
+    columns: Columns
+    stamp_ns: IntArray
+    clock: str
 
-    def check_stamps(self, expected: int) -> None:
-        stamps = self._stamps
-        if len(stamps) != expected:
-            raise BagError(
-                f"{self._where} has {len(stamps)} messages, the bag's index says {expected}; "
-                "the bag is damaged"
-            )
-        if not len(stamps):
-            raise BagError(f"{self._where} has no messages; was its publisher running?")
-        if self._clock == HEADER_STAMP and not stamps.any():
-            raise SamplesError(
-                f"{self._where}: every header stamp is 0; its publisher does not fill it in"
-            )
-        back = self._back or [
-            (int(i) + 1, int(stamps[i]), int(stamps[i + 1]))
-            for i in np.flatnonzero(np.diff(stamps) < 0)
-        ]
-        if back:
-            at, before, after = back[0]
-            raise SamplesError(
-                f"{self._where}: time goes back by {(before - after) / 1e9:g} s at message {at}: "
-                f"{self._clock} {stamp_text(before)}, then {stamp_text(after)} "
-                f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
-            )
 
-    def drop_duplicates(self) -> None:
-        kept = without_duplicates(self._stamps)
-        if len(kept) < len(self._stamps):
-            self._stamps = self._stamps[kept]
-            self._values = {name: values[kept] for name, values in self._values.items()}
+def _stamped(source: Bag, columns: Columns, clock: str, *, sort: bool) -> _Stamped:
+    """The columns by `header` or `log` stamps (empty: by those there are); BagError if wrong."""
+    where, expected = f"{source.path}: {columns.topic}", source.count(columns.topic)
+    if len(columns) != expected:
+        raise BagError(
+            f"{where} has {len(columns)} messages, the bag's index says {expected}; "
+            "the bag is damaged"
+        )
+    if not expected:
+        raise BagError(f"{where} has no messages; was its publisher running?")
+    if clock == "header" and columns.stamp_ns is None:
+        raise BagError(f"{where}: its messages have no header stamp; choose {LOG_TIME}")
+    header = None if clock == "log" else columns.stamp_ns
+    stamps, called = (columns.log_ns, LOG_TIME) if header is None else (header, HEADER_STAMP)
+    if called == HEADER_STAMP and not stamps.any():
+        raise SamplesError(f"{where}: every header stamp is 0; its publisher does not fill it in")
+    falls = np.flatnonzero(np.diff(stamps) < 0)
+    if sort:
+        order = np.argsort(stamps, kind="stable") if len(falls) else slice(None)
+        return _Stamped(columns.select(order), stamps[order], called)
+    back = columns.back if called == LOG_TIME else ()
+    back = back or [(int(i) + 1, int(stamps[i]), int(stamps[i + 1])) for i in falls]
+    if back:
+        at, before, after = back[0]
+        raise SamplesError(
+            f"{where}: time goes back by {(before - after) / 1e9:g} s at message {at}: "
+            f"{called} {stamp_text(before)}, then {stamp_text(after)} "
+            f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
+        )
+    return _Stamped(columns, stamps, called)
 
-    def samples(self, name: str, *, gaps: bool) -> Samples:
-        values = self._values[name]
-        finite = np.isfinite(values)
-        if gaps and finite.any():
-            return Samples(name, self._stamps[finite], values[finite], self._clock)
-        if len(bad := np.flatnonzero(~finite)):
-            i = int(bad[0])
-            raise SamplesError(
-                f"{self._bag}: {name} is {values[i]} in message {i} at "
-                f"{stamp_text(int(self._stamps[i]))} ({len(bad)} of {len(values)} messages "
-                "are not finite); record it again or cut the bag there"
-            )
-        return Samples(name, self._stamps, values, self._clock)
+
+def _recorded(source: Bag, name: str, topic: _Stamped, *, gaps: bool) -> Samples:
+    """A signal's finite values; SamplesError for others, unless `gaps` leaves them out."""
+    values, stamps = topic.columns.values[name], topic.stamp_ns
+    finite = np.isfinite(values)
+    if gaps and finite.any():
+        return Samples(name, stamps[finite], values[finite], topic.clock)
+    if len(bad := np.flatnonzero(~finite)):
+        i = int(bad[0])
+        raise SamplesError(
+            f"{source.path}: {name} is {values[i]} in message {i} at "
+            f"{stamp_text(int(stamps[i]))} ({len(bad)} of {len(values)} messages "
+            "are not finite); record it again or cut the bag there"
+        )
+    return Samples(name, stamps, values, topic.clock)

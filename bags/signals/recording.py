@@ -1,7 +1,8 @@
 """A bag while it is recorded: what came on each topic, until it ends or the disk is full."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Final
 
 from bags.recordings.definitions import Definition
@@ -51,7 +52,7 @@ class Recording:
         if number is not None:
             self._sequence[topic].update(number)
         times = {"log_time_ns": log_ns, "publish_time_ns": publish_ns}
-        try:
+        try:  # at every message: half the time of `_ending`
             self.bag.write(topic, msgtype, data, **times, sequence=number)
         except OSError as error:
             self._end(str(error))
@@ -64,10 +65,8 @@ class Recording:
         """Add to the bag's metadata."""
         if self._closed:
             return
-        try:
+        with self._ending():
             self.bag.annotate(custom)
-        except OSError as error:
-            self._end(str(error))
 
     def keep_up(self) -> None:
         """Close the chunk, and the bag if it was taken away or the disk is (nearly) full; to be
@@ -75,16 +74,13 @@ class Recording:
         """
         if self._closed:
             return
-        try:
+        with self._ending():
             self.bag.close_chunk()
             free = shutil.disk_usage(self.bag.path).free / 1e6
-        except OSError as error:
-            self._end(str(error))
-            return
-        if self.bag.full:
-            self._end(self.bag.full)
-        elif free < self._least_free:
-            self._end(f"{free:.0f} MB left, {self._least_free:g} are to stay free")
+            if self.bag.full:
+                self._end(self.bag.full)
+            elif free < self._least_free:
+                self._end(f"{free:.0f} MB left, {self._least_free:g} are to stay free")
 
     def close(self) -> None:
         """Write the counts into the bag and close it; once."""
@@ -127,6 +123,14 @@ class Recording:
         """Before they could be handed on, and by the publisher's count since then."""
         sequence = self._sequence[topic]
         return self._lost[topic] + (0 if sequence.mixed else sequence.missing)
+
+    @contextmanager
+    def _ending(self) -> Iterator[None]:
+        """End the recording where the disk refuses."""
+        try:
+            yield
+        except OSError as error:
+            self._end(str(error))
 
     def _end(self, why: str) -> None:
         self.ended = f"recording stopped: {why}"

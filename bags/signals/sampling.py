@@ -36,6 +36,7 @@ so that is when every topic has been seen at or after it.
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from rosbags.typesys.store import Typestore
@@ -62,6 +63,45 @@ FILLED: Final = "filled in"  # how the reason of a sample begins that nobody mea
 NOT_FINITE: Final = "not a finite number"
 LEAP: Final = 1000  # samples in a row of which every one would be said to be missing
 HISTORY: Final = 2**16  # values kept of a signal while no sample comes: a minute at 1 kHz
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the numbers in messages become samples.
+
+    Attributes:
+        period: s between samples (None: the median step of the first response).
+        max_gap: s without a response that is still filled in, or resampled over (None: 1.5
+            periods, so no sample may be missing).
+        clock: of all signals, `header` or `log`.
+        resample: `none`, `last` or `linear` for responses.
+        hold: s for which a command is held (None: as long as max_gap).
+        split_gaps: a longer gap ends a trajectory and begins the next, instead of an error.
+    """
+
+    period: float | None = None
+    max_gap: float | None = None
+    clock: str = "header"
+    resample: str = "none"
+    hold: float | None = None
+    split_gaps: bool = False
+
+    def path(self, text: str, *, response: bool) -> str:
+        """A signal's text with these rules written into it; what it says itself stays."""
+        parts = factors(text)
+        if len(parts) > 1:
+            return product(self.path(part, response=response) for part in parts)
+        recorded = signal = Expression.parse(text)
+        if self.clock != "header":
+            signal = signal.sampled("clock", unit=self.clock)
+        if response and self.resample != "none":
+            if self.max_gap is None:
+                raise BagError("resampling needs max_gap: the longest time between two values")
+            rule = "hold" if self.resample == "last" else "linear"
+            signal = signal.sampled(rule, window=self.max_gap)
+        if not response and self.hold is not None:
+            signal = signal.sampled("hold", window=self.hold)
+        return text if signal == recorded else str(signal)
 
 
 class Sample(NamedTuple):
@@ -186,14 +226,6 @@ class Sampler:
         for k, value in numbers.items():
             self._operate(k, stamp_ns, value)
         return self._release(-math.inf)
-
-    def respond(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
-        """Take every response as read from one message; the samples that are certain now."""
-        return self.take(stamp_ns, dict(enumerate(values)))
-
-    def excite(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
-        """Take every factor of the excitations from one message; the samples certain now."""
-        return self.take(stamp_ns, dict(enumerate(values, start=len(self.responses))))
 
     def feed(self, k: int, stamp_ns: int, value: float) -> list[Sample]:
         """Take a number of signal k (as `numbers` counts), its operations done already."""
@@ -474,36 +506,6 @@ def one_clock(signals: Sequence[Expression]) -> str:
         said = ", ".join(f"{text} by its {clock} time" for text, clock in clocks.items())
         raise BagError(f"signals on two clocks cannot be paired: {said}; choose one clock")
     return next(iter(clocks.values()))
-
-
-def sampled_path(
-    text: str,
-    *,
-    clock: str = "header",
-    resample: str = "none",
-    hold: float | None = None,
-    max_gap: float | None = None,
-    response: bool,
-) -> str:
-    """A signal's text with a configuration's `clock` and `grid` written into it.
-
-    resample: `none`, `last` or `linear` for responses, over at most `max_gap` s. hold: s for which
-    an excitation is held; each factor of a product is. What the text says itself stays.
-    """
-    parts = factors(text)
-    if len(parts) > 1:
-        rule = {"clock": clock, "resample": resample, "hold": hold, "max_gap": max_gap}
-        return product(sampled_path(part, **rule, response=response) for part in parts)  # type: ignore[arg-type]
-    signal = Expression.parse(text)
-    if clock != "header":
-        signal = signal.sampled("clock", unit=clock)
-    if response and resample != "none":
-        if max_gap is None:
-            raise BagError("resampling needs max_gap: the longest time between two values")
-        signal = signal.sampled("hold" if resample == "last" else "linear", window=max_gap)
-    if not response and hold is not None:
-        signal = signal.sampled("hold", window=hold)
-    return text if signal == Expression.parse(text) else str(signal)
 
 
 def held_values(samples: Samples, signal: Expression, at_ns: Sequence[int]) -> list[float]:

@@ -19,6 +19,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import fields_of
 from bags.recordings.names import did_you_mean
 from nlsid_core.arrays import FloatArray
@@ -34,33 +35,6 @@ _STEP: Final = re.compile(
 )
 _FORM: Final = "a signal is written topic:field.path[index], e.g. /joint_states:position[0]"
 _MAX_DEPTH: Final = 16  # of message types in message types, when listing paths
-
-
-@dataclass(frozen=True)
-class Step:
-    """One field on the way to the number, and which element of it if it is an array.
-
-    index: the element. key: (array of strings beside the field, the string at the element's place).
-    every: `[*]`, all elements. length: how many elements there must be (None: any number).
-    """
-
-    field: str
-    index: int | None = None
-    key: tuple[str, str] | None = None
-    every: bool = False
-    length: int | None = None
-
-    def __str__(self) -> str:
-        if self.index is not None:
-            return f"{self.field}[{self.index}]"
-        if self.key is not None:
-            return f"{self.field}[{self.key[0]}={self.key[1]}]"
-        return f"{self.field}[*]" if self.every else self.field
-
-    @property
-    def picks(self) -> bool:
-        """Whether it names an element."""
-        return self.index is not None or self.key is not None or self.every
 
 
 @dataclass(frozen=True)

@@ -101,8 +101,3 @@ def _drift(t: FloatArray, ahead: FloatArray) -> float:
     if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter):
         return 0.0
     return float(slope)
-
-
-def without_duplicates(stamp_ns: IntArray) -> IntArray:
-    """Indices of the first message of each stamp (stamps sorted)."""
-    return np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[:1] - 1) > 0).astype(np.int64)

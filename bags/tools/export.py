@@ -6,26 +6,26 @@ One table on a common grid needs the memory of its columns.
 
 import io
 import tempfile
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
 from bags.recordings.cdr import Numbers
-from bags.recordings.definitions import Definition
 from bags.recordings.message_types import fields_of
 from bags.recordings.storage import NEVER
 from bags.signals.columns import Columns, TopicReader, expand_paths, joined_columns
 from bags.signals.expressions import Expression, Running
 from bags.signals.grid import seconds
 from bags.signals.reader import expanded, read_signals
-from bags.signals.resample import Method, resample
+from bags.signals.resample import resample
+from bags.signals.sampling import Grid
 from bags.signals.signal import NO_FIELD, SignalPath, numeric_paths
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
@@ -50,103 +50,132 @@ class Exported:
 
 
 def export_topics(
-    path: Path | str,
+    bag: Bag,
     out: Path | str,
     *,
     form: str,
-    signals: Sequence[str] | None = None,
-    unfinished: bool = False,
-    definitions: Mapping[str, Definition] | None = None,
+    signals: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Exported:
-    """One table per topic in the new folder `out`: times in ns, the signals after their operations.
+    """Write a table per topic in the new folder `out`: times in ns, signals after operations.
 
     Rows are in the order of log time; a number has the type that it has in the message. A
-    derivative is NaN until its window is full. signals: which (None: every number in every message
-    that can be read, but for arrays whose length changes). Raises BagError as `read_signals` does
-    for damage, if there is nothing to export, and if `out` exists.
+    derivative is NaN until its window is full.
+
+    Args:
+        bag: an open bag.
+        out: the new folder.
+        form: one of FORMATS.
+        signals: which (none: every number in every message that can be read, but for arrays whose
+            length changes).
+        progress: told how far it is.
+
+    Returns:
+        What was written, and what was left out.
+
+    Raises:
+        BagError: as `read_signals` for damage, if there is nothing to export, and if `out` exists.
     """
-    _check_format(form)
-    out = Path(out)
-    if out.exists():
-        raise BagError(f"{out} exists already; name another folder or move it away")
-    with Bag(path, unfinished=unfinished, definitions=definitions) as bag:
-        left_out: list[str] = []
-        tables: dict[str, dict[str, Expression]] = {}
-        if signals:
-            for found in expanded(bag, signals).values():
-                tables.setdefault(found.path.topic, {})[str(found)] = found
-        else:
-            tables = _every_number(bag, left_out)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-            folder_path = Path(folder) / out.name
-            folder_path.mkdir()
-            written = _Tables(bag, tables, folder_path, form)
-            written.write(progress, None if signals else left_out)
-            if not written.rows:
-                what = "; ".join(left_out) or "there are no messages"
-                raise BagError(f"{path}: nothing was exported: {what}")
-            folder_path.rename(out)
-        notes = (*bag.lost, *bag.disagreements)
-    return Exported(
-        {out / name: count for name, count in written.rows.items()}, tuple(left_out), notes
-    )
+    out = _new(out, form)
+    left_out: list[str] = []
+    tables: dict[str, dict[str, Expression]] = {}
+    if signals:
+        for found in expanded(bag, signals).values():
+            tables.setdefault(found.path.topic, {})[str(found)] = found
+    else:
+        tables = _every_number(bag, left_out)
+    with _temporary(out) as folder:
+        folder.mkdir()
+        written = _written(
+            bag, tables, folder / f"?.{form}", None if signals else left_out, progress
+        )
+        if not written:
+            what = "; ".join(left_out) or "there are no messages"
+            raise BagError(f"{bag.path}: nothing was exported: {what}")
+    counts = {out / name: count for name, count in written.items()}
+    return Exported(counts, tuple(left_out), (*bag.lost, *bag.disagreements))
 
 
 def export_grid(
-    path: Path | str,
+    bag: Bag,
     out: Path | str,
     *,
     form: str,
     signals: Sequence[str],
-    period: float,
-    method: Method = "linear",
     hold: Sequence[str] = (),
-    max_gap: float,
-    clock: str = "header",
-    unfinished: bool = False,
-    definitions: Mapping[str, Definition] | None = None,
-) -> dict[str, float]:
-    """One table on a common grid of `period` s: t in s since the first common stamp, and signals.
+    grid: Grid,
+) -> list[str]:
+    """Write a table on a common grid: t in s since the first common stamp, and signals.
 
-    hold: the signals (of `signals`) that are commands; the others are resampled by `method`.
-    clock: `header` or `log`, for all of them.
-    Returns each signal's error bound (see `resample`). Raises BagError and DataError as
-    `read_signals` and `resample` do, and if `out` exists.
+    Args:
+        bag: an open bag.
+        out: the new file.
+        form: one of FORMATS.
+        signals: which.
+        hold: those of `signals` that are commands; the others are put on the line between samples.
+        grid: its period, clock and max_gap are used (no max_gap: 1.5 periods).
+
+    Returns:
+        In words, what putting it on the grid did to each signal.
+
+    Raises:
+        BagError, DataError: as `read_signals` and `resample` do, and if `out` exists.
     """
-    _check_format(form)
-    out = Path(out)
-    if out.exists():
-        raise BagError(f"{out} exists already; name another file or move it away")
-    stamped = "log time" if clock == "log" else None
-    read = read_signals(
-        path, signals, clock=stamped, unfinished=unfinished, definitions=definitions
-    )
+    out = _new(out, form)
+    period = grid.period or 0.0
+    read = read_signals(bag, [grid.path(text, response=True) for text in signals])
     if len({samples.clock for samples in read.values()}) > 1:
         said = "; ".join(f"{name} has a {samples.clock}" for name, samples in read.items())
-        raise BagError(f"{path}: times of two clocks cannot share a grid: {said}; set --clock log")
-    if unknown := set(hold) - read.keys():
+        raise BagError(
+            f"{bag.path}: times of two clocks cannot share a grid: {said}; set --clock log"
+        )
+    held = {grid.path(text, response=True) for text in hold}
+    if unknown := held - read.keys():
         raise BagError(f"hold: {min(unknown)} is not one of the signals")
     first = max(int(s.stamp_ns[0]) for s in read.values())
     last = min(int(s.stamp_ns[-1]) for s in read.values())
     period_ns = round(period * 1e9)
     if period_ns <= 0 or last - first < period_ns:
-        raise DataError(f"{path}: the signals overlap in {(last - first) / 1e9:g} s, less than two")
-    grid = first + period_ns * np.arange(1 + (last - first) // period_ns)
-    table: dict[str, Any] = {"t": seconds(grid, first)}
-    errors = {}
+        raise DataError(
+            f"{bag.path}: the signals overlap in {(last - first) / 1e9:g} s, less than two samples"
+        )
+    at_ns = first + period_ns * np.arange(1 + (last - first) // period_ns)
+    max_gap = 1.5 * period if grid.max_gap is None else grid.max_gap
+    table: dict[str, Any] = {"t": seconds(at_ns, first)}
+    did = []
     for name, samples in read.items():
-        how: Method = "hold" if name in hold else method
-        found = resample(samples, grid, method=how, max_gap=max_gap)
-        table[name], errors[name] = found.values, found.error + _rounding(samples.values)
+        found = resample(samples, at_ns, hold=name in held, max_gap=max_gap)
+        title, rounding = name.removesuffix(f"|clock({grid.clock})"), _rounding(samples.values)
+        table[title] = found.values
+        if name not in held:
+            did.append(f"{title}: off by at most {found.error + rounding:.2g}")
+            continue
+        said = f"{title}: held; from one message to the next it changes by at most"
+        off = f"; off by at most {rounding:.2g}, as float64" if rounding else ""
+        did.append(f"{said} {found.error:.2g}{off}")
+    with _temporary(out) as file, closing(_WRITERS[form](file)) as writer:
+        writer.write(table)
+    return did
+
+
+def _new(out: Path | str, form: str) -> Path:
+    """The place to write to; BagError if something is there, or for an unknown format."""
+    if form not in FORMATS:
+        raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
+    if form == "parquet" and find_spec("pyarrow") is None:
+        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv or npz")
+    if Path(out).exists():
+        raise BagError(f"{out} exists already; take another name or move it away")
+    return Path(out)
+
+
+@contextmanager
+def _temporary(out: Path) -> Iterator[Path]:
+    """A place beside `out` that gets its name in the end; nothing is left after an error."""
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        part = Path(folder) / out.name
-        with _WRITERS[form](part) as writer:
-            writer.write(table)
-        part.rename(out)
-    return errors
+        yield Path(folder) / out.name
+        (Path(folder) / out.name).rename(out)
 
 
 def _rounding(values: FloatArray) -> float:
@@ -196,102 +225,81 @@ def _steady(bag: Bag, path: SignalPath) -> list[SignalPath]:
     return elements
 
 
-class _Tables:
-    """The tables of all topics. rows: of each file."""
+def _written(
+    bag: Bag,
+    wanted: Mapping[str, Mapping[str, Expression]],
+    pattern: Path,
+    left_out: list[str] | None,
+    progress: Progress,
+) -> dict[str, int]:
+    """Rows by the files' names; a topic that cannot be read is left out, or with None an error.
 
-    def __init__(
-        self, bag: Bag, tables: Mapping[str, Mapping[str, Expression]], folder: Path, form: str
-    ) -> None:
-        self.rows: dict[str, int] = {}
-        self._bag, self._folder, self._form = bag, folder, form
-        self._tables = {topic: _Table(bag, topic, columns) for topic, columns in tables.items()}
-        self._writers: dict[str, tuple[str, Any]] = {}
-
-    def write(self, progress: Progress, left_out: list[str] | None) -> None:
-        """Write them all; a topic that cannot be read is left out, or with None an error."""
-        total, done = sum(c.count for c in self._bag.channels if c.topic in self._tables), 0
-        try:
-            for channel, batch, later_ns in self._bag.parts(list(self._tables)):
-                try:
-                    if channel.topic in self._tables:
-                        self._append(
-                            channel.topic, self._tables[channel.topic].add(batch, later_ns)
-                        )
-                except BagError as error:
-                    if left_out is None:
-                        raise
-                    left_out.append(str(error))
-                    self._remove(channel.topic)
-                done += len(batch)
-                progress("reading", done / max(total, 1))
-            for topic, table in self._tables.items():
-                self._append(topic, table.ready(NEVER))
-        finally:
-            for _, writer in self._writers.values():
-                writer.close()
-
-    def _append(self, topic: str, part: Columns | None) -> None:
-        if part is None or not len(part):
-            return
-        if topic not in self._writers:
-            name = topic.strip("/").replace("/", "__")
-            while f"{name}.{self._form}" in self.rows:  # /a/b and /a__b
-                name += "_"
-            name += f".{self._form}"
-            self._writers[topic] = name, _WRITERS[self._form](self._folder / name)
-        name, writer = self._writers[topic]
-        writer.write(_table(part))
-        self.rows[name] = self.rows.get(name, 0) + len(part)
-
-    def _remove(self, topic: str) -> None:
-        del self._tables[topic]
-        if topic in self._writers:
-            name, writer = self._writers.pop(topic)
-            writer.close()
-            (self._folder / name).unlink()
-            del self.rows[name]
+    pattern: `folder/?.csv`, of which the question mark is replaced by the topic.
+    """
+    names: dict[str, str] = {}
+    for topic in wanted:
+        name = topic.strip("/").replace("/", "__")
+        while name in names.values():  # /a/b and /a__b
+            name += "_"
+        names[topic] = name
+    tables = {
+        topic: _Table(bag, topic, columns, pattern.with_name(names[topic] + pattern.suffix))
+        for topic, columns in wanted.items()
+    }
+    with ExitStack() as stack:
+        for table in tables.values():
+            stack.callback(table.close)
+        for channel, batch, later_ns in bag.parts(list(tables), progress=progress):
+            try:
+                if channel.topic in tables:
+                    tables[channel.topic].add(batch, later_ns)
+            except BagError as error:
+                if left_out is None:
+                    raise
+                left_out.append(str(error))
+                tables.pop(channel.topic).remove()
+        for table in tables.values():
+            table.write_until(NEVER)
+    return {table.file.name: table.rows for table in tables.values() if table.rows}
 
 
 class _Table:
-    """The rows of one topic, which wait until no message with an earlier log time can come."""
+    """The file of one topic, whose rows wait until no message with an earlier log time can come."""
 
-    def __init__(self, bag: Bag, topic: str, columns: Mapping[str, Expression]) -> None:
+    def __init__(self, bag: Bag, topic: str, columns: Mapping[str, Expression], file: Path) -> None:
+        self.file = file
+        self.rows = 0
         self._reader = TopicReader(bag, topic, {name: s.path for name, s in columns.items()})
-        self._operations = _Operations(bag, columns)
         self._waiting: list[Columns] = []
+        self._writer: Any = None
+        self._signals = columns
+        self._running: dict[str, Running] = {}
+        kind = bag.types_on(topic)
+        for name, signal in columns.items():
+            if signal.numbers.operations:
+                signal.unit(*kind)
+                self._running[name] = signal.numbers.running(signal.recorded_unit(*kind))
 
-    def add(self, batch: Batch, later_ns: int) -> Columns | None:
-        """Read more messages; the rows that are ready."""
+    def add(self, batch: Batch, later_ns: int) -> None:
+        """Read more messages; `later_ns` as `write_until`."""
         self._waiting.append(self._reader.read(batch))
-        return self.ready(later_ns)
+        self.write_until(later_ns)
 
-    def ready(self, later_ns: int) -> Columns | None:
-        """The rows with log times before `later_ns`, in order; None if there are none."""
+    def write_until(self, later_ns: int) -> None:
+        """Write the rows with log times before `later_ns`, in order."""
         if not self._waiting or min(int(p.log_ns.min()) for p in self._waiting) >= later_ns:
-            return None
+            return
         part = joined_columns(self._waiting)
         if (np.diff(part.log_ns) < 0).any():
             part = part.select(np.argsort(part.log_ns, kind="stable"))
         count = int(np.searchsorted(part.log_ns, later_ns))
         self._waiting = [part.select(slice(count, None))] if count < len(part) else []
-        return self._operations.on(part.select(slice(count)))
-
-
-class _Operations:
-    """What is to be done to the signals of each topic, part by part."""
-
-    def __init__(self, bag: Bag, columns: Mapping[str, Expression]) -> None:
-        self._running: dict[str, Running] = {}
-        self._signals = columns
-        for name, signal in columns.items():
-            if signal.numbers.operations:
-                kind = bag.types_on(signal.path.topic)
-                signal.unit(*kind)
-                self._running[name] = signal.numbers.running(signal.recorded_unit(*kind))
-
-    def on(self, part: Columns) -> Columns:
-        values = {name: self._value(name, part) for name in part.values}
-        return replace(part, values=values)
+        ready = part.select(slice(count))
+        values = {name: self._value(name, ready) for name in ready.values}
+        if self._writer is None:
+            self._writer = _WRITERS[self.file.suffix[1:]](self.file)
+        self._writer.write(_table(replace(ready, values=values)))
+        self.rows += count
 
     def _value(self, name: str, part: Columns) -> Numbers:
         recorded = part.values[name]
@@ -302,6 +310,17 @@ class _Operations:
         rows = zip(stamps.tolist(), recorded.tolist(), strict=True)
         return np.array([self._running[name].update(*row) for row in rows])
 
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def remove(self) -> None:
+        """Leave nothing of it."""
+        self.close()
+        self.file.unlink(missing_ok=True)
+
 
 def _table(part: Columns) -> dict[str, Numbers]:
     times = (part.log_ns, part.publish_ns, part.stamp_ns)
@@ -311,34 +330,7 @@ def _table(part: Columns) -> dict[str, Numbers]:
     return table | {name.partition(":")[2]: values for name, values in part.values.items()}
 
 
-class TableWriter(Protocol):
-    """A file that takes a table part by part; all parts have the same columns."""
-
-    def write(self, table: Table) -> None:
-        """Append rows."""
-
-    def close(self) -> None:
-        """Finish the file."""
-
-    def __enter__(self) -> "TableWriter":
-        """Use it in a with block."""
-
-    def __exit__(self, *_: object) -> None:
-        """Finish the file."""
-
-
-class _Closing(ABC):
-    @abstractmethod
-    def close(self) -> None: ...
-
-    def __enter__(self) -> Any:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class _Csv(_Closing):
+class _Csv:
     """Numbers with all digits that tell float64 apart."""
 
     def __init__(self, path: Path) -> None:
@@ -356,7 +348,7 @@ class _Csv(_Closing):
         self._stream.close()
 
 
-class _Npz(_Closing):
+class _Npz:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._parts: list[Table] = []
@@ -371,7 +363,7 @@ class _Npz(_Closing):
         self._path.write_bytes(stream.getvalue())
 
 
-class _Parquet(_Closing):
+class _Parquet:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._writer: Any = None
@@ -395,10 +387,3 @@ _WRITERS: Final[Mapping[str, Callable[[Path], Any]]] = {
     "npz": _Npz,
     "parquet": _Parquet,
 }
-
-
-def _check_format(form: str) -> None:
-    if form not in FORMATS:
-        raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
-    if form == "parquet" and find_spec("pyarrow") is None:
-        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv or npz")

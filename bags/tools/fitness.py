@@ -5,7 +5,7 @@ Each check gives findings; the worst of them is the verdict. The thresholds are 
 their reasons; none of them proves anything, they say where to look.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -24,7 +24,7 @@ from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
 from bags.signals.repeats import find_period, same_excitation
-from bags.signals.sampling import sampled_path
+from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
 from bags.signals.timing import clock_relation, held
 from nlsid_core.arrays import FloatArray
@@ -72,6 +72,15 @@ class Fitness:
         return max((finding.level for finding in self.findings), default=Level.GOOD)
 
 
+@dataclass
+class _Look:
+    """What one bag shows; commands: of each excitation the values where responses were recorded."""
+
+    bag: Path
+    findings: list[Finding]
+    commands: dict[str, FloatArray]
+
+
 def check_fitness(
     bags: Sequence[Path | str],
     *,
@@ -80,86 +89,109 @@ def check_fitness(
     clock: str = "header",
     definitions: Mapping[str, Definition] | None = None,
 ) -> list[Fitness]:
-    """Check each bag for itself, and the bags against each other for repeats of one excitation.
+    """Check each bag for itself, and the bags against each other.
 
-    clock: `header` or `log`, as in a configuration. definitions: of message types that the bags do
-    not define. What a bag is refused for elsewhere (damage, NaN, no such topic) is a finding here.
+    What a bag is refused for elsewhere (damage, NaN, no such topic) is a finding here. A command
+    that is constant in one bag is bad only if it has the same value in all of them.
+
+    Args:
+        bags: where they are.
+        excitations: the commands' texts.
+        responses: likewise.
+        clock: `header` or `log`, as in a configuration.
+        definitions: of message types that the bags do not define.
+
+    Returns:
+        The findings about each bag, in the order of the bags.
     """
     if not excitations or not responses:
         raise BagError("name at least one excitation and one response")
-    excitations, responses = (
-        [sampled_path(text, clock=clock, response=True) for text in texts]
+    u_texts, y_texts = (
+        [Grid(clock=clock).path(text, response=True) for text in texts]
         for texts in (excitations, responses)
     )
-    results = []
-    commands: list[tuple[str, FloatArray] | None] = []
+    looks = []
     for path in map(place, bags):
-        findings: list[Finding] = []
+        look = _Look(path, [], {})
         try:
             with Bag(path, unfinished=True, definitions=definitions) as bag:
-                if bag.ending is not None:
-                    findings.append(Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}"))
-                findings += _clocks(bag, [*excitations, *responses])
-                u_names, y_names = list(expanded(bag, excitations)), list(expanded(bag, responses))
-            names = [*u_names, *y_names]
-            read = read_signals(path, names, sort=True, definitions=definitions)
+                look.findings.extend(_clocks(bag, [*u_texts, *y_texts]))
+                _look_at(bag, u_texts, y_texts, look)
         except StorageError:  # nothing is known of the bag
             raise
         except BagError as error:
-            findings.append(Finding(Level.BAD, "readable", str(error)))
-            results.append(Fitness(path, tuple(findings)))
-            commands.append(None)
-            continue
-        commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
-        for name, samples in read.items():
-            if doubt := samples.doubt(responds=name in y_names):
-                findings.append(Finding(Level.BAD, "publishers", doubt))
-        for samples in measured:
-            findings += _regularity(samples)
-            findings += _range(samples)
-        last_ns = max(int(samples.stamp_ns[-1]) for samples in measured)
-        for samples in commanded:
-            findings += _commands(samples, last_ns)
-            findings += _excitation(samples)
-        findings += _samples(measured, commanded)
-        findings += _delays(commanded, measured)
-        results.append(Fitness(path, tuple(findings)))
-        commands.append((path.name, commanded[0].values))
+            look.findings.append(Finding(Level.BAD, "readable", str(error)))
+        looks.append(look)
     return [
-        Fitness(found.bag, (*found.findings, *_repeats(k, commands)))
-        for k, found in enumerate(results)
+        Fitness(look.bag, (*look.findings, *_constant(look, looks), *_repeats(look, looks)))
+        for look in looks
     ]
 
 
-def _samples(responses: Sequence[Samples], excitations: Sequence[Samples]) -> list[Finding]:
-    """What identification would make of the signals: too few samples, or a constant command."""
+def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: _Look) -> None:
+    """Add what the signals of one bag show; BagError if they cannot be read."""
+    u_names, y_names = list(expanded(bag, u_texts)), list(expanded(bag, y_texts))
+    read = read_signals(bag, [*u_names, *y_names], sort=True)
+    commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
+    found = look.findings
+    for name, samples in read.items():
+        if doubt := samples.doubt(responds=name in y_names):
+            found.append(Finding(Level.BAD, "publishers", doubt))
+    for samples in measured:
+        found.extend(_regularity(samples))
+        found.extend(_range(samples))
+    last_ns = max(int(samples.stamp_ns[-1]) for samples in measured)
+    for samples in commanded:
+        found.extend(_commands(samples, last_ns))
+        found.extend(_excitation(samples))
+        look.commands[samples.path] = samples.values
+    found.extend(_samples(measured, commanded, look.commands))
+    found.extend(_delays(commanded, measured))
+
+
+def _samples(
+    responses: Sequence[Samples], excitations: Sequence[Samples], commands: dict[str, FloatArray]
+) -> Iterator[Finding]:
+    """What identification would make of the signals; `commands` become those of its samples."""
     clocks = {samples.clock for samples in (*responses, *excitations)}
     if len(clocks) > 1:
         what = "some signals have no header stamp: identify and check them with clock log"
-        return [Finding(Level.BAD, "samples", what)]
-    findings = []
+        yield Finding(Level.BAD, "samples", what)
+        return
     held = [_ruled(samples, "hold") for samples in excitations]
+    apart = Grid(split_gaps=True)
     try:
-        trials = to_trajectories(responses, held, split_gaps=True)
+        trials = to_trajectories(responses, held, apart)
     except (BagError, DataError) as error:
         try:
             lines = [_ruled(samples, "linear") for samples in responses]
-            trials = to_trajectories(lines, held, split_gaps=True)
+            trials = to_trajectories(lines, held, apart)
         except (BagError, DataError) as second:
-            return [Finding(Level.BAD, "samples", f"identification refuses them: {second}")]
+            yield Finding(Level.BAD, "samples", f"identification refuses them: {second}")
+            return
         what = f"only with grid.resample: linear or last; as they come: {error}"
-        findings.append(Finding(Level.LOOK, "samples", what))
+        yield Finding(Level.LOOK, "samples", what)
     longest = max(trials, key=len)
     count = sum(map(len, trials))
     stretches = "one stretch" if len(trials) == 1 else f"{len(trials)} stretches"
     what = f"{count} samples of {longest.period:.4g} s in {stretches} without a gap"
-    findings.append(Finding(Level.GOOD, "samples", what))
+    yield Finding(Level.GOOD, "samples", what)
     u = np.concatenate([trial.u for trial in trials])
-    for column, samples in zip(u.T, excitations, strict=True):
-        if np.ptp(column) == 0.0 and np.ptp(samples.values) > 0.0:
-            what = f"{samples.path} is {column[0]:g} wherever every response was recorded"
-            findings.append(Finding(Level.BAD, "samples", what))
-    return findings
+    commands |= {samples.path: c for samples, c in zip(excitations, u.T, strict=True)}
+
+
+def _constant(look: _Look, looks: Sequence[_Look]) -> Iterator[Finding]:
+    """The commands that do not change where responses were recorded, here or in all bags."""
+    for name, values in look.commands.items():
+        if np.ptp(values) > 0.0:
+            continue
+        others = [other.commands[name] for other in looks if name in other.commands]
+        what = f"{name} is {values[0]:g} wherever every response was recorded: no excitation"
+        if np.ptp(np.concatenate(others)) > 0.0:
+            what += " here; other bags have other values, so it is of use beside them"
+            yield Finding(Level.LOOK, "excitation", what)
+        else:
+            yield Finding(Level.BAD, "excitation", what)
 
 
 def _ruled(samples: Samples, rule: str) -> Samples:
@@ -169,8 +201,9 @@ def _ruled(samples: Samples, rule: str) -> Samples:
     )
 
 
-def _clocks(bag: Bag, signals: Sequence[str]) -> list[Finding]:
-    findings = []
+def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
+    if bag.ending is not None:
+        yield Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}")
     texts = [text.partition("|")[0] for text in signals]
     paths = expand_paths(bag, [SignalPath.parse(text) for text in texts])
     offsets = {}
@@ -178,60 +211,51 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> list[Finding]:
     for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
         if topic in logged:
             what = f"{topic} by its log times, which carry the latency of recording"
-            findings.append(Finding(Level.GOOD, "clock", what))
-            continue
-        if columns.stamp_ns is None:
+            yield Finding(Level.GOOD, "clock", what)
+        elif columns.stamp_ns is None:
             what = f"{topic} has no header stamp; its log times carry the latency of recording"
-            findings.append(Finding(Level.LOOK, "clock", what))
-            continue
-        if not len(columns):
-            continue
-        if not columns.stamp_ns.any():
-            findings.append(Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0"))
-            continue
-        back = int((np.diff(columns.stamp_ns) < 0).sum())
-        if back:
-            findings.append(
-                Finding(Level.BAD, "clock", f"{topic}: stamps go back in {_counted(back, 'place')}")
-            )
-        relation = clock_relation(columns.stamp_ns, columns.log_ns)
-        offsets[topic] = relation.offset
-        level = Level.LOOK if relation.drift else Level.GOOD
-        findings.append(Finding(level, "clock", f"{topic}: {relation}"))
+            yield Finding(Level.LOOK, "clock", what)
+        elif len(columns) and not columns.stamp_ns.any():
+            yield Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0")
+        elif len(columns):
+            back = int((np.diff(columns.stamp_ns) < 0).sum())
+            if back:
+                what = f"{topic}: stamps go back in {_counted(back, 'place')}"
+                yield Finding(Level.BAD, "clock", what)
+            relation = clock_relation(columns.stamp_ns, columns.log_ns)
+            offsets[topic] = relation.offset
+            level = Level.LOOK if relation.drift else Level.GOOD
+            yield Finding(level, "clock", f"{topic}: {relation}")
     if offsets and max(offsets.values()) - min(offsets.values()) > 1.0:
         far = max(offsets, key=lambda topic: abs(offsets[topic]))
         what = f"the topics' stamps are of different clocks: {far} is {offsets[far]:+.3f} s off"
-        findings.append(Finding(Level.BAD, "clock", what))
-    return findings
+        yield Finding(Level.BAD, "clock", what)
 
 
-def _regularity(samples: Samples) -> list[Finding]:
+def _regularity(samples: Samples) -> Iterator[Finding]:
     steps = np.diff(samples.stamp_ns) / 1e9
     name = samples.path
     if not len(steps):
-        return [Finding(Level.BAD, "regularity", f"{name} has one sample")]
-    findings = []
-    duplicates = int((steps == 0).sum())
-    if duplicates:
-        what = f"{name}: {duplicates} of {len(samples)} stamps repeat the one before"
-        findings.append(Finding(Level.LOOK, "regularity", what))
-        steps = steps[steps > 0]
-        if not len(steps):
-            return findings
+        yield Finding(Level.BAD, "regularity", f"{name} has one sample")
+        return
+    if repeated := int((steps == 0).sum()):
+        what = f"{name}: {repeated} of {len(samples)} stamps repeat the one before"
+        yield Finding(Level.LOOK, "regularity", what)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return
     period = float(np.median(steps))
     gaps = steps > GAP * period
     if gaps.any():
         what = f"{name}: {_counted(int(gaps.sum()), 'gap')}, the longest {np.max(steps):.3g} s"
-        findings.append(Finding(Level.LOOK, "regularity", what))
+        yield Finding(Level.LOOK, "regularity", what)
     jitter = float(np.quantile(np.abs(steps[~gaps] - period), 0.95)) / period
     level = Level.LOOK if jitter > JITTER_LOOK else Level.GOOD
-    clock = "" if samples.clock == HEADER_STAMP else f" by {samples.clock}"
-    what = f"{name}: {1 / period:.4g} Hz{clock}, 95 % of steps within {_percent(jitter)}"
-    findings.append(Finding(level, "regularity", what))
-    return findings
+    what = f"{name}: {_rate(samples, period)}, 95 % of steps within {_percent(jitter)}"
+    yield Finding(level, "regularity", what)
 
 
-def _commands(samples: Samples, last_ns: int) -> list[Finding]:
+def _commands(samples: Samples, last_ns: int) -> Iterator[Finding]:
     """Commands are held until the next one: their stamps may come as they like.
 
     last_ns: the last stamp of a response.
@@ -239,21 +263,23 @@ def _commands(samples: Samples, last_ns: int) -> list[Finding]:
     steps = np.diff(samples.stamp_ns) / 1e9
     name = samples.path
     if not len(steps):
-        return [Finding(Level.LOOK, "commands", f"{name} has one command")]
-    period = float(np.median(steps))
-    rate = f"{1 / period:.4g} Hz" if period > 0 else "several at one time"
-    clock = "" if samples.clock == HEADER_STAMP else f" by {samples.clock}"
+        yield Finding(Level.LOOK, "commands", f"{name} has one command")
+        return
+    rate = _rate(samples, float(np.median(steps)))
     found = held(samples.stamp_ns, last_ns)
-    what = f"{name}: {rate}{clock}, one held for at most {found.longest:.3g} s (grid.hold)"
-    findings = [Finding(Level.GOOD, "commands", what)]
+    what = f"{name}: {rate}, one held for at most {found.longest:.3g} s (grid.hold)"
+    yield Finding(Level.GOOD, "commands", what)
     if found.tail:
         what = f"{name} ends {found.tail:.3g} s before the responses do: what follows is not fitted"
-        findings.append(Finding(Level.LOOK, "commands", what))
-    repeats = int((steps == 0).sum())
-    if repeats:
-        what = f"{name}: {repeats} of {len(samples)} stamps repeat the one before; the last counts"
-        findings.append(Finding(Level.LOOK, "commands", what))
-    return findings
+        yield Finding(Level.LOOK, "commands", what)
+    if repeated := int((steps == 0).sum()):
+        what = f"{name}: {repeated} of {len(samples)} stamps repeat the one before; the last counts"
+        yield Finding(Level.LOOK, "commands", what)
+
+
+def _rate(samples: Samples, period: float) -> str:
+    rate = f"{1 / period:.4g} Hz" if period > 0 else "several at one time"
+    return rate if samples.clock == HEADER_STAMP else f"{rate} by {samples.clock}"
 
 
 def _counted(count: int, what: str) -> str:
@@ -264,63 +290,54 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
-def _excitation(samples: Samples) -> list[Finding]:
+def _excitation(samples: Samples) -> Iterator[Finding]:
     x, name = samples.values, samples.path
     if not np.ptp(x) > 0:
-        return [Finding(Level.BAD, "excitation", f"{name} is {x[0]:g} throughout: no excitation")]
-    findings = []
+        return
     period = max(float(np.median(np.diff(samples.stamp_ns))) / 1e9, 1e-9)
     f, power = welch(x - x.mean(), fs=1 / period, nperseg=min(len(x), 1024))
     share = np.cumsum(power) / power.sum()
     band = float(f[np.searchsorted(share, 0.95)])
     lines = int((power > 1e-3 * power.max()).sum())
-    level = Level.GOOD
-    if lines < LINES_FEW or band * period > BAND_LOOK:
-        level = Level.LOOK
+    level = Level.LOOK if lines < LINES_FEW or band * period > BAND_LOOK else Level.GOOD
     what = f"{name}: 95 % of its power below {band:.3g} Hz, {lines} frequency lines carry power"
-    findings.append(Finding(level, "excitation", what))
+    yield Finding(level, "excitation", what)
     repeat = find_period(x)
     if repeat is not None:
         what = f"{name} repeats every {repeat * period:.4g} s, {len(x) // repeat} times"
-        findings.append(Finding(Level.GOOD, "repeats", what))
-    return findings
+        yield Finding(Level.GOOD, "repeats", what)
 
 
-def _range(samples: Samples) -> list[Finding]:
+def _range(samples: Samples) -> Iterator[Finding]:
     x, name = samples.values, samples.path
     if not np.ptp(x) > 0:
-        return [Finding(Level.BAD, "response", f"{name} is {x[0]:g} throughout: it does not move")]
-    findings = []
+        yield Finding(Level.BAD, "response", f"{name} is {x[0]:g} throughout: it does not move")
+        return
     for end, what in ((np.max(x), "largest"), (np.min(x), "smallest")):
-        held = (x[1:] == end) & (x[:-1] == end)
-        share = float(held.mean())
+        share = float(((x[1:] == end) & (x[:-1] == end)).mean())
         if share > SATURATED and end != x[0]:
             text = f"{name}: {100 * share:.0f} % of samples stay at its {what} value {end:g}"
-            findings.append(Finding(Level.LOOK, "saturation", text))
+            yield Finding(Level.LOOK, "saturation", text)
     levels = np.unique(x)
     step = float(np.min(np.diff(levels))) / float(np.ptp(x))
     coarse = len(levels) < LEVELS_FEW or step > STEP_COARSE
     text = f"{name}: {len(levels)} distinct values, steps of {step:.1e} of its range"
-    findings.append(Finding(Level.LOOK if coarse else Level.GOOD, "quantisation", text))
-    return findings
+    yield Finding(Level.LOOK if coarse else Level.GOOD, "quantisation", text)
 
 
-def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> list[Finding]:
+def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> Iterator[Finding]:
     """For each response the command that it follows most clearly."""
-    findings = []
     for y in responses:
         found: list[tuple[Delay, str]] = []
+        period_ns = int(np.median(np.diff(y.stamp_ns))) if len(y) > 1 else 0
         for u in excitations:
-            period_ns = int(np.median(np.diff(y.stamp_ns))) if len(y) > 1 else 0
             start, end = max(u.stamp_ns[0], y.stamp_ns[0]), min(u.stamp_ns[-1], y.stamp_ns[-1])
             if period_ns <= 0 or end - start < LEAST_OVERLAP * period_ns:
-                what = f"{u.path} and {y.path} do not overlap in time by their stamps"
-                if period_ns > 0 and end > start:
-                    what = (
-                        f"{u.path} and {y.path} overlap for {(end - start) / 1e9:.3g} s, less than "
-                        f"{LEAST_OVERLAP} steps of the response"
-                    )
-                findings.append(Finding(Level.BAD, "delay", what))
+                what = (
+                    f"{u.path} and {y.path} overlap for {max(end - start, 0) / 1e9:.3g} s by their "
+                    f"stamps, less than {LEAST_OVERLAP} steps of the response"
+                )
+                yield Finding(Level.BAD, "delay", what)
                 continue
             at = np.arange(start, end, period_ns)
             held = u.values[np.searchsorted(u.stamp_ns, at, side="right") - 1]
@@ -335,19 +352,20 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> lis
                 f"{y.path} follows {command} after {best.seconds:.3g} s "
                 f"(correlation {best.correlation:+.2f})"
             )
-            findings.append(Finding(level, "delay", what))
-    return findings
+            yield Finding(level, "delay", what)
 
 
-def _repeats(k: int, commands: Sequence[tuple[str, FloatArray] | None]) -> list[Finding]:
-    mine = commands[k]
-    if mine is None:
-        return []
+def _repeats(look: _Look, looks: Sequence[_Look]) -> Iterator[Finding]:
+    """The bags whose first command is the same."""
+    mine = next(iter(look.commands.values()), None)
     same = [
-        other[0]
-        for j, other in enumerate(commands)
-        if j != k and other is not None and same_excitation(mine[1], other[1])
+        other.bag.name
+        for other in looks
+        for theirs in [next(iter(other.commands.values()), None)]
+        if other is not look
+        and mine is not None
+        and theirs is not None
+        and same_excitation(mine, theirs)
     ]
-    if not same:
-        return []
-    return [Finding(Level.GOOD, "repeats", f"the same excitation as {', '.join(same)}")]
+    if same:
+        yield Finding(Level.GOOD, "repeats", f"the same excitation as {', '.join(same)}")

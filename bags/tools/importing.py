@@ -1,34 +1,37 @@
-"""Tables (CSV, MAT) to a bag of standard messages."""
+"""A table (CSV) to a bag of standard messages."""
 
 import csv
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
-from scipy.io import loadmat
 
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import fields_of, is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.reader import stamp_text
-from bags.signals.signal import SignalPath, Step
+from bags.signals.signal import SignalPath
+from bags.signals.units import UNITS
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
 TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
-MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
-_COLUMN: Final = re.compile(
-    r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
-)
+SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
+EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
+SUFFIXES: Final = (".csv", ".txt", ".dat")
+_TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
+_TITLE: Final = re.compile(r"(?P<name>.+?)(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
+_COLUMN: Final = re.compile(r"([^\[\]]+)\[(\d{1,6})\]")
 
 
 @dataclass(frozen=True)
@@ -52,181 +55,144 @@ class Assignment:
         return cls(path, column.strip())
 
 
-@dataclass(frozen=True, eq=False)
-class Tables:
-    """Numeric arrays (rows,) or (rows, columns): by `file.name`, and by `name` if one file has it.
+@dataclass(frozen=True)
+class Rows:
+    """When the rows of a table were recorded: `period` s apart, or at the times of a column.
 
-    files: name of every array -> the files that have an array of that name.
+    Attributes:
+        period: s.
+        time: the column, and its unit, `stamp|unit(ms)`. Without a unit it is what the title says,
+            `t_ms` or `t [ms]`; of times since 1970, which of s, ms, us and ns can be meant; else s.
+        drop_repeats: of rows with one time keep the first.
+        start_ns: of time 0, since 1970.
     """
 
-    arrays: Mapping[str, FloatArray]
-    files: Mapping[str, tuple[str, ...]]
-
-    def whole_name(self, table: str, file: str = "") -> str:
-        """`file.name` of a table; DataError if there is none, or several and none in `file`."""
-        if table in self.arrays:
-            return table
-        owners = self.files.get(table, ())
-        if len(owners) == 1 or file in owners:
-            return f"{file if file in owners else owners[0]}.{table}"
-        if owners:
-            choices = " or ".join(f"{owner}.{table}" for owner in owners)
-            raise DataError(f"'{table}' is in {len(owners)} files; name one of them: {choices}")
-        names = {
-            name if len(own) == 1 else f"{f}.{name}": f"{f}.{name}"
-            for name, own in self.files.items()
-            for f in own
-        }
-        shapes = listed(f"{n} {'x'.join(map(str, self.arrays[w].shape))}" for n, w in names.items())
-        raise DataError(f"no table '{table}'; there are: {shapes}{did_you_mean(table, names)}")
-
-    def file_of(self, column: str) -> str:
-        """The file that a column comes from."""
-        whole = self.whole_name(_parsed(column)[0])
-        return next(f for own in self.files.values() for f in own if whole.startswith(f"{f}."))
-
-    def column(self, text: str, file: str = "") -> FloatArray:
-        """`table`, `table[column]` or `table[row, :]`; DataError lists what there is.
-
-        file: whose table is meant where several files have one of that name.
-        """
-        table, row, index = _parsed(text)
-        values = self.arrays[self.whole_name(table, file)]
-        if values.ndim == 1 and row is None and index is None:
-            return values
-        if values.ndim != 2 or (row is None and index is None):
-            raise DataError(
-                f"'{text}' has shape {values.shape}; name one column, {table}[0], or where time "
-                f"runs along the rows one row, {table}[0, :]"
-            )
-        number, count = (row, values.shape[0]) if index is None else (index, values.shape[1])
-        assert number is not None
-        if number >= count:
-            what = "rows" if index is None else "columns"
-            raise DataError(f"'{text}': the table has {what} 0 to {count - 1}")
-        found: FloatArray = values[number] if index is None else values[:, number]
-        return found
+    period: float | None = None
+    time: str | None = None
+    drop_repeats: bool = False
+    start_ns: int = 0
 
 
-def _parsed(text: str) -> tuple[str, int | None, int | None]:
-    """(table, row, column) of a column's text."""
-    match = _COLUMN.fullmatch(text)
-    if match is None:
-        return text, None, None
-    row, index = match["row"], match["index"]
-    return match["table"], None if row is None else int(row), None if index is None else int(index)
+@dataclass(frozen=True)
+class Imported:
+    """Messages on each topic; how the times were understood, in words."""
+
+    counts: dict[str, int]
+    times: str
 
 
-def read_tables(files: Sequence[Path | str]) -> Tables:
-    """Every numeric array of the files.
+def column_of(tables: Mapping[str, FloatArray], text: str) -> FloatArray:
+    """`title`, or `name[column]` of a table without titles; DataError lists what there is."""
+    match = None if text in tables else _COLUMN.fullmatch(text)
+    name, index = (text, "") if match is None else match.groups("")
+    if name not in tables:
+        shapes = listed(f"{name} {'x'.join(map(str, t.shape))}" for name, t in tables.items())
+        raise DataError(f"no table '{name}'; there are: {shapes}{did_you_mean(name, tables)}")
+    values = tables[name]
+    if values.ndim == 1 and not index:
+        return values
+    if values.ndim == 1 or not index:
+        raise DataError(f"'{text}' has shape {values.shape}; name one column, as in {name}[0]")
+    if int(index) >= values.shape[1]:
+        raise DataError(f"'{text}': the table has columns 0 to {values.shape[1] - 1}")
+    found: FloatArray = values[:, int(index)]
+    return found
 
-    A CSV file without a header is one table by the file's name; with one, each column is a table by
-    its own name, an empty cell is NaN, and a column without a number is left out. In MAT (up to
-    version 7.2) files each numeric array is one, those in a struct by
-    `struct.field`; nothing in them is evaluated. A file is called by its stem,
-    with the folder before it where two have one stem. Raises DataError for a file that is none of
-    these or holds no numbers.
+
+def read_table(file: Path | str) -> dict[str, FloatArray]:
+    """Read the numbers of a CSV file, (rows,) or (rows, columns), by name.
+
+    Without a header it is one table by the file's name; with one, each column is a table by its own
+    name, an empty cell is NaN, and a column without a number is left out. Raises DataError for a
+    file that is no CSV or holds no numbers.
     """
-    arrays: dict[str, FloatArray] = {}
-    owners: dict[str, tuple[str, ...]] = {}
-    for path, label in _labels([Path(file) for file in files]):
-        if path.stat().st_size > MAX_TABLE_BYTES:
-            raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
-        readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat}
-        reader = readers.get(path.suffix.lower())
-        if reader is None:
-            raise DataError(f"{path}: unknown kind; known are {', '.join(readers)}")
-        found = reader(path)
-        if not found:
-            raise DataError(f"{path} holds no table of numbers")
-        for name, table in found.items():
-            arrays[f"{label}.{name}"] = table
-            owners[name] = (*owners.get(name, ()), label)
-    return Tables(arrays, owners)
+    path = Path(file)
+    if path.stat().st_size > MAX_TABLE_BYTES:
+        raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"{path}: unknown kind; known are {', '.join(SUFFIXES)}")
+    found = _csv(path)
+    if not found:
+        raise DataError(f"{path} holds no table of numbers")
+    return found
 
 
-def _labels(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
-    """Each file with the shortest end of its path that no other has, without the suffix."""
-    whole = [path.resolve().with_suffix("").parts for path in paths]
-    for path, parts in zip(paths, whole, strict=True):
-        count = 1
-        while count < len(parts) and sum(o[-count:] == parts[-count:] for o in whole) > 1:
-            count += 1
-        yield path, "/".join(parts[-count:])
+def every_column(file: Path | str, rows: Rows) -> tuple[Rows, list[str], dict[str, str]]:
+    """The rows with their time column, and every other column as a number on a topic of its name.
 
-
-def every_column(
-    files: Sequence[Path | str], time: str | None, period: float | None
-) -> tuple[str | None, list[str], dict[str, str]]:
-    """The time column, and every other column as a number on a topic of its name.
-
-    Returns the time column (None: rows are `period` s apart), the assignments and the topics'
-    types. Raises DataError if two columns would be one topic.
+    Returns the rows, the assignments and the topics' types. Raises DataError if two columns would
+    be one topic.
     """
-    tables = read_tables(files)
-    names = [name for name, owners in tables.files.items() if len(owners) == 1]
-    if time is None and period is None:
-        time = next((name for name in names if name.lower() in TIMES), None)
-    columns = [n for n in names if n != time and tables.arrays[tables.whole_name(n)].ndim == 1]
+    tables = read_table(file)
+    if rows.time is None and rows.period is None:
+        time = next((name for name in tables if _says_when(name)), None)
+        rows = replace(rows, time=time)
+    said = None if rows.time is None else _unit_of(rows.time)[0]
+    columns = [name for name, table in tables.items() if name != said and table.ndim == 1]
     topics = [f"/{re.sub(r'^(?=[0-9])|[^A-Za-z0-9_]', '_', name)}" for name in columns]
     if twice := next((topic for topic in topics if topics.count(topic) > 1), None):
         raise DataError(f"two columns would be {twice}; name them with --signal")
     assignments = [f"{t}:data={name}" for t, name in zip(topics, columns, strict=True)]
-    return time, assignments, dict.fromkeys(topics, "std_msgs/msg/Float64")
+    return rows, assignments, dict.fromkeys(topics, "std_msgs/msg/Float64")
 
 
-def import_tables(
-    files: Sequence[Path | str],
+def import_table(
+    file: Path | str,
     out: Path | str,
     assignments: Sequence[str],
     *,
     types: Mapping[str, str],
-    period: float | None = None,
-    time: str | None = None,
-    drop_repeats: bool = False,
-    start_ns: int = 0,
+    rows: Rows,
     custom: Mapping[str, str] | None = None,
-) -> dict[str, int]:
-    """Write a bag with one message a row; topic -> how many there are.
+) -> Imported:
+    """Write a bag with one message a row.
 
-    assignments: `signal=column` each; types: topic -> message type, a standard one. Rows are
-    `period` s apart, or stamped by the column `time` in s (of the file of the topic's columns,
-    where several files have it), from `start_ns` on; header stamp, log time and publish time are
-    equal. drop_repeats: of rows with one time keep the first. A topic has as many messages as the
-    shortest of its columns. What is not assigned is zero or empty. Raises BagError and DataError
-    for what does not fit, and if `out` exists.
+    Header stamp, log time and publish time are equal. A topic has as many messages as the shortest
+    of its columns. What is not assigned is zero or empty.
+
+    Args:
+        file: the table.
+        out: the bag.
+        assignments: `signal=column` each.
+        types: topic -> message type, a standard one.
+        rows: when the rows were recorded.
+        custom: key-value pairs of the bag's own.
+
+    Returns:
+        How many messages there are, and how the times were understood.
+
+    Raises:
+        BagError, DataError: for what does not fit, and if `out` exists.
     """
-    if (period is None) == (time is None):
+    if (rows.period is None) == (rows.time is None):
         raise BagError(
             "state either the period of the rows (--period) or the column with their times (--time)"
         )
-    tables = read_tables(files)
+    tables = read_table(file)
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
-    sources: dict[str, str] = {}
     for text in assignments:
         parsed = Assignment.parse(text)
-        column = tables.column(parsed.column)
-        topics.setdefault(parsed.path.topic, {})[parsed.path] = column
-        sources.setdefault(parsed.path.topic, tables.file_of(parsed.column))
+        topics.setdefault(parsed.path.topic, {})[parsed.path] = column_of(tables, parsed.column)
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
+    if not topics:
+        raise BagError("nothing is assigned, so there is nothing to write")
+    most = max(len(column) for columns in topics.values() for column in columns.values())
+    times, unit = _times(most, tables, rows)
+    kept = np.arange(len(times))
+    if rows.time is not None and rows.drop_repeats:
+        kept = kept[np.diff(times, prepend=-np.inf) > 0]
     streams = []
     for topic, columns in topics.items():
         if topic not in types:
             raise BagError(
                 f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
             )
-        rows = np.arange(min(map(len, columns.values())))
-        times = None if time is None else tables.column(time, sources[topic])
-        if times is not None and drop_repeats and len(times) >= len(rows):
-            kept = np.diff(times, prepend=-np.inf) > 0
-            rows = rows[kept[: len(rows)]]
-            times = times[rows]
-            columns = {path: column[rows] for path, column in columns.items()}
-        stamps = _stamps(len(rows), period, times, start_ns)
+        mine = kept[kept < min(map(len, columns.values()))]
+        stamps = _stamps(times[mine], rows.start_ns)
+        columns = {path: column[mine] for path, column in columns.items()}
         streams.append(_Stream(topic, types[topic], columns, stamps))
-    if not streams:
-        raise BagError("nothing is assigned, so there is nothing to write")
+    said = _said_times(times[kept], rows, unit)
     with BagWriter(out, custom=custom) as writer:
         events = sorted(
             (int(stamp), k, row)
@@ -242,11 +208,62 @@ def import_tables(
                 log_time_ns=stamp,
                 publish_time_ns=stamp,
             )
-        return dict(writer.counts)
+        return Imported(dict(writer.counts), said)
+
+
+def _says_when(title: str) -> bool:
+    match = _TITLE.fullmatch(title)
+    return (match["name"] if match else title).strip().lower() in TIMES
+
+
+def _unit_of(time: str) -> tuple[str, str]:
+    """The column, and the unit that stands behind it or in its title; empty if none does."""
+    if match := _TIME.fullmatch(time):
+        return match["column"], match["unit"]
+    match = _TITLE.fullmatch(time)
+    unit = "" if match is None else match["a"] or match["b"]
+    return time, unit if unit in UNITS and UNITS[unit].kind == "time" else ""
+
+
+def _times(count: int, tables: Mapping[str, FloatArray], rows: Rows) -> tuple[FloatArray, str]:
+    """Times of `count` rows in s, and the unit that the column has them in.
+
+    Raises DataError for times that may well be in another unit than s.
+    """
+    if rows.time is None:
+        assert rows.period is not None
+        if not rows.period > 0:
+            raise DataError(f"a period of {rows.period:g} s")
+        return np.arange(count) * rows.period, "s"
+    name, unit = _unit_of(rows.time)
+    times = column_of(tables, name)
+    if len(times) < count:
+        raise DataError(f"{count} rows but {len(times)} times")
+    times = times[:count]
+    if len(unknown := np.flatnonzero(~np.isfinite(times))):
+        raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
+    since_1970 = [unit for unit, least in EPOCHS.items() if len(times) and times[0] >= least]
+    found = unit or (since_1970[0] if since_1970 else "s")
+    seconds: FloatArray = times * UNITS[found].scale
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    if step >= SLOW and not unit and not since_1970:
+        raise DataError(
+            f"the times of '{name}' are {step:g} apart, {len(times)} rows over "
+            f"{np.ptp(times):g}: say which unit they are in, --time '{name}|unit(ms)' or "
+            f"'{name}|unit(s)'; known are s, ms, us and ns"
+        )
+    return seconds, found
+
+
+def _said_times(seconds: FloatArray, rows: Rows, unit: str) -> str:
+    duration = float(np.ptp(seconds)) if len(seconds) else 0.0
+    by = "" if rows.time is None else f" by the column {_unit_of(rows.time)[0]}, taken as {unit}"
+    rate = f", {(len(seconds) - 1) / duration:.4g} Hz" if duration > 0 else ""
+    return f"{len(seconds)} rows over {duration:.4g} s{rate}{by}"
 
 
 def said_units(assignments: Sequence[str], types: Mapping[str, str]) -> str:
-    """The unit that the message type gives to each signal of `import_tables`, in words.
+    """The unit that the message type gives to each signal of `import_table`, in words.
 
     Empty if none of them has one.
     """
@@ -287,20 +304,12 @@ class _Stream:
         return bytes(standard_types().serialize_cdr(self._message, self.msgtype))
 
 
-def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: int) -> IntArray:
-    if period is not None:
-        if not period > 0:
-            raise DataError(f"a period of {period:g} s")
-        time = np.arange(rows) * period
-    assert time is not None
-    if len(time) < rows:
-        raise DataError(f"{rows} rows but {len(time)} times")
-    if len(unknown := np.flatnonzero(~np.isfinite(time[:rows]))):
-        raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
-    seconds = start_ns / 1e9 + time[:rows]
+def _stamps(times: FloatArray, start_ns: int) -> IntArray:
+    """Times in s as stamps; DataError for those that no message can have."""
+    seconds = start_ns / 1e9 + times
     if len(wrong := np.flatnonzero((seconds < 0) | (seconds >= STAMP_SECONDS))):
         first = seconds[wrong[0]]
-        remedy = "give the column in seconds, or another --start"
+        remedy = "name the column's unit, --time 'column|unit(ms)', or another --start"
         if first < 0:
             later = start_ns / 1e9 + math.ceil(-float(np.min(seconds)))
             remedy = f"--start {later:.0f} moves all times to after 0"
@@ -308,7 +317,7 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
             f"the time of row {wrong[0]} is {first:.15g} s since 1970 ({len(wrong)} such rows); "
             f"stamps go from 0 to {STAMP_SECONDS} s: {remedy}"
         )
-    stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
+    stamps: IntArray = start_ns + np.rint(times * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
             f"time does not increase after row {back[0]}: {stamp_text(stamps[back[0]])} "
@@ -368,44 +377,6 @@ def _csv_by_cells(
             raise DataError(f"{path}: '{texts[0][1]}' in {where} is no number")
         table[:, k] = [float(cell) if cell else np.nan for _, cell in column]
     return table
-
-
-def _mat(path: Path) -> dict[str, FloatArray]:
-    try:
-        content = loadmat(path, squeeze_me=False)
-    except NotImplementedError as error:
-        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
-    except Exception as error:  # scipy raises what the bytes make it raise
-        raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
-    found: dict[str, FloatArray] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):  # what the file format keeps for itself
-            _collect(name, value, found)
-    return found
-
-
-def _collect(name: str, value: Any, found: dict[str, FloatArray], depth: int = 0) -> None:
-    """The numeric arrays in a MATLAB value, those of a struct by `name.field`."""
-    if _is_table(value):
-        found[name] = _column(value)
-    elif isinstance(value, np.ndarray) and value.size == 1 and depth < MAX_STRUCT_DEPTH:
-        for field in value.dtype.names or ():
-            _collect(f"{name}.{field}", value.flat[0][field], found, depth + 1)
-
-
-def _is_table(value: Any) -> bool:
-    return (
-        isinstance(value, np.ndarray)
-        and value.ndim in (1, 2)
-        and value.size > 0
-        and (np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating))
-    )
-
-
-def _column(value: Any) -> FloatArray:
-    """As float64; a matrix of one row or column as that row or column."""
-    table = np.asarray(value, dtype=np.float64)
-    return table.ravel() if table.ndim == 2 and 1 in table.shape else table
 
 
 def _is_number(text: str) -> bool:

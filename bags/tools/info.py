@@ -6,7 +6,7 @@ Memory: two integers a message, and one chunk.
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -28,31 +28,19 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 LOST: Final = " lost"  # how the recorder's counts of lost messages end, after the topic
 
 
-@dataclass(frozen=True, eq=False)
-class TopicInfo:
-    """One topic. Intervals are between log times, in s; NaN with fewer than two messages.
+@dataclass(frozen=True)
+class LogTimes:
+    """When messages were logged, in ns; of the intervals, in s, NaN with fewer than two messages.
 
-    histogram: intervals per bin of BINS, which are in median intervals. missing: sequence numbers
-    left out, None where nobody counted. clock: None without header stamps. unstamped: there are
-    header stamps and all are 0.
+    interval: the median. histogram: intervals per bin of BINS, which are in median intervals.
     """
 
-    topic: str
-    msgtype: str
-    count: int
-    size: int
     first_ns: int = 0
     last_ns: int = 0
     interval: float = float("nan")
     histogram: tuple[int, ...] = ()
     gaps: int = 0
     longest: float = float("nan")
-    backward: int = 0
-    duplicates: int = 0
-    missing: int | None = None
-    clock: ClockRelation | None = None
-    unstamped: bool = False
-    unreadable: str = ""
 
     @property
     def rate(self) -> float:
@@ -68,17 +56,43 @@ class TopicInfo:
         height = [np.ceil((len(BARS) - 1) * n / most) for n in self.histogram]
         return "".join(BARS[int(h)] for h in height)
 
+
+@dataclass(frozen=True)
+class Stamps:
+    """Header stamps: how often they go back, and repeat; clock: None if all are 0."""
+
+    backward: int
+    duplicates: int
+    clock: ClockRelation | None
+
+
+@dataclass(frozen=True, eq=False)
+class TopicInfo:
+    """One topic. stamps: None without headers, or if they cannot be read.
+
+    missing: sequence numbers left out, None where nobody counted.
+    """
+
+    topic: str
+    msgtype: str
+    count: int
+    size: int
+    times: LogTimes = LogTimes()
+    stamps: Stamps | None = None
+    missing: int | None = None
+    unreadable: str = ""
+
     @property
     def odd(self) -> list[str]:
         """What is wrong with its messages and stamps, in words."""
         odd = []
-        if self.unstamped:
+        if self.stamps is not None and self.stamps.clock is None:
             odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
-        else:
-            if self.backward:
-                odd.append(f"header stamps go back in {self.backward} places")
-            if self.duplicates:
-                odd.append(f"{self.duplicates} header stamps repeat the one before")
+        elif self.stamps is not None:
+            if self.stamps.backward:
+                odd.append(f"header stamps go back in {self.stamps.backward} places")
+            if self.stamps.duplicates:
+                odd.append(f"{self.stamps.duplicates} header stamps repeat the one before")
         if self.missing:
             odd.append(f"{self.missing} sequence numbers are missing: messages were lost")
         if self.unreadable:
@@ -121,7 +135,8 @@ class BagInfo:
         filled = [topic for topic in self.topics if topic.count]
         if not filled:
             return 0.0
-        first, last = min(t.first_ns for t in filled), max(t.last_ns for t in filled)
+        first = min(topic.times.first_ns for topic in filled)
+        last = max(topic.times.last_ns for topic in filled)
         return (last - first) / 1e9
 
 
@@ -142,11 +157,8 @@ def bag_info(
             for topic, msgtype in bag.topics.items()
             if topics is None or topic in topics
         }
-        total, done = sum(c.count for c in bag.channels if c.topic in found), 0
-        for channel, batch in bag.batches(list(found)):
+        for channel, batch in bag.batches(list(found), progress=progress):
             found[channel.topic].add(batch, bag.strand(channel))
-            done += len(batch)
-            progress("reading", done / max(total, 1))
         return BagInfo(
             path=bag.path,
             files=len(bag.files),
@@ -196,39 +208,50 @@ class _Collector:
 
     def info(self) -> TopicInfo:
         count = sum(map(len, self.log_ns))
-        shown = TopicInfo(self.topic, self.msgtype, count, self.size, unreadable=self.unreadable)
         if not count:
-            return shown
+            return TopicInfo(self.topic, self.msgtype, 0, self.size, unreadable=self.unreadable)
         log_ns = np.concatenate(self.log_ns)
         order = np.argsort(log_ns, kind="stable")
         log_ns = log_ns[order]
-        values: dict[str, Any] = vars(shown) | {
-            "first_ns": int(log_ns[0]),
-            "last_ns": int(log_ns[-1]),
-        }
         counted = [missing(np.concatenate(parts)) for parts in self.sequence.values()]
         known = [count for count in counted if count is not None]
-        values["missing"] = sum(known) if known else None
+        stamps = None
         if self._gatherer is not None:
-            stamp_ns = np.concatenate(self.stamp_ns)[order]
-            steps = np.diff(stamp_ns)
-            values["backward"] = int((steps < 0).sum())
-            values["duplicates"] = int((steps == 0).sum())
-            if stamp_ns.any():
-                values["clock"] = clock_relation(stamp_ns, log_ns)
-            else:
-                values["unstamped"] = True
-        if count > 1:
-            intervals = np.diff(log_ns) / 1e9
-            median = float(np.median(intervals))
-            scale = median if median > 0 else float(np.max(intervals)) or 1.0
-            values |= {
-                "interval": median,
-                "histogram": tuple(np.histogram(intervals / scale, BINS)[0].tolist()),
-                "gaps": int((intervals > GAP * scale).sum()),
-                "longest": float(np.max(intervals)),
-            }
-        return TopicInfo(**values)
+            stamps = _stamps(np.concatenate(self.stamp_ns)[order], log_ns)
+        return TopicInfo(
+            self.topic,
+            self.msgtype,
+            count,
+            self.size,
+            _log_times(log_ns),
+            stamps,
+            sum(known) if known else None,
+            self.unreadable,
+        )
+
+
+def _log_times(log_ns: IntArray) -> LogTimes:
+    """What log times (N,) show, ascending, N > 0."""
+    first_ns, last_ns = int(log_ns[0]), int(log_ns[-1])
+    if len(log_ns) == 1:
+        return LogTimes(first_ns, last_ns)
+    intervals = np.diff(log_ns) / 1e9
+    median = float(np.median(intervals))
+    scale = median if median > 0 else float(np.max(intervals)) or 1.0
+    return LogTimes(
+        first_ns,
+        last_ns,
+        median,
+        tuple(np.histogram(intervals / scale, BINS)[0].tolist()),
+        int((intervals > GAP * scale).sum()),
+        float(np.max(intervals)),
+    )
+
+
+def _stamps(stamp_ns: IntArray, log_ns: IntArray) -> Stamps:
+    steps = np.diff(stamp_ns)
+    clock = clock_relation(stamp_ns, log_ns) if stamp_ns.any() else None
+    return Stamps(int((steps < 0).sum()), int((steps == 0).sum()), clock)
 
 
 def missing(sequence: IntArray) -> int | None:

@@ -12,9 +12,10 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import decode, fields_of
 from bags.signals.columns import TopicReader
-from bags.signals.signal import ANGLES, QUATERNION, SignalPath, Step, numeric_paths
+from bags.signals.signal import ANGLES, QUATERNION, SignalPath, numeric_paths
 from bags.signals.units import implied_unit
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -46,11 +47,8 @@ def bag_signals(bag: Bag, *, progress: Progress = silent) -> list[Listed]:
     """Every number of every topic, in the order of the topics; reads the whole bag once."""
     topics = {topic: _Topic(bag, topic) for topic in bag.topics}
     wanted = [topic for topic, listing in topics.items() if listing.names]
-    total, done = sum(c.count for c in bag.channels if c.topic in wanted), 0
-    for channel, batch in bag.batches(wanted):
+    for channel, batch in bag.batches(wanted, progress=progress):
         topics[channel.topic].read(batch)
-        done += len(batch)
-        progress("reading", done / max(total, 1))
     return [listed for listing in topics.values() for listed in listing.listed()]
 
 

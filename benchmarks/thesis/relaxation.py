@@ -14,7 +14,7 @@ from nlsid_core.design import ContinuousTracking
 from nlsid_core.design.continuous.lstep import sections
 from nlsid_core.design.continuous.problem import Goal
 from nlsid_core.design.continuous.setting import prepare
-from nlsid_core.design.continuous.sweep import sweep_rho
+from nlsid_core.design.continuous.sweep import Wanted, sweep_rho
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -45,7 +45,6 @@ def sample_funnel(
     samples: int = 4,
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
-    gain: str = "constant",
     progress: Progress = silent,
 ) -> Sampled:
     """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
@@ -55,15 +54,11 @@ def sample_funnel(
     """
     if samples < 2:
         raise DataError(f"{samples} samples an interval: its two ends are the least")
-    setting = prepare(
-        ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
-    )
+    setting = prepare(ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R))
     steps, policy = setting.steps, setting.policy
     instants = sections(steps, policy, setting.P, count=samples)
     margin = setting.margin(setting.rho_final)
-    rho, _ = sweep_rho(
-        steps, instants, margin=margin, rho_final=setting.rho_final, progress=progress
-    )
+    rho, _ = sweep_rho(steps, instants, Wanted(margin, setting.rho_final), progress)
     digest = files.digest(policy.document())
     funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
     return Sampled(funnel, (funnel.volume_integral(),))

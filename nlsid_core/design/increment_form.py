@@ -1,6 +1,7 @@
 """`Form`: a model's increment form in floats, as the program that looks for a tube needs it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -29,17 +30,12 @@ class Form:
     """The increment form in floats. modes: (F, H), and a second with a policy engaged.
 
     tree: of a proof's multipliers, with the vertices E of each of its leaves in order, (count, m,
-    m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
+    m + n); None without ν.
     """
 
-    F: FloatArray
-    H: FloatArray
     modes: list[tuple[FloatArray, FloatArray]]
     tree: Json | None
     leaves: list[FloatArray]
-    mean: FloatArray
-    A: FloatArray
-    C: FloatArray
     ray: bool
     rate: float
     inputs: tuple[FloatArray, FloatArray] | None
@@ -68,13 +64,10 @@ class Form:
                 )
             )
         F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
-        m = form.unknowns
         leaves: list[FloatArray] = [
             np.array(form.E.vertices(part, ends), dtype=np.float64)
             for part, ends in _parts(proof.multipliers, form.E.box)
         ]
-        mean = np.mean([E.mean(axis=0) for E in leaves], axis=0) if m else np.zeros((0, len(F)))
-        G = np.linalg.solve(mean[:, :m], mean[:, m:]) if m else mean
         inputs = None
         if form.linear is not None:
             B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
@@ -82,30 +75,44 @@ class Form:
         modes: list[tuple[FloatArray, FloatArray]] = [(F, H)]
         if K is not None and K.any() and inputs is not None:
             modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
-        return cls(
-            F,
-            H,
-            modes,
-            proof.multipliers,
-            leaves,
-            mean,
-            F[:, m:] - F[:, :m] @ G,
-            H[:, m:] - H[:, :m] @ G,
-            form.E.ray,
-            proof.rate,
-            inputs,
-            np.linalg.inv(proof.P),
-        )
+        storage = np.linalg.inv(proof.P)
+        return cls(modes, proof.multipliers, leaves, form.E.ray, proof.rate, inputs, storage)
+
+    @property
+    def F(self) -> FloatArray:
+        """x̄⁺ of (ν, x̄), without a policy."""
+        return self.modes[0][0]
+
+    @property
+    def H(self) -> FloatArray:
+        """o of (ν, x̄), without a policy."""
+        return self.modes[0][1]
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """(m, m + n) of the vertices E."""
+        if not self.m:
+            return np.zeros((0, len(self.F)))
+        return np.asarray(np.mean([E.mean(axis=0) for E in self.leaves], axis=0))
+
+    @cached_property
+    def A(self) -> FloatArray:
+        """x̄⁺ of x̄ at the mean of E."""
+        return _closed(self.F, self.mean)
+
+    @cached_property
+    def C(self) -> FloatArray:
+        """o of x̄ at the mean of E."""
+        return _closed(self.H, self.mean)
 
     @property
     def corners(self) -> list[FloatArray]:
         """x̄⁺ of x̄ where E is one of its vertices, of a few: one of them may be much slower."""
-        m, vertices = self.m, [E for leaf in self.leaves for E in leaf]
-        if not m:
+        vertices = [E for leaf in self.leaves for E in leaf]
+        if not self.m:
             return [self.A]
         chosen = vertices[:: max(1, len(vertices) // CORNERS)]
-        F = self.F
-        return [F[:, m:] - F[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]) for E in chosen]
+        return [_closed(self.F, E) for E in chosen]
 
     @property
     def m(self) -> int:
@@ -115,6 +122,12 @@ class Form:
     def fading(self) -> list[float]:
         """ρ between rate² and 1."""
         return [1.0 - part * (1.0 - self.rate**2) for part in FADING]
+
+
+def _closed(rows: FloatArray, E: FloatArray) -> FloatArray:
+    """Rows of (ν, x̄) as rows of x̄, where E (ν, x̄) = 0."""
+    m = len(E)
+    return np.asarray(rows[:, m:] - rows[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]))
 
 
 def _parts(tree: Json | None, box: Box) -> list[tuple[Box, Node | None]]:

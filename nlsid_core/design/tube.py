@@ -27,7 +27,7 @@ from nlsid_core.design.levels import followed
 from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.problems import OutputTube
 from nlsid_core.design.riccati import solve_riccati
-from nlsid_core.design.tube_program import Found, gramian, solved
+from nlsid_core.design.tube_program import Found, Pair, gramian, solved
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -135,7 +135,8 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
         return ""
 
     start = inlet / safety_factor
-    found = [_best(form, gains, e, amplitudes, samples, form.fading(), decided, start)]
+    fading = _pairs(gains, e, form.fading())
+    found = [_best(form, fading, amplitudes, samples, decided, start)]
     lasting: list[int | None] = [None]
     if horizon is not None:
         length = max(1, round(horizon / model.period))
@@ -150,7 +151,7 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
             i = found[0].at
             gains, e = found[0].L[None], [part[:, i : i + 1] for part in e]
             found[0] = replace(found[0], at=0)
-        found.append(_best(form, gains, e, amplitudes, length, [1.0], decided, start))
+        found.append(_best(form, _pairs(gains, e, [1.0]), amplitudes, length, decided, start))
     u = [trial.u for trial in train]
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
@@ -359,32 +360,39 @@ def _gains(form: Form, amplitudes: FloatArray) -> FloatArray:
     return np.array(found)
 
 
+def _pairs(gains: FloatArray, e: list[FloatArray], rhos: Sequence[float]) -> list[Pair]:
+    """Every gain with every ρ; e: innovations (N, B, p) of the gains in each trial."""
+    return [
+        Pair(gains[i], i, rho, [part[:, i] for part in e])
+        for i, rho in product(range(len(gains)), rhos)
+    ]
+
+
 def _best(
     form: Form,
-    gains: FloatArray,
-    e: list[FloatArray],
+    pairs: Sequence[Pair],
     amplitudes: FloatArray,
     samples: int,
-    rhos: Sequence[float],
     decided: Callable[[Found], str],
-    start: float = 0.0,
+    start: float,
 ) -> Found:
     """The pair (L, ρ), solved and proved, of the narrowest tube with a forecast near the narrowest.
 
     start: the first output's error there, in the unit in which the innovations are not scaled up.
-    e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
+    Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
     the most that E can be, `samples` after 0 or ever. SOLVED are solved; while the kernel refuses
     all of them (`decided` says why), as many more. An energy's tube has its forecast's length.
     """
-    near = CLOSE if min(rhos) < 1.0 else 1.0
+    near = CLOSE if min(pair.rho for pair in pairs) < 1.0 else 1.0
 
     def widths(
-        i: int, rho: float, R: FloatArray, variance: FloatArray, W: FloatArray
+        pair: Pair, R: FloatArray, variance: FloatArray, W: FloatArray
     ) -> tuple[float, float]:
         """A forecast's and the lasting tube's, per amplitude."""
+        rho = pair.rho
         began = rho * start**2 / float(W[0, 0]) if start else 0.0
-        spent = [np.einsum("ti,ij,tj->t", part[:, i], R, part[:, i]) for part in e]
+        spent = [np.einsum("ti,ij,tj->t", part, R, part) for part in pair.e]
         weights = rho ** np.arange(samples + 1)
         ahead = max(float(np.convolve(part, weights).max()) for part in spent)
         ever = max(float(lfilter([1.0], [1.0, -rho], part).max()) for part in spent)
@@ -398,23 +406,23 @@ def _best(
         return [found[k][2] for k in sorted(range(len(found)), key=keys.__getitem__)]
 
     ranked = []
-    for i, rho in product(range(len(gains)), rhos):
+    for pair in pairs:
         try:
-            W, R = gramian(form, gains[i], rho, [part[:, i] for part in e])
+            W, R = gramian(form, pair)
         except (LinAlgError, ValueError):
             continue
-        variance = np.diag(np.linalg.inv(R)) + np.einsum("ij,jk,ik->i", form.C, W, form.C) / rho
+        reach = np.einsum("ij,jk,ik->i", form.C, W, form.C) / pair.rho
+        variance = np.diag(np.linalg.inv(R)) + reach
         if np.isfinite(variance).all() and (variance > 0.0).all():
-            ranked.append((*widths(i, rho, R, variance, W), (i, rho)))
-    pairs, refused = ordered(ranked), ""
-    for first in range(0, min(len(pairs), MOST), SOLVED):
+            ranked.append((*widths(pair, R, variance, W), pair))
+    sorted_pairs, refused = ordered(ranked), ""
+    for first in range(0, min(len(sorted_pairs), MOST), SOLVED):
         tried: list[tuple[float, float, Any]] = []
-        for i, rho in pairs[first : first + SOLVED]:
-            found = solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
+        for pair in sorted_pairs[first : first + SOLVED]:
+            found = solved(form, pair, amplitudes)
             if found is not None:
-                entry = replace(found, at=i)
                 W = np.linalg.inv(found.P)
-                tried.append((*widths(i, rho, found.R, 1.0 / found.tau, W), entry))
+                tried.append((*widths(pair, found.R, 1.0 / found.tau, W), found))
         for candidate in ordered(tried):
             refused = decided(candidate)
             if not refused:

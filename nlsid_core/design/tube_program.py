@@ -10,7 +10,7 @@ Source: docs/certificate_tube.md.
 import warnings
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import cvxpy
 import numpy as np
@@ -46,14 +46,21 @@ class Found:
     R: FloatArray
     tau: FloatArray
     multipliers: Json | None
-    at: int = 0
+    at: int
 
 
-def gramian(
-    form: Form, L: FloatArray, rho: float, e: list[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+class Pair(NamedTuple):
+    """A pair to try: L (n, p), which of the gains it is, ρ, and its innovations e (N, p)."""
+
+    L: FloatArray
+    at: int
+    rho: float
+    e: list[FloatArray]
+
+
+def gramian(form: Form, pair: Pair) -> tuple[FloatArray, FloatArray]:
     """W, mean over a few vertices, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
-    p = len(form.H)
+    p, (L, _, rho, e) = len(form.H), pair
     most = np.max([_fading_squares(part, rho).max(axis=0) for part in e], axis=0)
     R = np.diag(1.0 / (p * np.maximum(most, np.finfo(float).tiny)))
     noise = L @ np.linalg.inv(R) @ L.T
@@ -68,9 +75,7 @@ def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
     return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
 
 
-def solved(
-    form: Form, L: FloatArray, rho: float, e: list[FloatArray], amplitudes: FloatArray
-) -> Found | None:
+def solved(form: Form, pair: Pair, amplitudes: FloatArray) -> Found | None:
     """P, R, N, τ of the least Σ 1/(τ_j a_j²), E <= 1 on the trials (one output: R = 1).
 
     Units: x in those of the Gramian W^(1/2) of the increments at a few vertices, or of the inverse
@@ -78,28 +83,22 @@ def solved(
     moves state and output by; E with an identity in ν at its mean.
     """
     try:
-        W, R0 = gramian(form, L, rho, e)
+        W, R0 = gramian(form, pair)
     except (LinAlgError, ValueError):
         return None
     inverse = form.storage * (np.trace(W) / np.trace(form.storage))
     for balance, scale in product((W, inverse), SCALES):
-        found = _balanced(form, L, rho, e, amplitudes, scale * balance, R0)
+        found = _balanced(form, pair, amplitudes, scale * balance, R0)
         if found is not None:
             return found
     return None
 
 
 def _balanced(
-    form: Form,
-    L: FloatArray,
-    rho: float,
-    e: list[FloatArray],
-    amplitudes: FloatArray,
-    W: FloatArray,
-    R0: FloatArray,
+    form: Form, pair: Pair, amplitudes: FloatArray, W: FloatArray, R0: FloatArray
 ) -> Found | None:
     """`solved` in the units of W^(1/2)."""
-    m, p = form.m, len(form.H)
+    m, p, (L, at, rho, e) = form.m, len(form.H), pair
     try:
         values, vectors = np.linalg.eigh(W)
         root = (vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))) @ vectors.T
@@ -123,7 +122,7 @@ def _balanced(
     windows = _Windows([part / sizes for part in e], rho)
     solution = None
     for _ in range(ROUNDS if p > 1 else 1):
-        solution = _program(modes, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
+        solution = _program(modes, leaves, rho, windows.chosen, sizes / amplitudes, ray=form.ray)
         if solution is None:
             return None
         if p == 1 or not windows.cut(solution[1]):
@@ -142,6 +141,7 @@ def _balanced(
         np.eye(1) if p == 1 else (R + R.T) / 2.0,
         unit * (1.0 - TAU_ROOM) * tau / sizes**2,
         None if form.tree is None else _with_multipliers(form.tree, found),
+        at,
     )
 
 
@@ -177,7 +177,6 @@ def _program(
     modes: list[tuple[FloatArray, FloatArray]],
     leaves: list[Leaf],
     rho: float,
-    m: int,
     windows: list[FloatArray],
     weights: FloatArray,
     *,
@@ -191,7 +190,8 @@ def _program(
     unknowns of the program.
     """
     n, p = len(modes[0][0]), len(modes[0][1])
-    size = m + n + p
+    size = modes[0][0].shape[1]
+    m = size - n - p
     P = cp.Variable((n, n), symmetric=True)
     tau = cp.Variable(p)
     R: Any = np.eye(1) if p == 1 else cp.Variable((p, p), symmetric=True)

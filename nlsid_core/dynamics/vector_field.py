@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any
 
@@ -49,8 +50,6 @@ class VectorField:
     uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     expansion: str = ""
-    names: tuple[str, ...] = field(init=False)
-    _plans: tuple["Plan", ...] = field(init=False)
     _slopes: dict[int, "Plan"] = field(init=False, default_factory=dict)  # built when first asked
 
     def __post_init__(self) -> None:
@@ -65,7 +64,6 @@ class VectorField:
         if breaks.ndim != 1 or not np.isfinite(breaks).all() or (np.diff(breaks) <= 0).any():
             raise DataError(f"breaks should be increasing times, are {breaks}")
         names = ("t", *variable_names(self.n, self.m, len(bounds)))
-        object.__setattr__(self, "names", names)
         valid = np.array(self.valid, dtype=np.float64)
         if valid.size == 0:
             valid = np.zeros((0, 3))
@@ -93,7 +91,15 @@ class VectorField:
                     raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
         keep(self, {"breaks": breaks, "uncertain": bounds, "valid": valid})
         object.__setattr__(self, "pieces", tuple(pieces))
-        object.__setattr__(self, "_plans", tuple(Plan.of(p, names) for p in pieces))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """t, x0.., u0.., w0..."""
+        return ("t", *variable_names(self.n, self.m, len(self.uncertain)))
+
+    @cached_property
+    def _plans(self) -> tuple["Plan", ...]:
+        return tuple(Plan.of(p, self.names) for p in self.pieces)
 
     @classmethod
     def from_function(

@@ -9,7 +9,8 @@ Read in this order: `files` (untrusted input), `exact` (definite matrices), `pol
 `positivity` (positive polynomials), then the claims, each a module with one `decide`.
 """
 
-from .checking import KINDS, LEFT, Verdict, check, decide
+from .checking import KINDS, LEFT, check, decide
 from .files import REASONS, Mismatch, Rejected
+from .text import Verdict
 
 __all__ = ["KINDS", "LEFT", "REASONS", "Mismatch", "Rejected", "Verdict", "check", "decide"]

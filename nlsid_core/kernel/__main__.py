@@ -47,13 +47,17 @@ def limited(seconds: int, memory: int) -> None:
 
 
 def answer(path: str) -> dict[str, Any]:
-    """The verdict as JSON has it; `rejected` and its `reason`; or `unread`, why it was not read."""
+    """The verdict as JSON has it; `rejected` and its `reason`; or `unread`, why it was not read.
+
+    said: the same for a person.
+    """
     try:
         verdict = _kernel.check(path)
     except OSError as error:
-        return {"unread": error.strerror}
+        return {"unread": error.strerror, "said": f"cannot be read: {error.strerror}"}
     except _kernel.Rejected as refusal:
-        return {"rejected": str(refusal), "reason": refusal.reason}
+        said = f"REJECTED {refusal} [{refusal.reason}]"
+        return {"rejected": str(refusal), "reason": refusal.reason, "said": said}
     return {**vars(verdict), "margin": str(verdict.margin), "said": str(verdict)}
 
 
@@ -70,14 +74,8 @@ def main(given: list[str]) -> int:
         limited(options.seconds, options.memory)
         found = answer(path)
         status = max(status, 2 if "unread" in found else 1 if "rejected" in found else 0)
-        if options.json:
-            print(json.dumps(found))
-            continue
-        line = "".join(sign if sign.isprintable() else "?" for sign in path)
-        name = line.encode("ascii", "replace").decode()
-        refused = f"REJECTED {found.get('rejected')} [{found.get('reason')}]"
-        said = found.get("said", refused)
-        print(f"{name}: " + (f"cannot be read: {found['unread']}" if "unread" in found else said))
+        name = "".join(sign if sign.isprintable() and sign.isascii() else "?" for sign in path)
+        print(json.dumps(found) if options.json else f"{name}: {found['said']}")
     return status
 
 

@@ -1,16 +1,27 @@
 """`check`: a proof file in, a verdict out, or `Rejected` with the reason."""
 
 import os
-from dataclasses import dataclass, field
-from fractions import Fraction
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-from . import text
-from .decision import Decision
-from .files import MAX_TOTAL, Node, Read, Rejected, digest, parse, plain, read_regular, refuse_if
+from .files import (
+    MAX_TOTAL,
+    Node,
+    Read,
+    Rejected,
+    digest,
+    itself,
+    limit,
+    parse,
+    plain,
+    read_regular,
+    refuse_if,
+)
+from .text import Verdict
 
-# Each claim is a module of this package with a function `decide(claim, proof, read) -> Decision`.
+# Each claim is a module of this package with a function `decide(claim, proof, read) -> Verdict`.
 KINDS = (
     "stability",
     "stable_set",
@@ -28,29 +39,6 @@ LEFT = (
     "region_of_attraction",
     "falsification",
 )
-LEFT_WITH = "left with version 0.3"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What is proved: it exists only for a claim that was decided.
-
-    statement: one sentence. margin: how much room the proof has, in the unit that the kind states;
-    rounded down when printed. assumptions: what the statement rests on and the kernel cannot know.
-    digests: by role, of the files that it is about, and of the proof itself (role `proof`). files:
-    the digests by name of all that was read beside the proof.
-    """
-
-    kind: str
-    statement: str
-    margin: Fraction
-    assumptions: tuple[str, ...] = ()
-    digests: dict[str, str] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        lines = [f"PROVED {self.statement}, margin {text.below(self.margin)}"]
-        return "\n".join(lines + [f"  assuming {assumption}" for assumption in self.assumptions])
 
 
 def check(path: str | os.PathLike[str]) -> Verdict:
@@ -65,24 +53,17 @@ def check(path: str | os.PathLike[str]) -> Verdict:
 
 def decide(content: bytes, read: Read) -> Verdict:
     """Decide a proof's bytes; `read` gives those of the files it names. Raises Rejected."""
-    left, files = MAX_TOTAL - len(content), {}
+    total, files = len(content), {}
 
     def limited(name: str) -> bytes:
-        nonlocal left
+        nonlocal total
         found = read(name)
-        left -= len(found)
-        refuse_if(
-            left < 0, f"the files of one claim have at most {MAX_TOTAL} bytes together", "too_large"
-        )
+        total = limit(total + len(found), MAX_TOTAL, "bytes of all files of the claim")
         files[name] = digest(found)
         return found
 
     try:
-        document = parse(content, "proof file")
-        _refuse_former(document)
-        parts = document.document("proof", "claim proof")
-        kind = parts["claim"].kind()
-        decided = _decided(kind, parts["claim"], parts["proof"], limited)
+        verdict = _decided(parse(content, "proof file"), limited)
     except Rejected:
         raise
     except (RecursionError, MemoryError) as error:
@@ -91,23 +72,18 @@ def decide(content: bytes, read: Read) -> Verdict:
     except Exception as error:
         unexpected = f"not decided: {type(error).__name__}: {plain(str(error))}"
         raise Rejected(unexpected, "not_decided") from error
-    digests = {**decided.digests, "proof": digest(content)}
-    return Verdict(kind, decided.statement, decided.margin, decided.assumptions, digests, files)
+    return replace(verdict, digests={**verdict.digests, "proof": digest(content)}, files=files)
 
 
-def _decided(kind: str, claim: Node, proof: Node, read: Read) -> Decision:
-    refuse_if(kind in LEFT, f"kind {kind} {LEFT_WITH}", "left")
+def _decided(document: Node, read: Read) -> Verdict:
+    former = document.value.get("version") == 1
+    refuse_if(former, "version 1 left; make the proof again, by what wrote it", "left")
+    parts = document.document("proof", {"claim": itself, "proof": itself})
+    kind = parts["claim"].kind()
+    refuse_if(kind in LEFT, f"kind {kind} left with version 0.3", "left")
     refuse_if(kind not in KINDS, f"claim {kind!r} is unknown; known: {', '.join(KINDS)}", "unknown")
-    refuse_if(
-        type(claim.value) is dict and kind == "continuous_funnel" and "decay" in claim.value,
-        f"decay, a member of a {kind}'s claim, {LEFT_WITH}",
-        "left",
-    )
-    decision: Decision = import_module(f".{kind}", __package__).decide(claim, proof, read)
-    return decision
-
-
-def _refuse_former(document: Node) -> None:
-    if type(document.value) is dict and document.value.get("version") == 1:
-        again = "make it again, by the command that wrote it"
-        raise Rejected(f"a proof of version 1 is not decided any more; {again}", "left")
+    former = kind == "continuous_funnel" and "decay" in parts["claim"].value
+    refuse_if(former, f"decay, of a {kind}, left with version 0.3", "left")
+    decide_claim: Any = import_module(f".{kind}", __package__).decide
+    verdict: Verdict = decide_claim(parts["claim"], parts["proof"], read)
+    return replace(verdict, kind=kind)

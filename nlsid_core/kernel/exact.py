@@ -6,8 +6,9 @@ A matrix is a list of rows of Fractions or ints.
 from collections.abc import Sequence
 from fractions import Fraction
 from math import lcm
+from typing import Any
 
-from .files import common_denominator, refuse_if
+from .files import common_denominator, limit, refuse_if
 
 Matrix = list[list[Fraction]]
 Rows = Sequence[Sequence[Fraction | int]]
@@ -32,17 +33,9 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
     entries are -(last pivot) g'M⁻¹g. Not strict, M ⪰ 0: a zero pivot is passed over if the rest of
     its row is zero, else M is indefinite.
     """
-    size = len(M)
-    refuse_if(
-        not 0 < size <= MAX_ORDER or any(len(row) != size for row in M),
-        f"{what} should be a square matrix of order 1 to {MAX_ORDER}",
-        "too_large",
-    )
-    refuse_if(
-        any(M[i][j] != M[j][i] for i in range(size) for j in range(i)),
-        f"{what} is not symmetric",
-        "not_definite",
-    )
+    size = limit(len(M), MAX_ORDER, f"{what}: order", least=1)
+    refuse_if(any(len(row) != size for row in M), f"{what} is not square", "too_large")
+    refuse_if(transposed(M) != list(map(list, M)), f"{what} is not symmetric", "not_definite")
 
     scales = [lcm(*(entry.denominator for entry in g)) for g in vectors]
     whole = [[int(e * scale) for e in g] for g, scale in zip(vectors, scales, strict=True)]
@@ -50,19 +43,12 @@ def inverse_forms(M: Rows, vectors: Rows, what: str, *, strict: bool = True) -> 
     rows = [[e.numerator * (common // e.denominator) for e in row] for row in M]
     rows = [[*row, *(g[i] for g in whole)] for i, row in enumerate(rows)]
     corners, before = [0] * len(whole), 1
+    wanted = "definite" if strict else "semidefinite"
 
     for k, row in enumerate(rows):
         pivot = row[k]
-        refuse_if(
-            strict and pivot <= 0,
-            f"{what} is not positive definite (leading minor {k + 1} of {size})",
-            "not_definite",
-        )
-        refuse_if(
-            pivot < 0 or (pivot == 0 and any(row[k:])),
-            f"{what} is not positive semidefinite",
-            "not_definite",
-        )
+        indefinite = pivot < 0 or (pivot == 0 and (strict or any(row[k:])))
+        refuse_if(indefinite, f"{what} is not positive {wanted} (minor {k + 1})", "not_definite")
         if pivot == 0:
             continue
         corners = [
@@ -96,12 +82,7 @@ def product(A: Rows, B: Rows) -> Matrix:
     return [[dot(row, column) for column in columns] for row in A]
 
 
-def congruence(F: Rows, P: Rows) -> Matrix:
-    """F'P F."""
-    return product(transposed(F), product(P, F))
-
-
-def transposed(A: Sequence[Sequence]) -> list[list]:  # type: ignore[type-arg]
+def transposed(A: Sequence[Sequence[Any]]) -> list[list[Any]]:
     """A'."""
     return [list(column) for column in zip(*A, strict=True)]
 
@@ -114,20 +95,14 @@ def combined(A: Rows, B: Rows, weight: Fraction | int = 1) -> Matrix:
     ]
 
 
-def block_diagonal(*blocks: Rows) -> Matrix:
-    """The blocks along the diagonal of a matrix that is zero elsewhere."""
-    size, rows, start = sum(map(len, blocks)), [], 0
-    for block in blocks:
-        for row in block:
-            end = size - start - len(block)
-            rows.append([Fraction(0)] * start + [Fraction(e) for e in row] + [Fraction(0)] * end)
-        start += len(block)
-    return rows
-
-
-def scaled(M: Rows, weight: Fraction) -> Matrix:
+def scaled(M: Rows, weight: Fraction | int) -> Matrix:
     """Weight M."""
-    return [[weight * entry for entry in row] for row in M]
+    return [[Fraction(weight * entry) for entry in row] for row in M]
+
+
+def identity(size: int) -> Matrix:
+    """I."""
+    return [unit(i, size) for i in range(size)]
 
 
 def unit(i: int, size: int) -> list[Fraction]:

@@ -10,26 +10,29 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from math import lcm
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 MAX_BYTES = 32 * 2**20  # of one file; real proofs are a few MB
 MAX_TOTAL = 48 * 2**20  # of all files of a claim: half a minute, and 50 times that in memory
 MAX_WHOLE = 2**53  # beyond it a float64 no longer holds every whole number
 MAX_DIGITS = 4000  # of one integer of a "p/q": bounds what one number can cost
-MAX_NAME = 200
+MAX_NAME = 200  # characters of a text
 MAX_NUMBER = 60  # characters of a JSON number; a float64 needs at most 25
+MAX_ENTRIES = 10**6  # of a list of objects
 MAX_DEGREE = 63  # of a monomial, all exponents together
 MAX_STATED = 20_000  # monomials of one list
 MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a matrix
 VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
+Reader: TypeAlias = "Callable[[Node], Any] | tuple[int | None, ...]"  # of a member, or its shape
+Table = dict[str, Reader]  # the members of an object; `name?` may be missing
 # Of a polynomial: exponents and coefficients. Exponents are bytes, whose hash no file can choose.
 Terms = list[tuple[bytes, Fraction]]
 
@@ -71,6 +74,12 @@ def refuse_if(wrong: object, message: str, reason: str = "malformed") -> None:
         raise Rejected(message, reason)
 
 
+def limit(count: int, most: int, what: str, least: int = 0) -> int:
+    """The count of `what`; Rejected unless it is from `least` to `most`."""
+    refuse_if(not least <= count <= most, f"{what}: {count}, not {least} to {most}", "too_large")
+    return count
+
+
 def by_degree(exponents: bytes) -> tuple[int, bytes]:
     """The order of monomials: by total degree, then by their exponents."""
     return sum(exponents), exponents
@@ -80,131 +89,141 @@ def by_degree(exponents: bytes) -> tuple[int, bytes]:
 class Node:
     """A JSON value and where it stands, for messages; every reader below refuses what is wrong."""
 
-    value: object
+    value: Any
     where: str
+
+    def require(self, checks: Mapping[str, object], reason: str = "malformed") -> None:
+        """Raise Rejected with the first text whose condition is false."""
+        for wanted, holds in checks.items():
+            joint = " " if wanted.startswith("should ") else ": "
+            refuse_if(not holds, f"{self.where}{joint}{wanted}", reason)
 
     def members(self, required: str, optional: str = "") -> dict[str, "Node"]:
         """An object with exactly these members (names separated by spaces)."""
         wanted, allowed = required.split(), optional.split()
-        if type(self.value) is not dict:
-            raise Rejected(f"{self.where} should be an object")
-        for name in wanted:
-            if name not in self.value:
-                raise Rejected(f"{self.where}: '{name}' is missing")
-        for name in self.value:
-            if name not in wanted and name not in allowed:
-                raise Rejected(f"{self.where}: unknown member {plain(name)!r}")
+        self.require({"should be an object": type(self.value) is dict})
+        self.require({f"'{name}' is missing": name in self.value for name in wanted})
+        known = {*wanted, *allowed}
+        self.require({f"unknown member {plain(name)!r}": name in known for name in self.value})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
-    def member(self, name: str) -> "Node":
-        """One member of an object that may have others."""
-        if type(self.value) is not dict or name not in self.value:
-            raise Rejected(f"{self.where}: '{name}' is missing")
-        return Node(self.value[name], f"{self.where} {name}")
+    def read(self, table: Table) -> dict[str, Any]:
+        """The members of an object, by their readers or of their shapes; None for a missing one."""
+        optional = [name[:-1] for name in table if name.endswith("?")]
+        parts = self.members(" ".join(n for n in table if n[-1] != "?"), " ".join(optional))
+        found: dict[str, Any] = dict.fromkeys(optional)
+        for stated, reader in table.items():
+            name = stated.rstrip("?")
+            if name not in parts:
+                continue
+            if isinstance(reader, tuple):
+                found[name] = parts[name].array(*reader)
+            else:
+                found[name] = reader(parts[name])
+        return found
 
-    def items(self, least: int = 0, most: int = 10**6) -> list["Node"]:
+    def document(
+        self, form: str, table: Table, kinds: str = "", made_for: Mapping[str, str] | None = None
+    ) -> dict[str, Any]:
+        """The members of a document nlsid/`form`, of one of `kinds` if there are any.
+
+        made_for: the digests, by role, that it has to name; Mismatch if it names another.
+        """
+        version = whole(VERSION, VERSION)
+        heads: dict[str, Reader] = {"format": one_of(f"nlsid/{form}"), "version": version}
+        if kinds:
+            heads["kind"] = one_of(*kinds.split())
+        for role, made in (made_for or {}).items():
+            heads[role] = _made(role, made)
+        return self.read({**heads, **table})
+
+    def items(self, least: int = 0, most: int = MAX_ENTRIES) -> list["Node"]:
         """A list of `least` to `most` entries."""
-        if type(self.value) is not list or not least <= len(self.value) <= most:
-            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
+        fits = type(self.value) is list and least <= len(self.value) <= most
+        self.require({f"should be a list of {least} to {most} entries": fits})
         return [Node(entry, f"{self.where}[{i}]") for i, entry in enumerate(self.value)]
 
     def text(self) -> str:
         """A printable text of at most MAX_NAME characters."""
         value = self.value
-        if type(value) is not str or len(value) > MAX_NAME or not value.isprintable():
-            wanted = f"at most {MAX_NAME} characters, none of them a control character"
-            raise Rejected(f"{self.where} should be a text of {wanted}")
-        return value
-
-    def number(self) -> Fraction:
-        """A float64, exactly."""
-        if type(self.value) is int or type(self.value) is Fraction:
-            return Fraction(self.value)
-        raise Rejected(f"{self.where} should be a number")
+        fits = type(value) is str and len(value) <= MAX_NAME and value.isprintable()
+        self.require({f"should be a text of one line, {MAX_NAME} characters at most": fits})
+        return str(value)
 
     def whole(self, least: int, most: int = MAX_WHOLE) -> int:
         """A whole number in [least, most]."""
-        if type(self.value) is not int or not least <= self.value <= most:
-            raise Rejected(f"{self.where} should be a whole number from {least} to {most}")
-        return self.value
+        fits = type(self.value) is int and least <= self.value <= most
+        self.require({f"should be a whole number from {least} to {most}": fits})
+        return int(self.value)
+
+    def number(self) -> Fraction:
+        """A float64, exactly."""
+        self.require({"should be a number": type(self.value) in (int, Fraction)})
+        return Fraction(self.value)
 
     def rational(self) -> Fraction:
         """A float64, or a text "p/q" or "p" of whole numbers."""
         if type(self.value) is not str:
             return self.number()
         above, slash, below = self.value.partition("/")
-        digits = above.removeprefix("-")
-        parts = [digits] + ([below] if slash else [])
-        for part in parts:
-            refuse_if(
-                not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS),
-                f"{self.where} should be a number or a text p/q of whole numbers",
-            )
-        refuse_if(slash and not int(below), f"{self.where} divides by zero")
+        for digits in (above.removeprefix("-"), below if slash else "1"):
+            fits = digits.isascii() and digits.isdigit() and len(digits) <= MAX_DIGITS
+            self.require({"should be a number or a text p/q of whole numbers": fits})
+        self.require({"divides by zero": not slash or int(below)})
         return Fraction(int(above), int(below) if slash else 1)
 
     def integer(self) -> int:
         """A whole number; one beyond 2^53 is a text of digits."""
-        refuse_if(
-            type(self.value) is not int and (type(self.value) is not str or "/" in self.value),
-            f"{self.where} should be a whole number",
-        )
+        whole = type(self.value) is int or (type(self.value) is str and "/" not in self.value)
+        self.require({"should be a whole number": whole})
         return self.rational().numerator
 
-    def integers(self, least: int, most: int) -> tuple[int, ...]:
+    def integers(self, least: int, most: int) -> list[int]:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
-        entries = self.value
-        if type(entries) is list and all(type(e) is int for e in entries):
-            numbers: list[int] = entries
-        else:
-            numbers = [entry.integer() for entry in self.items(least, most)]
-        refuse_if(
-            not least <= len(numbers) <= most,
-            f"{self.where} should be a list of {least} to {most} entries",
-        )
-        return tuple(numbers)
+        if type(self.value) is not list or any(type(entry) is not int for entry in self.value):
+            return [entry.integer() for entry in self.items(least, most)]
+        fits = least <= len(self.value) <= most
+        self.require({f"should be a list of {least} to {most} entries": fits})
+        return self.value
 
-    def array(self, *shape: int | None) -> list:  # type: ignore[type-arg]
+    def array(self, *shape: int | None) -> Any:
         """Nested lists of float64s of this shape, as Fractions; None: any length."""
-        return self._nested(self.value, shape, Fraction)
+        return self._nested(self.value, shape, (int, Fraction)) if shape else self.number()
 
-    def wholes(self, *shape: int | None) -> list:  # type: ignore[type-arg]
+    def wholes(self, *shape: int | None) -> Any:
         """Nested lists of whole numbers (at most 2^53 in size) of this shape."""
-        return self._nested(self.value, shape, int)
+        return self._nested(self.value, shape, (int,))
 
-    def _nested(self, value: object, shape: tuple[int | None, ...], kind: type) -> list:  # type: ignore[type-arg]
-        if type(value) is not list or (shape[0] is not None and len(value) != shape[0]):
-            wanted = " x ".join("any" if size is None else str(size) for size in shape)
-            raise Rejected(f"{self.where} should have shape {wanted}")
+    def _nested(self, value: Any, shape: Sequence[int | None], kinds: tuple[type, ...]) -> Any:
+        if type(value) is not list or shape[0] not in (None, len(value)):
+            raise Rejected(f"{self.where} should have shape {shape}")
         if len(shape) > 1:
-            return [self._nested(entry, shape[1:], kind) for entry in value]
-        for entry in value:
-            if type(entry) is not int and (kind is int or type(entry) is not Fraction):
-                wanted = "whole numbers" if kind is int else "numbers"
-                raise Rejected(f"{self.where} should hold {wanted} only")
-        return list(value) if kind is int else [Fraction(entry) for entry in value]
+            return [self._nested(entry, shape[1:], kinds) for entry in value]
+        if any(type(entry) not in kinds for entry in value):
+            wanted = "numbers" if Fraction in kinds else "whole numbers"
+            raise Rejected(f"{self.where} should hold {wanted} only")
+        return list(map(Fraction, value)) if Fraction in kinds else list(value)
 
     def monomials(
         self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] | None = None
     ) -> list[bytes]:
         """Distinct rows of `count` exponents, of `degree` together at most; sorted by `order`."""
         stated = self.wholes(None, count)
-        refuse_if(
-            len(stated) > MAX_STATED,
-            f"{self.where}: {len(stated)} terms; at most {MAX_STATED} are taken",
-            "too_large",
-        )
-        refuse_if(
-            any(min(row, default=0) < 0 or sum(row) > degree for row in stated),
-            f"{self.where}: exponents should be 0 or more, {degree} together at most",
-        )
+        limit(len(stated), MAX_STATED, f"{self.where}: terms")
+        small = all(min(row, default=0) >= 0 and sum(row) <= degree for row in stated)
+        self.require({f"exponents should be 0 or more, {degree} together": small})
         rows = list(map(bytes, stated))
-        if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
-            wanted = "in increasing order" if order else "each once"
-            raise Rejected(f"{self.where}: monomials should be distinct, {wanted}")
+        self.require(
+            {
+                "a monomial occurs twice": len(set(rows)) == len(rows),
+                "monomials should be sorted": not order or rows == sorted(rows, key=order),
+            }
+        )
         return rows
 
-    def polynomial(self, count: int, degree: int = MAX_DEGREE, order: Any = by_degree) -> Terms:
+    def polynomial(
+        self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] = by_degree
+    ) -> Terms:
         """`exponents` and `coefficients` of a polynomial: distinct sorted monomials, rationals."""
         parts = self.members("exponents coefficients")
         rows = parts["exponents"].monomials(count, degree, order)
@@ -214,36 +233,48 @@ class Node:
 
     def kind(self) -> str:
         """The member `kind` of an object."""
-        if type(self.value) is not dict or "kind" not in self.value:
-            raise Rejected(f"{self.where} should be an object with a kind")
+        kinded = type(self.value) is dict and "kind" in self.value
+        self.require({"should be an object with a kind": kinded})
         return Node(self.value["kind"], f"{self.where} kind").text()
 
-    def document(
-        self,
-        form: str,
-        names: str,
-        kinds: str = "",
-        *,
-        optional: str = "",
-        made_for: Mapping[str, str] | None = None,
-    ) -> dict[str, "Node"]:
-        """The members of a document nlsid/`form`, of one of `kinds` if there are any.
 
-        made_for: the digests, by role, that it has to name; Mismatch if it names another.
-        """
-        required = f"format version {'kind' * bool(kinds)} {' '.join(made_for or ())} {names}"
-        parts = self.members(required, optional)
-        found, version = parts["format"].text(), parts["version"].whole(0)
-        if found != f"nlsid/{form}" or version != VERSION:
-            wanted = f"{self.where} should be of format nlsid/{form}, version {VERSION}"
-            raise Rejected(f"{wanted}; it is of format {found!r}, version {version}")
-        if kinds and parts["kind"].text() not in kinds.split():
-            wanted = " or ".join(map(repr, kinds.split()))
-            raise Rejected(f"the kind of {self.where} is {self.kind()!r}, expected {wanted}")
-        for role, made in (made_for or {}).items():
-            if parts[role].text() != made:
-                raise Mismatch(f"the {self.where} was made for another {role}")
-        return parts
+def itself(node: Node) -> Node:
+    """A member that is read elsewhere, or that no claim is about."""
+    return node
+
+
+def whole(least: int, most: int = MAX_WHOLE) -> Reader:
+    """A reader of a whole number in [least, most]."""
+    return lambda node: node.whole(least, most)
+
+
+def rows_of(count: int) -> Reader:
+    """A reader of rows of so many whole numbers."""
+    return lambda node: node.wholes(None, count)
+
+
+def each(reader: Callable[[Node], Any], least: int, most: int = MAX_ENTRIES) -> Reader:
+    """A reader of a list of `least` to `most` entries."""
+    return lambda node: list(map(reader, node.items(least, most)))
+
+
+def one_of(*texts: str) -> Reader:
+    """A reader of one of these texts."""
+
+    def read(node: Node) -> str:
+        found, wanted = node.text(), " or ".join(map(repr, texts))
+        refuse_if(found not in texts, f"{node.where} is {found!r}, not {wanted}")
+        return found
+
+    return read
+
+
+def _made(role: str, made: str) -> Reader:
+    def read(node: Node) -> None:
+        if node.text() != made:
+            raise Mismatch(f"{node.where}: it was made for another {role}")
+
+    return read
 
 
 def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
@@ -251,26 +282,20 @@ def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
     common = 1
     for value in values:
         common = lcm(common, value.denominator)
-        refuse_if(
-            common.bit_length() > MAX_COMMON,
-            f"{where}: denominators of more than {MAX_COMMON} bits together",
-            "too_large",
-        )
+        limit(common.bit_length(), MAX_COMMON, f"{where}: bits of the common denominator")
     return common
 
 
 def parse(content: bytes, where: str) -> Node:
     """One JSON object."""
-    refuse_if(
-        len(content) > MAX_BYTES, f"{where}: {len(content)} bytes; at most {MAX_BYTES}", "too_large"
-    )
+    limit(len(content), MAX_BYTES, f"{where}: bytes")
     try:
         value = json.loads(
             content.decode("utf-8"),
             object_pairs_hook=_unique,
             parse_float=_float64,
             parse_int=_whole,
-            parse_constant=_refused,
+            parse_constant=_float64,
         )
     except (ValueError, RecursionError, ArithmeticError) as error:
         raise Rejected(f"{where}: not a valid document: {plain(str(error))}") from error
@@ -285,26 +310,19 @@ def digest(content: bytes) -> str:
 
 def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], dict[str, str]]:
     """The documents that `about` names by file and digest, and their digests, by role."""
-    documents: dict[str, Node] = {}
-    digests: dict[str, str] = {}
+    documents, digests = {}, {}
     for role, binding in about.members(roles).items():
-        entry = binding.members("file digest")
-        name, stated = entry["file"].text(), entry["digest"].text()
-        refuse_if(
-            not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"),
-            f"{role} file {name!r} is not a plain file name",
-        )
+        stated = binding.read({"file": Node.text, "digest": Node.text})
+        name = stated["file"]
+        odd = name in ("", ".", "..") or any(sign in name for sign in "/\\:\0")
+        refuse_if(odd, f"{role} file {name!r} is not a plain file name")
         try:
             content = read(name)
         except OSError as error:
             raise Mismatch(f"{role} file {name} cannot be read: {error.strerror}") from error
-        found = digest(content)
-        if found != stated:
-            raise Mismatch(
-                f"{name} is not the {role} this proof is about: digest {found[:23]}..., "
-                f"the proof says {plain(stated[:23])}..."
-            )
-        documents[role], digests[role] = parse(content, role), found
+        if digest(content) != stated["digest"]:
+            raise Mismatch(f"{name} is not the {role} this proof is about: its digest differs")
+        documents[role], digests[role] = parse(content, role), digest(content)
     return documents, digests
 
 
@@ -312,13 +330,10 @@ def read_regular(path: Path) -> bytes:
     """A regular file's bytes; OSError for anything else, Rejected if it is too large."""
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(handle, "rb") as stream:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode):
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise OSError(0, "not a regular file", str(path))
         content = stream.read(MAX_BYTES + 1)
-    refuse_if(
-        len(content) > MAX_BYTES, f"{plain(path.name)}: more than {MAX_BYTES} bytes", "too_large"
-    )
+    limit(len(content), MAX_BYTES, f"{plain(path.name)}: bytes")
     return content
 
 
@@ -335,17 +350,12 @@ def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return result
 
 
-def _refused(name: str) -> object:
-    raise ValueError(f"{name} is not a number")
-
-
 def _float64(text: str) -> Fraction:
     if len(text) > MAX_NUMBER:
         raise ValueError(f"{text[:24]}... has too many digits")
     nearest = float(text)
-    if nearest - nearest != 0.0:
-        raise ValueError(f"{text} does not fit a float64")
-    if repr(nearest) != text and Decimal(repr(nearest)) != Decimal(text):
+    written = repr(nearest) == text or Decimal(repr(nearest)) == Decimal(text)
+    if nearest - nearest != 0.0 or not written:
         raise ValueError(f"{text} is not a float64; the nearest one is {nearest!r}")
     return Fraction(*nearest.as_integer_ratio())
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 from . import text
 from .continuous_funnel import decide_funnel, inside
-from .decision import Decision
-from .files import Node, Read, Rejected, bound_files, refuse_if
+from .exact import scaled
+from .files import Node, Read, Rejected, bound_files, itself, limit, refuse_if
 from .trajectory import Funnel
 
 MAX_STAGES = 100
@@ -22,37 +22,22 @@ SENTENCE = (
 )
 
 
-def decide(claim: Node, proof: Node, read: Read) -> Decision:
+def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Decide every stage, and that each but the last ends inside the next."""
-    multipliers = proof.members("multipliers")["multipliers"].array(None)
-    count = len(multipliers) + 1
-    refuse_if(
-        not 2 <= count <= MAX_STAGES,
-        f"a composition has 2 to {MAX_STAGES} stages, not {count}",
-        "too_large",
-    )
+    multipliers = proof.read({"multipliers": (None,)})["multipliers"]
+    count = limit(len(multipliers) + 1, MAX_STAGES, "stages", least=2)
     roles = [f"stage{i}" for i in range(1, count + 1)]
     documents, digests = bound_files(claim.members("kind about")["about"], read, " ".join(roles))
-    decisions, funnels, assumptions = [], [], []
+    verdicts, funnels, assumptions = [], [], []
     for role in roles:
         try:
-            stage = documents[role].document("proof", "claim proof")
-            refuse_if(
-                stage["claim"].kind() != "continuous_funnel",
-                "a stage should claim a continuous_funnel",
-            )
-            refuse_if(
-                "hold" in stage["claim"].members("kind about", "goal hold error"),
-                "an input that is held into the next stage is not covered",
-                "not_valid",
-            )
-            decision, funnel = decide_funnel(stage["claim"], stage["proof"], read)
+            verdict, funnel = _decide_stage(documents[role], read)
         except Rejected as refusal:
             raise type(refusal)(f"{role}: {refusal}", refusal.reason) from refusal
-        decisions.append(decision)
+        verdicts.append(verdict)
         funnels.append(funnel)
-        assumptions += [f"{role}: {assumption}" for assumption in decision.assumptions]
-        digests |= {f"{role}.{part}": digest for part, digest in decision.digests.items()}
+        assumptions += [f"{role}: {assumption}" for assumption in verdict.assumptions]
+        digests |= {f"{role}.{part}": digest for part, digest in verdict.digests.items()}
     for role, multiplier, pair in zip(roles, multipliers, pairwise(funnels), strict=False):
         _decide_step(role, multiplier, *pair)
     said = text.say(
@@ -61,23 +46,29 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         start=funnels[0].t[0],
         end=funnels[-1].t[-1],
         changes=", ".join(text.exact(funnel.t[0]) for funnel in funnels[1:]),
-        last=decisions[-1].statement,
+        last=verdicts[-1].statement,
     )
-    margin = min(decision.margin for decision in decisions)
-    return Decision(said, margin, tuple(assumptions), digests)
+    margin = min(verdict.margin for verdict in verdicts)
+    return text.Verdict(said, margin, tuple(assumptions), digests)
+
+
+def _decide_stage(node: Node, read: Read) -> tuple[text.Verdict, Funnel]:
+    """A continuous funnel whose input is not held into the next stage: that is not covered."""
+    stage = node.document("proof", {"claim": itself, "proof": itself})
+    claim = stage["claim"]
+    claim.require({"a stage should claim a funnel": claim.kind() == "continuous_funnel"})
+    held = "hold" in claim.members("kind about", "goal hold error")
+    claim.require({"an input held into the next stage is not covered": not held}, "not_valid")
+    return decide_funnel(claim, stage["proof"], read)
 
 
 def _decide_step(role: str, multiplier: Fraction, before: Funnel, after: Funnel) -> None:
     """`before` ends when `after` starts, and inside it there."""
-    refuse_if(
-        len(before.x[0][0]) != len(after.x[0][0]), f"{role} and the next differ in their states"
-    )
-    end, start = before.t[-1], after.t[0]
-    refuse_if(
-        end != start,
-        f"{role} ends at {text.exact(end)} s, the next starts at {text.exact(start)} s",
-        "not_covered",
-    )
-    shape = [[entry / after.rho[0] for entry in row] for row in after.P[0]]
-    what = f"that {role} ends inside the next at {text.exact(end)} s, by the S-lemma,"
-    inside(before.x[-1][-1], before.P[-1], before.rho[-1], after.x[0][0], shape, multiplier, what)
+    same = len(before.x[0][0]) == len(after.x[0][0])
+    refuse_if(not same, f"{role} and the next differ in their states")
+    end = text.exact(before.t[-1])
+    meets = before.t[-1] == after.t[0]
+    refuse_if(not meets, f"{role} ends at {end} s, the next starts at another time", "not_covered")
+    last, first = scaled(before.P[-1], 1 / before.rho[-1]), scaled(after.P[0], 1 / after.rho[0])
+    what = f"that {role} ends inside the next at {end} s, by the S-lemma,"
+    inside(before.x[-1][-1], last, after.x[0][0], first, multiplier, what)

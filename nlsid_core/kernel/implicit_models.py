@@ -3,12 +3,26 @@
 from dataclasses import dataclass
 from fractions import Fraction
 
-from .files import Node, Terms, refuse_if
+from .files import Node, Reader, Terms, each, itself, one_of, refuse_if
 
 EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
-MAX_IMPLICIT, MAX_WINDOW = 30, 60  # states, and entries of w, of an implicit model
-IMPLICIT = "equation period states inputs monotonicity h"
-RECORDED = "y u window training bags"  # of an implicit model of recorded signals
+MAX_IMPLICIT, MAX_WINDOW = 30, 60  # states, and entries of w
+EQUATIONS = "format version kind equation period states inputs monotonicity h"
+IMPLICIT: dict[str, Reader] = {  # the members of a file; those of recorded signals are not read
+    "equation": one_of(EQUATION),
+    "period": (),
+    "states": each(Node.text, 1, MAX_IMPLICIT),
+    "inputs": each(Node.text, 0, MAX_WINDOW),
+    "monotonicity": (),
+    "h": itself,
+    "shift?": itself,
+    "centre?": itself,
+    "y?": itself,
+    "u?": itself,
+    "window?": itself,
+    "training?": itself,
+    "bags?": itself,
+}
 
 
 @dataclass(frozen=True)
@@ -27,10 +41,8 @@ class ImplicitModel:
     def separated(self) -> tuple[list[Terms], list[Terms]]:
         """(e in x, f in (x, w)) of a model e(x⁺) = f(x, w); Rejected if it is not of that form."""
         n = self.states
-        refuse_if(
-            self.unknowns < n or any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p),
-            "the model is not e(x+) = f(x, w); this set is for such models",
-        )
+        mixed = any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p)
+        refuse_if(mixed or self.unknowns < n, "the set is for models e(x+) = f(x, w)")
         left = [[(e[:n], c) for e, c in p if any(e[:n])] for p in self.h]
         right = [[(e[n:], -c) for e, c in p if not any(e[:n])] for p in self.h]
         return left, right
@@ -38,24 +50,22 @@ class ImplicitModel:
 
 def read_implicit_model(node: Node) -> ImplicitModel:
     """The equations of an `implicit` model's file."""
-    parts = node.document("model", IMPLICIT, "implicit", optional=f"shift centre {RECORDED}")
-    refuse_if(
-        parts["equation"].text() != EQUATION, f"{parts['equation'].where} should be {EQUATION!r}"
-    )
-    n = len([entry.text() for entry in parts["states"].items(1, MAX_IMPLICIT)])
-    m = len([entry.text() for entry in parts["inputs"].items(0, MAX_WINDOW)])
-    monotonicity, period = parts["monotonicity"].number(), parts["period"].number()
-    refuse_if(monotonicity <= 0 or period <= 0, "monotonicity and period should be positive")
-    rows = parts["h"].members("exponents coefficients")["coefficients"].array(None, None)
+    given = node.document("model", IMPLICIT, "implicit")
+    n, m = len(given["states"]), len(given["inputs"])
+    rows = given["h"].members("exponents coefficients")["coefficients"].array(None, None)
     k = len(rows[0]) if rows else 0
-    refuse_if(
-        not 0 < k <= n or ("shift" in parts) != (k < n),
-        f"{k} equations for {n} states; a shift gives the others",
+    positive = given["monotonicity"] > 0 and given["period"] > 0
+    node.require(
+        {
+            "monotonicity and period should be positive": positive,
+            "there should be an equation, and no more than states": 0 < k <= n,
+            "a shift gives the states without an equation": bool(given["shift"]) == (k < n),
+        }
     )
-    h = _read_stack(parts["h"], k + n + m, k)
-    shift = _read_stack(parts["shift"], n + m, n - k) if "shift" in parts else []
-    centre = _read_stack(parts["centre"], k, k) if "centre" in parts else []
-    return ImplicitModel(k, n, m, h, shift, centre, monotonicity, period)
+    h = _read_stack(given["h"], k + n + m, k)
+    shift = _read_stack(given["shift"], n + m, n - k) if given["shift"] else []
+    centre = _read_stack(given["centre"], k, k) if given["centre"] else []
+    return ImplicitModel(k, n, m, h, shift, centre, given["monotonicity"], given["period"])
 
 
 def derivative(p: Terms, j: int) -> Terms:

@@ -14,10 +14,10 @@ docs/certificate_stability.md has the forms and why.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Any
 
-from .exact import Matrix, Rows, block_diagonal, combined, congruence, definite, scaled, transposed
-from .exact import product as times
-from .files import Node, Rejected, refuse_if
+from .exact import Matrix, Rows, combined, definite, product, scaled, transposed
+from .files import Node, Table, itself, limit, refuse_if
 from .signals import Signal
 
 MAX_STATES = 120
@@ -78,8 +78,12 @@ class Model:
 
 def gap(model: Model, rho: Fraction, P: Rows, R: Rows, G: Rows, Q: Rows) -> Matrix:
     """diag(0, ρP, R) - G'QG, without the multipliers."""
-    zero = [[Fraction(0)] * model.unknowns for _ in range(model.unknowns)]
-    return combined(block_diagonal(zero, scaled(P, rho), R), congruence(G, Q), -1)
+    M = scaled(product(transposed(G), product(Q, G)), -1)
+    for start, block in ((model.unknowns, scaled(P, rho)), (len(model.F[0]), R)):
+        for i, row in enumerate(block, start):
+            for j, entry in enumerate(row, start):
+                M[i][j] += entry
+    return M
 
 
 def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, Matrix]]) -> None:
@@ -91,41 +95,33 @@ def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, M
     varies, in the place of the vertices.
     """
     m, size = model.unknowns, len(gaps[0][1])
-    if (multipliers is None) != (m == 0):
-        wanted = "needs multipliers" if m else "has no multipliers"
-        raise Rejected(f"a proof for this class of models {wanted}")
+    refuse_if((multipliers is None) != (m == 0), "multipliers are for models with ν, and needed")
     if multipliers is None:
         for what, M in gaps:
             definite(M, what)
         return
-    for box, leaf in _leaves(multipliers, model.E, model.E.box, 0):
+    for box, leaf in _leaves(multipliers, model.E, model.E.box):
         given = leaf["N"]
         Ns = given.array(len(gaps), size, m) if len(gaps) > 1 else [given.array(size, m)]
-        refuse_if(
-            model.E.ray and any(N[0][0] < 0 or any(row[0] for row in N[1:]) for N in Ns),
-            "the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0",
-            "not_below",
-        )
+        pointed = all(N[0][0] >= 0 and not any(row[0] for row in N[1:]) for N in Ns)
+        shape = {"with a ray N should be (T >= 0, 0, ..., 0)": pointed or not model.E.ray}
+        leaf["N"].require(shape, "not_below")
         for E in model.E.vertices(box, leaf.get("ends")):
             wide = [row + [Fraction(0)] * (size - len(row)) for row in E]
             for (what, M), N in zip(gaps, Ns, strict=True):
-                cross = times(N, wide)
+                cross = product(N, wide)
                 definite(combined(M, combined(cross, transposed(cross))), what)
 
 
-def _leaves(node: Node, E: Hull, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
+def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box, dict[str, Node]]]:
+    """Every leaf of the tree, and its part of the box."""
     parts = node.members("", "N ends split parts")
     if set(parts) == {"N"} or (set(parts) == {"N", "ends"} and box):
         yield box, parts
         return
-    if set(parts) != {"split", "parts"} or not box:
-        wanted = "a multiplier N, or the split of a box and its parts"
-        raise Rejected(f"{node.where} should be {wanted}")
-    refuse_if(
-        depth == MAX_SPLITS,
-        f"{node.where}: more than {MAX_SPLITS} splits, one inside the other",
-        "too_large",
-    )
+    splits = set(parts) == {"split", "parts"} and box
+    node.require({"should be a multiplier N, or split and parts of a box": splits})
+    limit(depth + 1, MAX_SPLITS, f"{node.where}: splits, one inside the other")
     i = parts["split"].whole(E.whole, len(box) - 1)
     low, high = box[i]
     halves = ((low, (low + high) / 2), ((low + high) / 2, high))
@@ -133,19 +129,14 @@ def _leaves(node: Node, E: Hull, box: Box, depth: int) -> Iterator[tuple[Box, di
         yield from _leaves(part, E, [*box[:i], half, *box[i + 1 :]], depth + 1)
 
 
-def read_recorded(node: Node, kind: str, names: str) -> tuple[dict[str, Node], Fraction]:
-    """The members of a model of recorded signals, and its period; what made it is not read."""
-    parts = node.document("model", f"period training bags {names}", kind, optional="equation")
-    period = parts["period"].number()
-    refuse_if(period <= 0, "the model's period should be positive")
-    return parts, period
+def read_recorded(node: Node, kind: str, table: Table) -> dict[str, Any]:
+    """The members of a model of recorded signals; what made it is not read."""
+    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": itself}
+    given = node.document("model", {**heads, **table}, kind)
+    node.require({"the period should be positive": given["period"] > 0})
+    return given
 
 
 def sized(n: int, node: Node) -> int:
     """So many states."""
-    refuse_if(
-        not 0 < n <= MAX_STATES,
-        f"{node.where}: {n} states; 1 to {MAX_STATES} are decided",
-        "too_large",
-    )
-    return n
+    return limit(n, MAX_STATES, f"{node.where}: states", least=1)

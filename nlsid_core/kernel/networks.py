@@ -11,9 +11,9 @@ from itertools import pairwise, product
 
 from . import text
 from .exact import Matrix, unit
-from .files import Node, refuse_if
+from .files import Node, each, itself
 from .increments import Hull, Model, read_recorded, sized
-from .signals import read_signal, read_signals
+from .signals import read_signal, signals
 
 MAX_MAPS = 8  # a network has 2^maps matrices
 ZERO = Fraction(0)
@@ -21,21 +21,30 @@ ZERO = Fraction(0)
 
 def read_cells(node: Node) -> Model:
     """A `cell_network`: maps that are linear between their knots, and on beyond them."""
-    parts, period = read_recorded(
-        node, "cell_network", "y u maps into next output start start_samples"
+    given = read_recorded(
+        node,
+        "cell_network",
+        {
+            "y": signals("outputs", 1),
+            "u": signals("inputs"),
+            "maps": each(_slopes, 1, MAX_MAPS),
+            "into": itself,
+            "next": itself,
+            "output": itself,
+            "start": (None,),
+            "start_samples": itself,
+        },
     )
-    y, u = read_signals(parts["y"], "outputs", 1), read_signals(parts["u"], "inputs")
-    slopes = [_slopes(f) for f in parts["maps"].items(1, MAX_MAPS)]
-    m, n = len(slopes), sized(len(parts["start"].array(None)), node)
-    width = m + n + len(u) + 1
-    into = parts["into"].array(m, width)
-    F, H = parts["next"].array(n, width), parts["output"].array(len(y), width)
-    refuse_if(
-        any(any(row[j:m]) for j, row in enumerate(into)),
-        f"{node.where} into: a map should depend on earlier maps only",
-    )
-    F, H, into = ([row[: m + n] for row in rows] for rows in (F, H, into))
-    return Model(period, y, u, F, H, _corners(slopes, into), "for every input")
+    slopes, n = given["maps"], sized(len(given["start"]), node)
+    m, columns = len(slopes), len(slopes) + n
+    width = columns + len(given["u"]) + 1
+    into = given["into"].array(m, width)
+    F, H = given["next"].array(n, width), given["output"].array(len(given["y"]), width)
+    earlier = not any(any(row[j:m]) for j, row in enumerate(into))
+    given["into"].require({"a map should depend on earlier maps only": earlier})
+    F, H, into = ([row[:columns] for row in rows] for rows in (F, H, into))
+    hull = _corners(slopes, into)
+    return Model(given["period"], given["y"], given["u"], F, H, hull, "for every input")
 
 
 def read_cascade(node: Node) -> Model:
@@ -44,21 +53,31 @@ def read_cascade(node: Node) -> Model:
     v(t) = u(t) + Σ a1_k v(t-k), x_j = Σ_i b1_ji v(t-i), y(t) = Σ a2_k y(t-k) + Σ b2_ji f(x_j(t-i)).
     x stacks v(t-1) … v(t-n₁) of the first filter and the observer form of the second.
     """
-    parts, period = read_recorded(node, "block_cascade", "y u a1 b1 f a2 b2")
-    a1, a2 = parts["a1"].array(None), parts["a2"].array(None)
-    b1, b2 = parts["b1"].array(None, None), parts["b2"].array(None, None)
+    given = read_recorded(
+        node,
+        "block_cascade",
+        {
+            "y": read_signal,
+            "u": read_signal,
+            "a1": (None,),
+            "b1": (None, None),
+            "f": _spline_slopes,
+            "a2": (None,),
+            "b2": (None, None),
+        },
+    )
+    b1, b2, slopes = given["b1"], given["b2"], given["f"]
     M = len(b1)
-    refuse_if(
-        not 0 < M <= MAX_MAPS or len(b2) != M,
-        f"{node.where}: b1 and b2 should have as many rows, 1 to {MAX_MAPS}",
+    even = all(row and len(row) == len(rows[0]) for rows in (b1, b2) for row in rows)
+    node.require(
+        {
+            f"b1 and b2 should have as many rows, 1 to {MAX_MAPS}": 0 < M == len(b2) <= MAX_MAPS,
+            "the rows of b1, and of b2, should have equal lengths": even,
+        }
     )
-    refuse_if(
-        any(len(row) != len(rows[0]) or not row for rows in (b1, b2) for row in rows),
-        f"{node.where}: the rows of b1, and of b2, should have equal lengths",
-    )
-    n1, n2 = max(len(a1), len(b1[0]) - 1), max(len(a2), len(b2[0]) - 1)
+    n1, n2 = max(len(given["a1"]), len(b1[0]) - 1), max(len(given["a2"]), len(b2[0]) - 1)
     n = sized(n1 + n2, node)
-    a1, a2 = _padded(a1, n1), _padded(a2, n2)
+    a1, a2 = _padded(given["a1"], n1), _padded(given["a2"], n2)
 
     # x_j = b1_j0 v(t) + … with v(t) = u + a1·past gives C_j; the same way behind f gives g_j.
     C = [[row[0] * a + b for a, b in zip(a1, _padded(row[1:], n1), strict=True)] for row in b1]
@@ -71,14 +90,12 @@ def read_cascade(node: Node) -> Model:
         F.append(row)
     H = [row[0] for row in b2] + [ZERO] * n1 + unit(0, n2)
 
-    slopes = _spline_slopes(parts["f"])
     where = text.say(
         "for every input (the slopes of its nonlinearity are in {0:outer_range} everywhere)",
         (slopes[0], slopes[-1]),
     )
     hull = _corners([slopes] * M, [[ZERO] * M + row + [ZERO] * n2 for row in C])
-    y, u = (read_signal(parts["y"]),), (read_signal(parts["u"]),)
-    return Model(period, y, u, F, [H], hull, where)
+    return Model(given["period"], (given["y"],), (given["u"],), F, [H], hull, where)
 
 
 def _corners(slopes: list[list[Fraction]], into: Matrix) -> Hull:
@@ -97,31 +114,24 @@ def _corners(slopes: list[list[Fraction]], into: Matrix) -> Hull:
 
 def _slopes(node: Node) -> list[Fraction]:
     """The least and the largest slope of a piecewise-linear map, ascending, each once."""
-    parts = node.members("knots values")
-    knots = parts["knots"].array(None)
-    values = parts["values"].array(len(knots))
-    refuse_if(
-        len(knots) < 2 or any(high <= low for low, high in pairwise(knots)),
-        f"{node.where}: 2 knots or more, ascending",
-    )
+    given = node.read({"knots": (None,), "values": (None,)})
+    knots, values = given["knots"], given["values"]
+    ascending = len(knots) >= 2 and all(a < b for a, b in pairwise(knots))
+    node.require({"2 knots or more, ascending": ascending, "values": len(knots) == len(values)})
     steps = zip(pairwise(knots), pairwise(values), strict=True)
     return _ends([(after - before) / (high - low) for (low, high), (before, after) in steps])
 
 
 def _spline_slopes(node: Node) -> list[Fraction]:
     """The same of a spline: f' is a convex combination of (c_{k+1} - c_k)/spacing everywhere."""
-    parts = node.members("low spacing coefficients")
-    parts["low"].number()
-    spacing, c = parts["spacing"].number(), parts["coefficients"].array(None)
-    refuse_if(
-        spacing <= 0 or len(c) < 4, f"{node.where}: a positive spacing and 4 coefficients or more"
-    )
+    given = node.read({"low": (), "spacing": (), "coefficients": (None,)})
+    spacing, c = given["spacing"], given["coefficients"]
+    node.require({"a positive spacing, 4 coefficients or more": spacing > 0 and len(c) >= 4})
     return _ends([(after - before) / spacing for before, after in pairwise(c)])
 
 
 def _ends(slopes: list[Fraction]) -> list[Fraction]:
-    least, most = min(slopes), max(slopes)
-    return [least] if least == most else [least, most]
+    return sorted({min(slopes), max(slopes)})
 
 
 def _padded(values: list[Fraction], size: int) -> list[Fraction]:

@@ -17,7 +17,7 @@ from math import comb, lcm
 from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Rejected, Terms, refuse_if
+from .files import MAX_DEGREE, Terms, limit, refuse_if
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
 SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
@@ -61,9 +61,9 @@ class Polynomial:
     __rmul__ = __mul__
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ring:
-    """Polynomials in s and in x0 … x(count - 1), packed at one width."""
+    """Polynomials in s and in x0 … x(count - 1), packed at one width, with keys of its own."""
 
     count: int
     width: int
@@ -81,15 +81,6 @@ class Ring:
 
     def key(self, exponents: Sequence[int]) -> int:
         """The integer that stands for a monomial of x."""
-        refuse_if(
-            len(exponents) != self.count or min(exponents, default=0) < 0,
-            f"a monomial should have {self.count} exponents of 0 or more",
-        )
-        refuse_if(
-            sum(exponents) > MAX_DEGREE,
-            f"degree {sum(exponents)} is above {MAX_DEGREE}",
-            "too_large",
-        )
         return sum(e * key for e, key in zip(exponents, self.keys, strict=True) if e)
 
     def exponents(self, key: int) -> tuple[int, ...]:
@@ -139,12 +130,9 @@ class Ring:
 
     def dot(self, a: Sequence[Scalar], b: Sequence[Polynomial]) -> Polynomial:
         """Σ_i a[i] b[i]."""
+        pairs = [(p, q) for p, q in zip(a, b, strict=True) if p]
         return self.weighted(
-            [
-                (1, p * q) if isinstance(p, Polynomial) else (p, q)
-                for p, q in zip(a, b, strict=True)
-                if p
-            ]
+            [(1, p * q) if isinstance(p, Polynomial) else (p, q) for p, q in pairs]
         )
 
     def product(self, M: Sequence[Sequence[Scalar]], p: Sequence[Polynomial]) -> list[Polynomial]:
@@ -174,17 +162,15 @@ class Ring:
 
     def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
         """p q."""
-        degree, norm = p.degree + q.degree, p.norm * q.norm
-        if degree > MAX_DEGREE or norm.bit_length() > WIDTHS[-1]:
-            most = f"degree {MAX_DEGREE} and coefficients of {WIDTHS[-1]} bits"
-            raise Rejected(f"a product beyond {most}", "too_large")
+        degree = limit(p.degree + q.degree, MAX_DEGREE, "the degree of a product")
+        norm = p.norm * q.norm
+        limit(norm.bit_length(), WIDTHS[-1], "bits of a product")
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
             for right, b in q.terms.items():
                 key = left + right
                 terms[key] = terms.get(key, 0) + a * b
-            if len(terms) > MAX_TERMS:
-                raise Rejected(f"a polynomial of more than {MAX_TERMS} terms", "too_large")
+            limit(len(terms), MAX_TERMS, "terms of a polynomial")
         denominator = p.denominator * q.denominator
         return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
 
@@ -232,16 +218,14 @@ def at_width(
     least: int = WIDTHS[0],
 ) -> None:
     """Decide each case in a ring of `count` variables, wider from the first that needs it on."""
-    rings = (Ring(count, width) for width in WIDTHS if width >= least)
-    ring = next(rings)
+    widths = [width for width in WIDTHS if width >= least]
+    ring = Ring(count, widths[0])
     for case in cases:
         while True:
             try:
                 decide(ring, case)
                 break
-            except TooNarrow as narrow:
-                wider = next(rings, None)
-                if wider is None:
-                    too_long = f"coefficients of more than {WIDTHS[-1]} bits"
-                    raise Rejected(too_long, "too_large") from narrow
-                ring = wider
+            except TooNarrow:
+                widths = widths[1:]
+                refuse_if(not widths, f"coefficients beyond {WIDTHS[-1]} bits", "too_large")
+                ring = Ring(count, widths[0])

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, lcm
 
-from .files import MAX_DEGREE, Node, Rejected, refuse_if
+from .files import MAX_DEGREE, Node, Table, itself, limit, refuse_if, whole
 from .polynomials import Polynomial, Ring, packed, unpacked
 
 MAX_BASIS = 200
 MAX_FACTORS = 24
 MAX_SHIFT = 400  # of a power of two
 WITNESS = "basis columns squares"
-Rows = list[tuple[int, tuple[int, ...]]]  # of a factor, each with its weight
+Rows = list[tuple[int, list[int]]]  # of a factor, each with its weight
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Squares:
     keys: the monomials v, of `degree` at most; columns: their powers of two.
     """
 
-    keys: tuple[int, ...]
+    keys: list[int]
     columns: list[int]
     degree: int
     scale: Fraction
@@ -46,44 +46,29 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
 
     A row of a factor may leave out leading zeros: its last entry belongs to the last monomial.
     """
-    where = parts["squares"].where
-    rows = parts["basis"].monomials(ring.count, MAX_DEGREE // 2)
-    size = len(rows)
-    refuse_if(
-        not 0 < size <= MAX_BASIS,
-        f"{parts['basis'].where} should hold 1 to {MAX_BASIS} monomials",
-        "too_large",
-    )
-    columns = powers_of_two(parts["columns"], size)
-    stated = parts["squares"].members("unit factors", "scale weights")
-    scale = stated["scale"].integer() if "scale" in stated else 1
-    refuse_if(scale < 1, f"{where}: scale should be a positive whole number")
-    weights = stated["weights"].integers(0, 4 * MAX_BASIS) if "weights" in stated else None
+    basis = parts["basis"].monomials(ring.count, MAX_DEGREE // 2)
+    size = limit(len(basis), MAX_BASIS, f"{parts['basis'].where}: monomials", least=1)
+    columns, node = powers_of_two(parts["columns"], size), parts["squares"]
+    table: Table = {"unit": whole(0, MAX_SHIFT), "factors": itself, "scale?": Node.integer}
+    stated = node.read({**table, "weights?": lambda entry: entry.integers(0, 4 * MAX_BASIS)})
+    scale = 1 if stated["scale"] is None else stated["scale"]
+    node.require({"scale should be a positive whole number": scale >= 1})
     factors = []
     for factor in stated["factors"].items(1, MAX_FACTORS):
-        entries = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
-        heights = (1,) * len(entries) if weights is None else weights
-        refuse_if(
-            len(heights) != len(entries) or min(heights, default=0) < 0,
-            f"{where}: one weight of 0 or more for each row of each factor",
-        )
-        factors.append(list(zip(heights, entries, strict=True)))
-    degree, unit = max(map(sum, rows)), stated["unit"].whole(0, MAX_SHIFT)
-    return Squares(tuple(map(ring.key, rows)), columns, degree, Fraction(scale), unit, factors)
-
-
-def read_witness(node: Node, ring: Ring) -> Squares:
-    """`read_squares` of an object with `basis`, `columns` and `squares`."""
-    return read_squares(node.members(WITNESS), ring)
+        rows = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
+        weights = [1] * len(rows) if stated["weights"] is None else stated["weights"]
+        fits = len(weights) == len(rows) and min(weights, default=0) >= 0
+        factor.require({"one weight of 0 or more a row": fits})
+        factors.append(list(zip(weights, rows, strict=True)))
+    keys, degree = list(map(ring.key, basis)), max(map(sum, basis))
+    return Squares(keys, columns, degree, Fraction(scale), stated["unit"], factors)
 
 
 def powers_of_two(node: Node, size: int) -> list[int]:
     """So many exponents of two."""
     shifts: list[int] = node.wholes(size)
-    refuse_if(
-        any(abs(shift) > MAX_SHIFT for shift in shifts),
-        f"{node.where}: powers of two beyond 2^{MAX_SHIFT}",
-    )
+    small = all(abs(shift) <= MAX_SHIFT for shift in shifts)
+    node.require({f"should be exponents of two within {MAX_SHIFT}": small})
     return shifts
 
 
@@ -141,11 +126,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
                 pair[left_key + basis[j]] = (i, j)
     grams, digits = _grams(squares, lowest), ring.digits(c)
     keys = list(set(digits).union(*grams))
-    refuse_if(
-        any(key not in square and key not in pair for key in keys),
-        f"{what}: a monomial that no product of the basis could balance",
-        "not_positive",
-    )
+    balanced = all(key in square or key in pair for key in keys)
+    refuse_if(not balanced, f"{what}: a monomial is no product of the basis", "not_positive")
     J, order = len(grams) - 1, c.order
     D = max(order, J)
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
@@ -180,10 +162,8 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             charge = abs(values[place]) << 2 * highest - columns[i] - columns[j]
             left[i] -= charge
             left[j] -= charge
-        if min(left) < 0:
-            i = next(i for i, room in enumerate(left) if room < 0)
-            at = f"Bernstein coefficient {k} of {D}, monomial {i}"
-            raise Rejected(f"{what}: not positive ({at})", "not_positive")
+        where = f"Bernstein coefficient {k} of {D}, monomial {left.index(min(left))}"
+        refuse_if(min(left) < 0, f"{what}: not positive ({where})", "not_positive")
         left = [room * (common // comb(D, k)) for room in left]
         least = list(map(min, least, left)) if k else left
     return {

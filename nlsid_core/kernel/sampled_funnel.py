@@ -8,25 +8,32 @@ h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄�
 Why that is enough: docs/certificate_sampled_funnel.md.
 """
 
-from dataclasses import dataclass
 from fractions import Fraction
 from math import comb
+from typing import Any
 
 from . import text
-from .decision import Decision
-from .exact import Matrix, at_most, inverse_forms, product, transposed, unit
-from .files import Node, Read, bound_files, refuse_if
+from .exact import Matrix, at_most, identity, inverse_forms, product, transposed
+from .files import Node, Read, Reader, Table, bound_files, itself, limit, refuse_if
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 from .sampled_step import Link, Model, Sample, nonnegative, read_link, stretch, triangular
-from .signals import apart, ranges, read_signals
+from .signals import apart, ranges, signals
 from .text import above
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
-PROVENANCE = "measured safety_factor measured_on"  # of the bound; no part of the claim
+
+Policy = dict[str, Any]  # the members of a policy's file
+Funnel = dict[str, Any]  # the members of a funnel's file and of its assumption
+
+ASSUMPTION: dict[str, Reader] = {  # what was measured is no part of the claim
+    "form": Node.text,
+    **dict.fromkeys(("bound", "rate", "gain"), nonnegative),
+    **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),
+}
 
 SENTENCE = (
     "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
@@ -49,48 +56,29 @@ ROOTS = (
 )
 
 
-@dataclass(frozen=True)
-class Funnel:
-    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption."""
-
-    S: list[Matrix]
-    A: list[Matrix]
-    radii: dict[str, list[Fraction]]
-    half_widths: Matrix
-    roots: list[Fraction]
-    form: str
-    bound: Fraction
-    rate: Fraction
-    gain: Fraction
-
-    @property
-    def widens(self) -> Fraction:
-        """What the disturbance adds to a radius."""
-        return Fraction(0) if self.form == "peak" else self.bound
-
-
-def decide(claim: Node, proof: Node, read: Read) -> Decision:
+def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Decide {kind, about: {model, policy, funnel}} by {basis, ball_basis, ..., steps}."""
     about = claim.members("kind about")["about"]
     documents, digests = bound_files(about, read, "model policy funnel")
     model = _read_model(documents["model"])
-    x, u, K = _read_policy(documents["policy"], model, digests["model"])
+    policy = _read_policy(documents["policy"], model, digests["model"])
+    x, u, K = policy["x"], policy["u"], policy["K"]
     funnel = _read_funnel(documents["funnel"], model, len(u), digests)
+    S, A = funnel["S"], funnel["A"]
     for k, (point, inputs, gain) in enumerate(zip(x, [*u, []], [*K, []], strict=True)):
         _prove_box(model, funnel, k, [*point, *inputs], gain)
     names = "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
     bases = proof.members(names)
-
     steps, rooms = bases["steps"].items(len(u), len(u)), []
 
     def prove(ring: Ring, k: int) -> None:
-        at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
-        stated, link = read_link(steps[k], model, at, funnel.form, ring)
+        at = Sample(x[k], u[k], K[k], x[k + 1], S[k], S[k + 1], A[k])
+        stated, link = read_link(steps[k], model, at, funnel["form"], ring)
         rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
 
     at_width(_variables(model), range(len(u)), prove, FREE_OF_S)
     said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
-    return Decision(said, min(rooms), assumptions, digests)
+    return text.Verdict(said, min(rooms), assumptions, digests)
 
 
 def _prove_step(
@@ -99,13 +87,16 @@ def _prove_step(
     """Prove one step of one chain; the part of the next radius that it leaves free."""
     ring, d, what = link.size.ring, len(link.h), f"{chain}, step {k}"
     names = "reach columns squares ball" + " roots equations" * bool(d)
-    names += " spread extents" * (bool(d) and funnel.form == "response")
+    names += " spread extents" * (bool(d) and funnel["form"] == "response")
     stated = node.members(names)
-    reach, (radius, following) = nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
+    reach, (radius, following) = nonnegative(stated["reach"]), funnel[chain][k : k + 2]
     parts = [reach**2 - ring.dot(link.rows, link.rows)]
     parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size))
     if d:
-        far, added = _implicit_addition(link, stated, funnel, radius, reach, k, what)
+        root = link.bounds["kappa_next"] * funnel["roots"][k + 1]
+        far, added = root, funnel["bound"]
+        if funnel["form"] == "response":
+            far, added = _implicit_addition(link, stated, funnel, radius, root)
         w = ring.variables[-d:]
         parts.append(_ball(stated["roots"], bases["roots_basis"], far, ring.dot(w, w)))
         parts += _equations(stated["equations"], bases["equation_basis"], link)
@@ -115,7 +106,7 @@ def _prove_step(
     at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
-    return (following - reach - added) / following
+    return Fraction((following - reach - added) / following)
 
 
 def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polynomial:
@@ -136,46 +127,34 @@ def _equations(node: Node, basis: Node, link: Link) -> list[Polynomial]:
 
 def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) -> Fraction:
     """What the disturbance adds to the reach of an explicit model from `radius`."""
-    if funnel.form == "peak":
-        return funnel.bound
-    kappa, rate, gain = link.bounds["kappa"], funnel.rate, funnel.gain
-    mu = kappa * stretch(link.curvature, kappa * radius, kappa * funnel.bound, least=1)
-    if funnel.form == "response":
-        return mu * funnel.bound
-    much = f"too much for rate {above(rate)} and gain {above(gain)}"
-    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, {much}")
+    form, bound, kappa = funnel["form"], funnel["bound"], link.bounds["kappa"]
+    if form == "peak":
+        return Fraction(bound)
+    mu = kappa * stretch(link.curvature, kappa * radius, kappa * bound, least=1)
+    if form == "response":
+        return Fraction(mu * bound)
+    much = f"{what}: deviations stretch by {above(mu)}, too much for rate and gain"
+    at_most(funnel["gain"] * mu**2, (funnel["gain"] - 1) * funnel["rate"], much)
     return Fraction(0)
 
 
 def _implicit_addition(
-    link: Link,
-    stated: dict[str, Node],
-    funnel: Funnel,
-    radius: Fraction,
-    reach: Fraction,
-    k: int,
-    what: str,
+    link: Link, stated: dict[str, Node], funnel: Funnel, radius: Fraction, far: Fraction
 ) -> tuple[Fraction, Fraction]:
-    """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
-    b = link.bounds
-    far = b["kappa_next"] * funnel.roots[k + 1]
-    if funnel.form == "peak":
-        return far, funnel.bound
-    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, nonnegative(stated["spread"])
+    """|w| that the reach has to be proved for, and what a response adds to the reach."""
+    b, where = link.bounds, stated["spread"].where
+    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel["bound"], nonnegative(stated["spread"])
     wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
     # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
     far += spread * r
-    at_most(z**2 + far**2, wide**2, f"{what}: the first extent is too small")
+    at_most(z**2 + far**2, wide**2, f"{where}: the first extent is too small")
     mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
     mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
-    refuse_if(
-        b["rates"] >= 1 or mapped_to > spread,
-        f"{what}: two roots may differ by more than the stated spread",
-        "not_below",
-    )
+    within = b["rates"] < 1 and mapped_to <= spread
+    stated["spread"].require({"two roots may differ by more": within}, "not_below")
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
-    own = b["kappa_next"] * reach
-    at_most(z**2 + own**2, near**2, f"{what}: the second extent is too small")
+    own = b["kappa_next"] * stated["reach"].number()
+    at_most(z**2 + own**2, near**2, f"{where}: the second extent is too small")
     mu = stretch(link.curvature, near, (1 + spread) * r, least=2)
     shrink = 1 - b["rates"] - mu
     if shrink > 0:
@@ -188,49 +167,44 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
 
     |g'x̄| <= room where |S x̄| <= radius if radius² g'(S'S)⁻¹g <= room².
     """
-    n = model.states
-    tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
-    rows = [unit(i, n) for i in range(n)] + K
-    forms = inverse_forms(product(transposed(funnel.S[k]), funnel.S[k]), rows, "S'S")
-    names, stays = [signal.name for signal in model.signals], "the box of the model's data"
-    rooms = [(tube, width, "its stated half-width") for width in funnel.half_widths[k]]
+    S = funnel["S"][k]
+    tube, inlet = (funnel[chain][k] + _widens(funnel) for chain in CHAINS)
+    forms = inverse_forms(product(transposed(S), S), identity(model.states) + K, "S'S")
+    rooms = [(tube, width, "its stated half-width") for width in funnel["half_widths"][k]]
     for centre, (low, high) in zip(centres, model.box, strict=False):
-        rooms.append((max(tube, inlet), min(high - centre, centre - low), stays))
-    named = zip(rooms, [*forms[:n], *forms], [*names[:n], *names], strict=False)
-    for (radius, room, kept), form, name in named:
-        refuse_if(
-            room < 0 or radius**2 * form > room**2,
-            f"sample {k}: {name} can leave {kept}",
-            "not_valid",
-        )
+        rooms.append((max(tube, inlet), min(high - centre, centre - low), "the box of the data"))
+    states = range(model.states)
+    for i, (radius, room, kept) in zip([*states, *range(len(forms))], rooms, strict=True):
+        leaves = room < 0 or radius**2 * forms[i] > room**2
+        refuse_if(leaves, f"sample {k}: {model.signals[i].name} can leave {kept}", "not_valid")
 
 
 def _read_model(node: Node) -> Model:
-    parts = node.document(
-        "model",
-        "equation period x u exponents coefficients x_range u_range noise disturbance bags",
-        "state_map trapezoidal",
-    )
-    trapezoidal = parts["kind"].value == "trapezoidal"
-    x = read_signals(parts["x"], "states", 1, MAX_SIGNALS)
-    u = read_signals(parts["u"], "inputs", 1, MAX_SIGNALS)
-    box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
-    signals = [*x, *apart(u, x)]
-    exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
-    refuse_if(
-        (trapezoidal and len(x) % 2) or period <= 0 or not exponents,
-        "a model needs a positive period, monomials, and a rate for each position",
+    table: Table = {
+        **dict.fromkeys(("equation", "noise", "disturbance", "bags"), itself),
+        "period": (),
+        "x": signals("states", 1, MAX_SIGNALS),
+        "u": signals("inputs", 1, MAX_SIGNALS),
+        **dict.fromkeys(("exponents", "coefficients", "x_range", "u_range"), itself),
+    }
+    given = node.document("model", table, "state_map trapezoidal")
+    trapezoidal, x, u = given["kind"] == "trapezoidal", given["x"], given["u"]
+    box = given["x_range"].array(len(x), 2) + given["u_range"].array(len(u), 2)
+    exponents = given["exponents"].monomials(len(box))
+    node.require(
+        {
+            "the period should be positive": given["period"] > 0,
+            "a trapezoidal model has a rate for each position": not (trapezoidal and len(x) % 2),
+            "there should be monomials": exponents,
+        }
     )
     outputs = len(x) // 2 if trapezoidal else len(x)
-    columns = transposed(parts["coefficients"].array(len(exponents), outputs))
+    columns = transposed(given["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
-    model = Model(trapezoidal, polynomials, period, signals, box, len(x))
+    named = [*x, *apart(u, x)]
+    model = Model(trapezoidal, polynomials, given["period"], named, box, len(x))
     degree, variables = max(map(sum, exponents)), _variables(model)
-    refuse_if(
-        comb(variables + degree, degree) > MAX_MONOMIALS,
-        f"degree {degree} in {variables} variables is too large to decide",
-        "too_large",
-    )
+    limit(comb(variables + degree, degree), MAX_MONOMIALS, f"monomials of degree {degree}")
     return model
 
 
@@ -239,68 +213,76 @@ def _variables(model: Model) -> int:
     return model.states + model.states // 2 * model.trapezoidal
 
 
-def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matrix, list[Matrix]]:
-    parts = node.document("policy", "law period L u x K", "sampled", made_for={"model": made_for})
-    refuse_if(
-        parts["period"].number() != model.period,
-        "the policy has another sample time than the model",
-    )
+def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
     n, p = model.states, len(model.signals) - model.states
-    u = parts["u"].array(None, p)
-    refuse_if(
-        not 0 < len(u) * n**3 <= MAX_SAMPLES,
-        f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps",
-        "too_large",
+    table: Table = {
+        "law": itself,
+        "period": (),
+        "L": (n, n),
+        "u": (None, p),
+        "x": (None, n),
+        "K": (None, p, n),
+    }
+    policy = node.document("policy", table, "sampled", {"model": made_for})
+    steps = limit(len(policy["u"]), MAX_SAMPLES // n**3, f"steps of {n} states", least=1)
+    node.require(
+        {
+            "the period should be the model's": policy["period"] == model.period,
+            "there should be a sample more than steps": len(policy["x"]) == steps + 1,
+            "there should be one K a step": len(policy["K"]) == steps,
+        }
     )
-    parts["L"].array(n, n)
-    return parts["x"].array(len(u) + 1, n), u, parts["K"].array(len(u), p, n)
+    return policy
 
 
 def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) -> Funnel:
-    names = "set assumption tube inlet half_widths S A" + " roots" * model.trapezoidal
+    n, samples = model.states, (steps + 1,)
+    table: Table = {
+        "set": itself,
+        "assumption": lambda entry: entry.read(ASSUMPTION),
+        **dict.fromkeys(("tube", "inlet") + ("roots",) * model.trapezoidal, samples),
+        "half_widths": (*samples, n),
+        "S": (*samples, n, n),
+        "A": (steps, n, n),
+    }
     made_for = {role: digests[role] for role in ("model", "policy")}
-    parts, n = node.document("funnel", names, "sampled", made_for=made_for), model.states
-    radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
-    roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
-    refuse_if(
-        min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0],
-        "radii and roots should be positive, and the tube start in the inlet",
-        "not_below",
-    )
-    S = [triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
-    A, widths = parts["A"].array(steps, n, n), parts["half_widths"].array(steps + 1, n)
+    given = node.document("funnel", table, "sampled", made_for)
+    funnel = {"roots": [], **given, **given["assumption"]}
+    radii = funnel["tube"] + funnel["inlet"] + funnel["roots"]
+    starts = min(radii) > 0 and funnel["tube"][0] <= funnel["inlet"][0]
+    wanted = "radii and roots should be positive, and the tube start in the inlet"
+    node.require({wanted: starts}, "not_below")
+    for S in funnel["S"]:
+        triangular(S, node)
+    form, rate, gain = (funnel[name] for name in ("form", "rate", "gain"))
+    forms = ["response", "peak"] + ["energy", "fading"] * (not model.trapezoidal)
+    node.require({f"the form should be one of {', '.join(forms)}": form in forms})
+    own = (form == "fading" or rate == 1) and (form in ("energy", "fading") or gain == 1)
+    wanted = f"rate and gain should be those of form {form}"
+    node.require({wanted: rate <= 1 <= gain and own}, "not_below")
+    return funnel
 
-    stated = parts["assumption"].members(f"form bound rate gain {PROVENANCE}")
-    form = stated["form"].text()
-    bound, rate, gain = (nonnegative(stated[key]) for key in ("bound", "rate", "gain"))
-    refuse_if(
-        form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal),
-        f"form {form!r} is not for this kind of model; use response or peak",
-    )
-    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
-    refuse_if(
-        rate > 1 or gain < 1 or plain,
-        f"rate {above(rate)} or gain {above(gain)} is none of form {form}",
-        "not_below",
-    )
-    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain)
+
+def _widens(funnel: Funnel) -> Fraction:
+    """What the disturbance adds to a radius."""
+    return Fraction(0 if funnel["form"] == "peak" else funnel["bound"])
 
 
 def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
     """What is proved, its numbers rounded outward."""
-    tube, inlet = (funnel.radii[chain] for chain in CHAINS)
-    wider = (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens)
+    tube, inlet = (funnel[chain] for chain in CHAINS)
+    wider = (inlet[-1] + _widens(funnel)) / (tube[-1] + _widens(funnel))
     ends, goal = (
         ", ".join(
             signal.quantity(f"{signal.name} {above(width * factor)}")
-            for signal, width in zip(model.signals, funnel.half_widths[-1], strict=False)
+            for signal, width in zip(model.signals, funnel["half_widths"][-1], strict=False)
         )
         for factor in (1, wider)
     )
     return text.say(
         SENTENCE,
         tube=tube[0],
-        bound=" + bound" if funnel.widens else "",
+        bound=" + bound" if _widens(funnel) else "",
         samples=steps + 1,
         span=steps * model.period,
         ends=ends,
@@ -311,8 +293,8 @@ def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
 
 
 def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
-    kept = text.say(KEPT[funnel.form], bound=funnel.bound, rate=funnel.rate, gain=funnel.gain)
-    said = (text.say(DISTURBANCE, form=funnel.form, kept=kept), APPLIED)
+    kept = text.say(KEPT[funnel["form"]], **funnel)
+    said = (text.say(DISTURBANCE, form=funnel["form"], kept=kept), APPLIED)
     if not model.trapezoidal:
         return said
-    return (*said, text.say(ROOTS, low=min(funnel.roots[1:]), high=max(funnel.roots[1:])))
+    return (*said, text.say(ROOTS, low=min(funnel["roots"][1:]), high=max(funnel["roots"][1:])))

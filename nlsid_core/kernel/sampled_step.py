@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import factorial, prod
 
-from .exact import Matrix, at_most, combined, product, semidefinite, transposed
+from .exact import Matrix, combined, identity, product, scaled, semidefinite, transposed
 from .files import Node, Terms, refuse_if
 from .polynomials import Polynomial, Ring
 from .signals import Signal
@@ -60,33 +60,31 @@ def read_link(
     stated = node.members(f"T curvature tube inlet {norms}{more}")
     bounds = {name: nonnegative(stated[name]) for name in norms.split()}
     curvature = [nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
-    n, d, where = model.states, model.states // 2, stated["T"].where
-    T = triangular(stated["T"].array(n, n), where)
+    n, d, where = model.states, model.states // 2, node.where
+    T = triangular(stated["T"].array(n, n), stated["T"])
     ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
-    z = ring.variables[:n]
-    scaled = ring.product(ST, z)
-    prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
-    h: list[Polynomial] = []
+    prove_inverse(ST, bounds["kappa"], f"{where}: kappa")
     if not model.trapezoidal:
+        h: list[Polynomial] = []
         rows = moved = explicit_step(model.map, at, T, ring)
         if form == "response":
-            moved = [p - q for p, q in zip(rows, ring.product(unit, z), strict=True)]
+            turned = ring.product(unit, ring.variables[:n])
+            moved = [p - q for p, q in zip(rows, turned, strict=True)]
     else:
         T_next = stated["T_next"].array(d, d)
         S_rates = [row[d:] for row in at.S_next[d:]]
         prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
         rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
         moved = ring.product(stated["inverse"].array(d, d), h)
-        (B, C), (L_z, L_w) = (
-            ([row[:n] for row in M], [row[n:] for row in M])
-            for M in (linear_part(moved, ring), linear_part(rows, ring))
-        )
-        C = [[entry - (i == j) for j, entry in enumerate(row)] for i, row in enumerate(C)]
-        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
-        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w)):
+        B, C = _columns(linear_part(moved, ring), n)
+        L_z, L_w = _columns(linear_part(rows, ring), n)
+        through = combined(L_z, product(L_w, B), -1)
+        norm = {"state": B, "rates": combined(C, identity(d), -1), "through": L_w}
+        for name, M in {**norm, "direct": combined(through, unit, -1)}.items():
             prove_norm(M, bounds[name], f"{where}: the bound {name}")
     prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
-    return stated, Link(rows, h, ring.dot(scaled, scaled), bounds, curvature)
+    size = ring.product(ST, ring.variables[:n])
+    return stated, Link(rows, h, ring.dot(size, size), bounds, curvature)
 
 
 def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
@@ -124,18 +122,14 @@ def prove_curvature(
 ) -> None:
     """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
     sizes: dict[int, Matrix] = {}
-    keys = set().union(*(q.terms for q in p))
-    for key in keys:
+    for key in set().union(*(q.terms for q in p)):
         e = ring.exponents(key)
         c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
         outer = [[a * b for b in c] for a in c]
         share = Fraction(prod(map(factorial, e)), factorial(m))
         sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
-    refuse_if(
-        max(sizes, default=0) >= least + len(gammas),
-        "curvature: a bound for every degree is needed",
-        "not_covered",
-    )
+    missing = max(sizes, default=0) >= least + len(gammas)
+    refuse_if(missing, "curvature: a bound for every degree is needed", "not_covered")
     for m, gamma in enumerate(gammas, start=least):
         if m in sizes:
             _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
@@ -143,10 +137,15 @@ def prove_curvature(
 
 def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: int) -> Fraction:
     """μ with |p(z + w) - p(z)| <= μ|w| for |z| <= size, |w| <= step; degrees from `least` on."""
-    far, total = size + step, Fraction(0)
-    for m, gamma in enumerate(gammas, start=least):
-        total += gamma * sum((far**i * size ** (m - 1 - i) for i in range(m)), Fraction(0))
-    return total
+    far = size + step
+    return sum(
+        (
+            gamma * far**i * size ** (m - 1 - i)
+            for m, gamma in enumerate(gammas, start=least)
+            for i in range(m)
+        ),
+        Fraction(0),
+    )
 
 
 def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
@@ -157,19 +156,21 @@ def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
 def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
     """Raise Rejected unless |z| <= bound |M z| for every z."""
     MM = product(transposed(M), M)
-    scaled = [[bound**2 * e - (i == j) for j, e in enumerate(row)] for i, row in enumerate(MM)]
-    semidefinite(scaled, what)
+    semidefinite(combined(scaled(MM, bound**2), identity(len(MM)), -1), what)
 
 
 def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
-    semidefinite(
-        [[bound**2 * (i == j) - e for j, e in enumerate(row)] for i, row in enumerate(MM)], what
-    )
+    semidefinite(combined(scaled(identity(len(MM)), bound**2), MM, -1), what)
+
+
+def _columns(M: Matrix, count: int) -> tuple[Matrix, Matrix]:
+    """The first columns of M, and the others."""
+    return [row[:count] for row in M], [row[count:] for row in M]
 
 
 def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
     """x + T z and u - K T z."""
-    feedback = [[-entry for entry in row] for row in product(at.K, T)]
+    feedback = scaled(product(at.K, T), -1)
     moved = ring.product([*T, *feedback], ring.variables[: len(T)])
     return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
 
@@ -177,15 +178,13 @@ def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
 def nonnegative(node: Node) -> Fraction:
     """A number of 0 or more."""
     value = node.number()
-    at_most(0, value, f"{node.where} should not be negative")
+    node.require({"should not be negative": value >= 0}, "not_below")
     return value
 
 
-def triangular(M: Matrix, what: str) -> Matrix:
+def triangular(M: Matrix, node: Node) -> Matrix:
     """M, if it is upper triangular with a nonzero diagonal."""
     size = range(len(M))
-    refuse_if(
-        not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)),
-        f"{what} should be upper triangular with a nonzero diagonal",
-    )
+    upper = all(M[i][i] for i in size) and not any(M[i][j] for i in size for j in range(i))
+    node.require({"should be upper triangular with a nonzero diagonal": upper})
     return M

@@ -2,10 +2,11 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from .files import Node, refuse_if
+from .files import Node, itself, refuse_if
 
 MAX_SIGNALS = 50
 
@@ -45,20 +46,20 @@ def unit_label(unit: str) -> str:
 
 def read_signal(node: Node) -> Signal:
     """One {name, unit, path}."""
-    parts = node.members("name unit path")
-    return Signal(name_label(parts["name"].text()), unit_label(parts["unit"].text()))
+    given = node.read({"name": Node.text, "unit": Node.text, "path": itself})
+    return Signal(name_label(given["name"]), unit_label(given["unit"]))
 
 
-def read_signals(
-    node: Node, what: str, least: int = 0, most: int = MAX_SIGNALS
-) -> tuple[Signal, ...]:
-    """A list of `least` to `most` of `what`, each with a name of its own."""
-    signals = tuple(read_signal(entry) for entry in node.items(least, most))
-    refuse_if(
-        len({signal.name for signal in signals}) < len(signals),
-        f"{node.where}: two {what} have the same name",
-    )
-    return signals
+def signals(what: str, least: int = 0, most: int = MAX_SIGNALS) -> Callable[[Node], Any]:
+    """A reader of a list of `least` to `most` of `what`, each with a name of its own."""
+
+    def read(node: Node) -> tuple[Signal, ...]:
+        found = tuple(map(read_signal, node.items(least, most)))
+        names = {signal.name for signal in found}
+        refuse_if(len(names) < len(found), f"{node.where}: two {what} have the same name")
+        return found
+
+    return read
 
 
 def apart(inputs: Sequence[Signal], outputs: Sequence[Signal]) -> list[Signal]:

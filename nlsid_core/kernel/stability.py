@@ -8,9 +8,8 @@ an implicit step has one solution. Source: docs/certificate_stability.md.
 from fractions import Fraction
 
 from . import text
-from .decision import Decision
 from .exact import definite
-from .files import Node, Read, bound_files, refuse_if
+from .files import Node, Read, bound_files, itself, refuse_if
 from .increments import gap, positive
 from .models import read_model
 
@@ -20,22 +19,20 @@ SENTENCE = (
 )
 
 
-def decide(claim: Node, proof: Node, read: Read) -> Decision:
+def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Decide {kind, about: {model}, rate} by {P, multipliers}."""
-    parts = claim.members("kind about rate")
-    documents, digests = bound_files(parts["about"], read, "model")
-    model = read_model(documents["model"])
-    rate = parts["rate"].number()
+    stated = claim.read({"kind": itself, "about": itself, "rate": ()})
+    documents, digests = bound_files(stated["about"], read, "model")
+    model, rate = read_model(documents["model"]), stated["rate"]
     refuse_if(not 0 < rate < 1, "the rate should satisfy 0 < rate < 1", "not_below")
-    given = proof.members("P", "multipliers")
-    P = given["P"].array(model.states, model.states)
+    given = proof.read({"P": (model.states, model.states), "multipliers?": itself})
+    P = given["P"]
     definite(P, "P")
     form = gap(model, rate**2, P, [], model.F, P)
-    positive(
-        model, given.get("multipliers"), [("the decrease of V = x'Px at the stated rate", form)]
-    )
+    what = "the decrease of V = x'Px at the stated rate"
+    positive(model, given["multipliers"], [(what, form)])
     said = text.say(SENTENCE, rate=_shown(rate), period=model.period, where=model.where)
-    return Decision(said, 1 - rate, (), digests)
+    return text.Verdict(said, 1 - rate, (), digests)
 
 
 def _shown(rate: Fraction) -> str:

@@ -19,14 +19,14 @@ from fractions import Fraction
 from typing import Any
 
 from . import text
-from .decision import Decision
 from .exact import definite
-from .files import Node, Read, Terms, bound_files, refuse_if
+from .files import Node, Read, Table, Terms, bound_files, itself, limit, one_of, refuse_if
 from .implicit_models import ImplicitModel, derivative, read_implicit_model
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import WITNESS, positive_on
 
 MAX_VARIABLES = 100
+SETS = ("2.10", "2.11", "2.12", "2.13", "2.19")
 STORAGE = {"2.10": " V", "2.11": " M", "2.12": " P", "2.13": " P", "2.19": "", "": ""}
 SENTENCE = "the implicit model with {size} has exactly one next state for {where}{stable}"
 STABLE = (
@@ -39,30 +39,28 @@ Vector = list[Polynomial]
 Inequality = tuple[Polynomial, Vector]  # >= 0 where each of the domain is >= 0
 
 
-def decide(claim: Node, proof: Node, read: Read) -> Decision:
+def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Rebuild the inequalities of the set from the model's numbers; each has its own witness."""
-    parts = claim.members("kind about", "set delta box")
-    documents, digests = bound_files(parts["about"], read, "model")
+    table: Table = {"kind": itself, "about": itself, "set?": one_of(*SETS), "delta?": ()}
+    stated = claim.read({**table, "box?": (None, 2)})
+    documents, digests = bound_files(stated["about"], read, "model")
     model = read_implicit_model(documents["model"])
     n, m = model.states, model.inputs
-    kind = parts["set"].text() if "set" in parts else ""
-    refuse_if(
-        kind not in STORAGE,
-        f"the set {kind!r} is unknown; known: {', '.join(filter(None, STORAGE))}",
+    kind, delta, box = stated["set"] or "", stated["delta"], stated["box"] or []
+    sized = stated["box"] is None or len(box) == n + m
+    claim.require(
+        {
+            "a set needs a delta, and a delta needs a set": (delta is None) == (not kind),
+            "the box should have a range for every state and input": sized,
+        }
     )
-    refuse_if(("delta" in parts) != bool(kind), "a set needs a delta, and a delta needs a set")
-    delta = parts["delta"].number() if kind else Fraction(0)
-    refuse_if(kind and delta <= 0, "delta should be positive", "not_below")
-    box = parts["box"].array(n + m, 2) if "box" in parts else []
-    refuse_if(
-        any(not low < high for low, high in box), "an interval of the box is empty", "not_valid"
-    )
+    claim.require({"delta should be positive": not kind or delta > 0}, "not_below")
+    full = all(low < high for low, high in box)
+    claim.require({"no interval of the box should be empty": full}, "not_valid")
     given = proof.members("inequalities" + STORAGE[kind])
     storage = _read_storage(kind, given, n, local=bool(box))
     count = 2 * model.unknowns + 2 * n + m + 2 * n + 1  # v, x, w, v~, x~, and y
-    refuse_if(
-        count > MAX_VARIABLES, f"{count} variables; at most {MAX_VARIABLES} are taken", "too_large"
-    )
+    limit(count, MAX_VARIABLES, "variables")
 
     def prove(ring: Ring, _: None) -> None:
         wanted = _inequalities(model, kind, storage, delta, box, ring)
@@ -76,7 +74,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     size = f"{n} state{'s' if n > 1 else ''}"
     said = text.say(SENTENCE, size=size, where=_where(box, n), stable=stable)
     stay = (STAY,) if box and kind else ()
-    return Decision(said, delta if kind else model.monotonicity, stay, digests)
+    return text.Verdict(said, delta if kind else model.monotonicity, stay, digests)
 
 
 def _where(box: list[Any], n: int) -> str:

@@ -1,4 +1,4 @@
-"""Numbers in sentences, and the one printer of sentences.
+"""`Verdict`: a sentence that is proved; the numbers in sentences, and their one printer.
 
 A sentence is a template with slots, `{name:how}`, and `how` is one of PRINTED. A bound is printed
 exactly where its shortest decimal form is short, else rounded outward: no printed bound is better
@@ -7,6 +7,7 @@ than the proved one. As in the files, a decimal stands for the float64 nearest t
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from math import isqrt
@@ -15,6 +16,28 @@ from typing import Any
 
 DIGITS = 4  # significant, of a number that is rounded
 SHORT = 6  # significant digits of a number that is not
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is proved: it exists only for a claim that was decided.
+
+    statement: one sentence. margin: how much room the proof has, in the unit that the kind states;
+    rounded down when printed. assumptions: what the statement rests on and the kernel cannot know.
+    digests: by role, of the files that it is about, and of the proof itself (role `proof`). files:
+    the digests by name of all that was read beside the proof.
+    """
+
+    statement: str
+    margin: Fraction
+    assumptions: tuple[str, ...]
+    digests: dict[str, str]
+    kind: str = ""
+    files: dict[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        lines = [f"PROVED {self.statement}, margin {below(self.margin)}"]
+        return "\n".join(lines + [f"  assuming {assumption}" for assumption in self.assumptions])
 
 
 def above(value: Fraction, digits: int = DIGITS) -> str:
@@ -35,11 +58,6 @@ def exact(value: Fraction) -> str:
     return str(value) if nearest is None else repr(nearest)
 
 
-def quoted(value: str) -> str:
-    """A text in quotation marks, which can end no sentence."""
-    return json.dumps(value)
-
-
 def root_above(value: Fraction, bits: int = 64) -> Fraction:
     """A rational at least the square root of value >= 0, within 2^(1 - bits) of it, relatively."""
     if not value:
@@ -56,7 +74,7 @@ PRINTED: dict[str, Callable[[Any], str]] = {
     "up": above,
     "down": below,
     "exact": exact,
-    "quoted": quoted,
+    "quoted": json.dumps,  # in quotation marks, which can end no sentence
     "exact_range": lambda ends: f"[{exact(ends[0])}, {exact(ends[1])}]",
     "outer_range": lambda ends: f"[{below(ends[0])}, {above(ends[1])}]",
     "inner_range": lambda ends: _inner(*ends),

@@ -1,141 +1,205 @@
-"""What is read of a trajectory: a vector field, a policy around a nominal, and a funnel.
+"""What is read of a trajectory: a policy and a funnel around a nominal, a vector field, and pieces.
 
-The nominal's states and inputs and the gains are Bézier curves in each interval between knots.
+Between knots the nominal's states and inputs and the gains are Bézier curves, P and ρ are linear.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
+from itertools import pairwise, product
+from math import prod
+from typing import Any
 
 from .exact import Matrix, definite
-from .files import Mismatch, Node, Terms, refuse_if
+from .files import Mismatch, Node, Reader, Table, Terms, itself, limit, whole
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS = 10_000, 10_000, 1000
+MAX_LEVEL, MAX_PIECES = 16, 100_000
+
 Bounds = dict[int, tuple[Fraction, Fraction]]
 Curve = list[list[list[Fraction]]]  # by interval, control point, entry
-
-
-@dataclass(frozen=True)
-class Field:
-    """By time span: bounds of entries of (x, u), and equations in t, x, u and w."""
-
-    n: int
-    m: int
-    box: list[tuple[Fraction, Fraction]]
-    breaks: list[Fraction]
-    bounds: list[Bounds]
-    expansion: str
-    equations: list[list[Terms]]
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Control points of u₀ and K; limits: low and high by input."""
-
-    u: Curve
-    K: list[list[Matrix]]
-    limits: Bounds
+Mode = tuple[int, ...]  # -1 low, 0 free, 1 high, of each input with limits
+Part = tuple[int, int, int]  # interval k, level, index: [index, index + 1] / 2^level of it
+Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
+Piece = tuple[Key, Part, dict[str, Node]]  # what it is about, and its members
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """Knots, control points of x₀, and P and ρ at the knots."""
+    """Knots; control points of x₀, u₀ and K; low and high by input with limits; P, ρ at knots."""
 
     t: list[Fraction]
     x: Curve
+    u: Curve
+    K: list[list[Matrix]]
+    limits: Bounds
     P: list[Matrix]
     rho: list[Fraction]
 
+    @property
+    def modes(self) -> list[Mode]:
+        """Each input with limits free, low or high."""
+        return list(product((0, -1, 1), repeat=len(self.limits)))
 
-def read_field(node: Node) -> Field:
-    """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
-    names = "states inputs uncertain breaks valid expansion pieces"
-    parts = node.document("vector_field", names)
-    n, m = parts["states"].whole(1, MAX_STATES), parts["inputs"].whole(0, MAX_INPUTS)
-    box = [(low, high) for low, high in parts["uncertain"].array(None, 2)]
-    refuse_if(
-        len(box) > MAX_UNCERTAIN or any(low > high for low, high in box),
-        f"uncertain should hold at most {MAX_UNCERTAIN} pairs low <= high",
+
+@dataclass(frozen=True)
+class Field:
+    """n states, m inputs, a box of w; by interval, equations in t, x, u, w and bounds of (x, u).
+
+    pushing: the variables of the equations that only add constants to ẋ; affine: whether f is so in
+    each input; both in all time spans.
+    """
+
+    n: int
+    m: int
+    box: list[tuple[Fraction, Fraction]]
+    equations: list[list[Terms]]
+    bounds: list[Bounds]
+    pushing: set[int]
+    affine: bool
+    expansion: str
+
+
+def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
+    """The policy and the funnel: around one nominal, x₀ continuous, P ≻ 0, ρ > 0 at every knot."""
+    made_for = {"vector_field": digests["vector_field"]}
+    table: Table = {"t": (None,), "x": itself, "u": itself, "K": itself, "limits": (None, 3)}
+    policy = documents["policy"].document("policy", table, "continuous", made_for)
+    made_for["policy"], node = digests["policy"], documents["funnel"]
+    table = {"t": _times(2, MAX_KNOTS), "x": itself, "P": itself, "rho": (None,)}
+    given = node.document("funnel", table, "continuous", made_for)
+
+    t, rho, x = given["t"], given["rho"], _curve(given["x"], len(given["t"]) - 1, None)
+    n, count = len(x[0][0]), len(x)
+    if policy["t"] != t or _curve(policy["x"], count, n) != x:
+        raise Mismatch("the funnel is around another nominal than the policy's")
+    node.require({"one rho a knot": len(rho) == len(t)})
+    node.require({"x should not jump": all(a[-1] == b[0] for a, b in pairwise(x))})
+    node.require({"rho should be positive": min(rho) > 0}, "not_below")
+    P = given["P"].array(len(t), n, n)
+    for k, shape in enumerate(P):
+        definite(shape, f"P at knot {k}")
+
+    u = _curve(policy["u"], count, None)
+    m, rows = len(u[0][0]), policy["limits"]
+    limits = {int(i): (low, high) for i, low, high in rows if i in range(m)}
+    documents["policy"].require(
+        {
+            f"at most {MAX_LIMITED} limits, of one input each": len(limits)
+            == len(rows)
+            <= MAX_LIMITED,
+            "limits should have low < high": all(low < high for low, high in limits.values()),
+        }
     )
-    breaks = _increasing(parts["breaks"], 0, MAX_SPANS)
-    count = len(breaks) + 1
+    return Funnel(t, x, u, _curve(policy["K"], count, m, n), limits, P, rho)
+
+
+def read_field(node: Node, funnel: Funnel) -> Field:
+    """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
+    table: Table = {
+        "states": whole(1, MAX_STATES),
+        "inputs": whole(0, MAX_INPUTS),
+        "uncertain": (None, 2),
+        "breaks": _times(0, MAX_SPANS),
+        "valid": (None, None),
+        "expansion": Node.text,
+        "pieces": itself,
+    }
+    given = node.document("vector_field", table)
+    n, m, box = given["states"], given["inputs"], given["uncertain"]
+    count, first = len(given["breaks"]) + 1, 1 + n + m
+    sizes = (len(funnel.x[0][0]), len(funnel.u[0][0]))
+    knots = [t for t in given["breaks"] if funnel.t[0] < t < funnel.t[-1]]
+    node.require(
+        {
+            "other states and inputs than the policy's": sizes == (n, m),
+            "uncertain should have low <= high": all(low <= high for low, high in box),
+            f"uncertain should have at most {MAX_UNCERTAIN} rows": len(box) <= MAX_UNCERTAIN,
+            f"valid should have at most {MAX_BOUNDS} rows": len(given["valid"]) <= MAX_BOUNDS,
+            "the dynamics change at a time that is no knot": all(t in funnel.t for t in knots),
+        }
+    )
     bounds: list[Bounds] = [{} for _ in range(count)]
-    for row in parts["valid"].items(0, MAX_BOUNDS):
-        j, low, high, *only = row.array(4 if type(row.value) is list and row.value[3:] else 3)
-        refuse_if(
-            j not in range(n + m) or not all(span in range(count) for span in only),
-            f"{row.where} should be an entry of (x, u), low, high, and maybe a span",
-        )
+    for row in given["valid"]:
+        known = len(row) in (3, 4) and row[0] in range(n + m) and {*row[3:]} <= {*range(count)}
+        node.require({"valid: rows (entry of (x, u), low, high), perhaps a span": known})
+        j, low, high, *only = row
         for found in [bounds[int(span)] for span in only] or bounds:
             before = found.get(int(j), (low, high))
             found[int(j)] = max(low, before[0]), min(high, before[1])
     equations = [
-        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, bytes) for row in piece.items(n, n)]
-        for piece in parts["pieces"].items(count, count)
+        [row.polynomial(first + len(box), MAX_DEGREE, bytes) for row in piece.items(n, n)]
+        for piece in given["pieces"].items(count, count)
     ]
-    refuse_if(
-        any(max(e[1 + n + m :], default=0) > 1 for span in equations for p in span for e, _ in p),
-        f"{parts['pieces'].where}: a monomial has degree above 1 in an entry of w",
-    )
-    return Field(n, m, box, breaks, bounds, parts["expansion"].text(), equations)
+    rows = [e for span in equations for equation in span for e, _ in equation]
+    single = all(max(e[first:], default=0) <= 1 for e in rows)
+    node.require({"a monomial should have degree 1 at most in an entry of w": single})
+    pushing = {j for j in range(1 + n, first + len(box)) if all(sum(e) == 1 for e in rows if e[j])}
+    spans = [sum(t <= start for t in given["breaks"]) for start in funnel.t[:-1]]
+    by_interval = [equations[span] for span in spans], [bounds[span] for span in spans]
+    affine = all(max(e[1 + n : first], default=0) <= 1 for e in rows)
+    return Field(n, m, box, *by_interval, pushing, affine, given["expansion"])
 
 
-def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
-    """The funnel: x₀ continuous, P ≻ 0 and ρ > 0 at every knot, and so in between."""
-    made_for = {role: digests[role] for role in ("vector_field", "policy")}
-    parts = node.document("funnel", "t x P rho", "continuous", made_for=made_for)
-    t = _increasing(parts["t"], 2, MAX_KNOTS)
-    K = len(t)
-    x = _curve(parts["x"], K - 1, n)
-    refuse_if(
-        any(before[-1] != after[0] for before, after in pairwise(x)),
-        "the nominal states of the funnel jump at a knot",
-    )
-    size = len(x[0][0])
-    P, rho = parts["P"].array(K, size, size), parts["rho"].array(K)
-    for k in range(K):
-        definite(P[k], f"P at knot {k}")
-        refuse_if(rho[k] <= 0, f"rho is not positive at knot {k}", "not_below")
-    return Funnel(t, x, P, rho)
+def pushed(equation: Terms, j: int) -> Fraction:
+    """What a unit of variable j adds to one rate, for a variable that only pushes."""
+    return sum((c for e, c in equation if e[j]), Fraction(0))
 
 
-def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str]) -> Policy:
-    """The policy: around the funnel's own nominal, each input clipped at most once."""
-    made_for = {"vector_field": digests["vector_field"]}
-    parts = node.document("policy", "t x u K limits", "continuous", made_for=made_for)
-    count = len(funnel.x)
-    if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:
-        raise Mismatch("the funnel is around another nominal than the policy's")
-    u, K = _curve(parts["u"], count, field.m), _curve(parts["K"], count, field.m, field.n)
-    rows = parts["limits"].array(None, 3)
-    limits = {int(row[0]): (row[1], row[2]) for row in rows if row[0] in range(field.m)}
-    refuse_if(
-        len(limits) != len(rows) or len(rows) > MAX_LIMITED,
-        f"limits should be at most {MAX_LIMITED} rows, one each for some input",
-    )
-    refuse_if(
-        any(low >= high for low, high in limits.values()),
-        "limits should be rows (input, low, high) with low < high",
-    )
-    return Policy(u, K, limits)
+def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> list[Piece]:
+    """Every piece, in the order of the file.
+
+    Raises Rejected unless their parts of time cover [0, 1] for everything that is needed.
+    """
+    names = f"interval vertex level index columns squares {names}" + " mode" * bool(limited)
+    pieces: list[Piece] = []
+    covered = dict.fromkeys(needed, Fraction(0))
+    for entry in node.items(1, MAX_PIECES):
+        piece = entry.members(names)
+        level = piece["level"].whole(0, MAX_LEVEL)
+        index = piece["index"].whole(0, 2**level - 1)
+        mode = tuple(piece["mode"].wholes(limited)) if limited else ()
+        if "input" in piece:
+            mode = piece["input"].whole(0), piece["sign"].whole(-1, 1), *mode
+        k, v = piece["interval"].whole(0), piece["vertex"].whole(0)
+        known = (k, v, mode) in covered
+        entry.require({f"no interval {k}, vertex {v}, mode {mode}": known}, "not_covered")
+        pieces.append(((k, v, mode), (k, level, index), piece))
+    starts = sorted((key, Fraction(i, 2**level), level) for key, (_, level, i), _ in pieces)
+    for key, start, level in starts:
+        if start <= covered[key]:
+            covered[key] = max(covered[key], start + Fraction(1, 2**level))
+    for (k, v, mode), until in covered.items():
+        wanted = f"a piece of interval {k}, vertex {v}, mode {mode} is missing"
+        node.require({wanted: until >= 1}, "not_covered")
+    return pieces
 
 
-def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
-    times: list[Fraction] = node.array(None)
-    refuse_if(
-        not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)),
-        f"{node.where} should be {least} to {most} times that increase",
-    )
-    return times
+def refuse_many(*counts: int) -> None:
+    """Raise Rejected if there are more intervals, vertices and modes than pieces."""
+    limit(prod(counts), MAX_PIECES, "intervals, vertices and modes")
 
 
-def _curve(node: Node, count: int, *shape: int | None) -> list:  # type: ignore[type-arg]
+def _times(least: int, most: int) -> Reader:
+    """A reader of so many times that increase."""
+
+    def read(node: Node) -> list[Fraction]:
+        times: list[Fraction] = node.array(None)
+        fits = least <= len(times) <= most and all(a < b for a, b in pairwise(times))
+        node.require({f"should be {least} to {most} times that increase": fits})
+        return times
+
+    return read
+
+
+def _curve(node: Node, count: int, *shape: int | None) -> Any:
     curve = node.array(count, None, *shape)
     for control in curve:
-        refuse_if(
-            not 0 < len(control) <= MAX_TIME_DEGREE + 1 or len(control[0]) != len(curve[0][0]),
-            f"{node.where} should have degree 0 to {MAX_TIME_DEGREE} in time",
+        even = all(len(point) == len(curve[0][0]) for point in control)
+        fits = 0 < len(control) <= MAX_TIME_DEGREE + 1 and even
+        node.require(
+            {f"should have degree 0 to {MAX_TIME_DEGREE} in time, points of one size": fits}
         )
     return curve

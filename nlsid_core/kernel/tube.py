@@ -6,26 +6,64 @@ the inequality of `increments` has to hold, with the funnel's ρ, P, R,
     for G = [F L], Q = P: V = x̄'Px̄ grows by no more than the innovation's energy,
     for G = [H_j 1_j], Q = τ_j: V bounds output j.
 Where a policy acts, F is F - κBK and H is H - κDK, κ in [0, 1], and its ends decide all between.
+A level may follow the commands, E <= level g(k) at every sample, g(k) = Σ_i w_i G_i(k) with
+    G(k) = fading G(k-1) + v(k)²,   G = 0 before the run,
+v = (s - centre)/scale, or the change of s since the last sample over scale, s a product of inputs:
+the theorem needs only that g >= 0, and whoever uses it that g is known from the commands up to k.
 Why that is enough: docs/certificate_tube.md.
 """
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 from . import text
-from .decision import Decision
 from .exact import Matrix, Rows, at_most, definite, unit
-from .files import Node, Read, Rejected, bound_files, refuse_if
+from .files import (
+    Node,
+    Read,
+    Reader,
+    Rejected,
+    bound_files,
+    each,
+    itself,
+    limit,
+    one_of,
+    refuse_if,
+    whole,
+)
 from .increments import Model, gap, positive
-from .levels import CommandLevel, formula, read_level
 from .models import read_model
 from .signals import Signal, apart, ranges
 
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
 MAX_PLAN = 10**6  # samples of a plan
-PROVENANCE = "measured safety_factor designed_on measured_on"  # of a level; no part of the claim
+
+MAX_TERMS = 200
+MAX_FACTORS = 4
+WORDS = ("E", "e", "g", "i", "x", "sum", "change")  # of a formula: names that are these are quoted
+TERM: dict[str, Reader] = {
+    "inputs": lambda node: node.wholes(None),
+    "of": one_of("value", "change"),
+    "centre": (),
+    "scale": (),
+    "fading": (),
+}
+
+Term = dict[str, Any]  # one G, the members of TERM
+CommandLevel = list[tuple[Fraction, Term]]  # its weights, not negative, some positive, and terms
+
+Tube = dict[str, Any]  # the members of a tube in a funnel's file
+Policy = dict[str, Any]  # the members of a policy's file
+
+ASSUMPTION: dict[str, Reader] = {  # what was measured is no part of the claim
+    "kind": one_of("fading", "energy"),
+    "samples?": whole(1, MAX_SAMPLES),
+    **dict.fromkeys(("measured", "safety_factor", "designed_on", "measured_on"), itself),
+}
 
 SENTENCE = (
     "tube: the measured output stays near the model's simulation under the same inputs, {tubes}, "
@@ -49,105 +87,66 @@ INSIDE = (
 )
 
 
-@dataclass(frozen=True)
-class Assumption:
-    """E <= level g. samples: None is for ever, else an energy's (ρ = 1). follows: g; None: 1."""
-
-    level: Fraction
-    samples: int | None
-    follows: CommandLevel | None
-
-
-@dataclass(frozen=True)
-class Tube:
-    """One tube of a funnel file; n states, p outputs.
-
-    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,).
-    """
-
-    rho: Fraction
-    L: Matrix
-    P: Matrix
-    R: Matrix
-    tau: list[Fraction]
-    half_widths: list[Fraction]
-    inlet: Fraction
-    assumed: Assumption
-
-
-@dataclass(frozen=True)
-class Policy:
-    """What the claim needs of a policy file: K (1, n), L (n, p), and the samples of its plan."""
-
-    K: Matrix
-    L: Matrix
-    samples: int
-
-
-def decide(claim: Node, proof: Node, read: Read) -> Decision:
+def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Decide {kind, about: {model, funnel}}, or with a policy beside them, by {multipliers}."""
     about = claim.members("kind about")["about"]
     planned = type(about.value) is dict and "policy" in about.value
     roles = "model policy funnel" if planned else "model funnel"
     documents, digests = bound_files(about, read, roles)
     made_for = {role: digests[role] for role in roles.split()[:-1]}
-    beside = "box" if planned else "box response cusum"
-    funnel = documents["funnel"].document(
-        "funnel", "settling tubes", "tube", optional=beside, made_for=made_for
-    )
-    model = read_model(documents["model"], funnel.get("box"))
+    table: dict[str, Reader] = {"settling": whole(0, MAX_SAMPLES), "tubes": itself, "box?": itself}
+    if not planned:
+        table |= {"response?": itself, "cusum?": itself}
+    funnel = documents["funnel"].document("funnel", table, "tube", made_for)
+    model = read_model(documents["model"], funnel["box"])
     policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None
-    tubes = [_read(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
-    settling = funnel["settling"].whole(0, MAX_SAMPLES)
+    tubes = [_read_tube(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
 
     given = proof.members("", "multipliers").get("multipliers")
-    trees: Sequence[Node | None] = [None] * len(tubes)
-    if given is not None:
-        trees = given.items(len(tubes), len(tubes))
+    trees = [None] * len(tubes) if given is None else given.items(len(tubes), len(tubes))
     modes = _modes(model, policy)
-    margin = min(_decide_tube(*pair, modes, policy) for pair in zip(tubes, trees, strict=True))
+    pairs = zip(tubes, trees, strict=True)
+    margin = min(_decide_tube(tube, tree, modes, policy) for tube, tree in pairs)
 
-    assumptions = [_start(model, policy, tubes, settling)]
-    if "box" in funnel:
+    assumptions = [_start(model, policy, tubes, funnel["settling"])]
+    if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
-    whose = " of its own observer" if _several(tubes) else ""
-    for label, tube in zip(_labels(tubes), tubes, strict=True):
-        assumptions.append(f"{label}innovation energy{whose}: {_energy(model, tube)}")
-    shown = (label + _shown(model, tube) for label, tube in zip(_labels(tubes), tubes, strict=True))
+    own = " of its own observer" if _several(tubes) else ""
+    shown = []
+    for i, tube in enumerate(tubes, 1):
+        label = f"({i}) " if len(tubes) > 1 else ""
+        shown.append(label + _shown(model, tube))
+        assumptions.append(f"{label}innovation energy{own}: {_energy(model, tube)}")
     plan = _around_plan(model, policy)
     said = text.say(SENTENCE, tubes="; ".join(shown), where=model.where, plan=plan)
-    return Decision(said, margin, tuple(assumptions), digests)
+    return text.Verdict(said, margin, tuple(assumptions), digests)
 
 
 def _decide_tube(
     tube: Tube, tree: Node | None, modes: Sequence[tuple[str, Model]], policy: Policy | None
 ) -> Fraction:
     """The part of the half-widths' squares that one tube leaves."""
-    refuse_if(
-        policy and tube.L != policy.L, "the observer of a tube is not the policy's: L is another"
-    )
-    refuse_if(
-        policy and tube.assumed.follows,
-        "a level that follows the commands is for a tube without a policy",
-    )
-    definite(tube.P, "P")
-    definite(tube.R, "R")
+    if policy:
+        refuse_if(tube["L"] != policy["L"], "the observer of a tube is not the policy's")
+        refuse_if(tube["follows"], "with a policy no level follows the commands")
+    definite(tube["P"], "P")
+    definite(tube["R"], "R")
     for mode, model in modes:
         positive(model, tree, _gaps(model, tube, mode))
 
-    margin = Fraction(1)
-    for tau, width, signal in zip(tube.tau, tube.half_widths, modes[0][1].y, strict=True):
-        used = (tube.assumed.level + tube.rho * tube.inlet) / (tau * width**2)
-        at_most(used, 1, f"{signal.name} can leave the stated half-width {text.above(width)}")
-        margin = min(margin, 1 - used)
-    return margin
+    used = tube["level"] + tube["rho"] * tube["inlet"]
+    shares: list[Fraction] = []
+    for tau, width, signal in zip(tube["tau"], tube["half_widths"], modes[0][1].y, strict=True):
+        shares.append(used / (tau * width**2))
+        at_most(shares[-1], 1, f"{signal.name} can leave the stated half-width {text.above(width)}")
+    return 1 - max(shares)
 
 
 def _modes(model: Model, policy: Policy | None) -> list[tuple[str, Model]]:
     """The increments with the plan's inputs played, and with the policy engaged if it acts."""
-    if policy is None or model.linear is None or not any(policy.K[0]):
+    if policy is None or model.linear is None or not any(policy["K"][0]):
         return [("", model)]
-    linear, (K,) = model.linear, policy.K
+    linear, (K,) = model.linear, policy["K"]
     F = [_minus(row, b, K) for row, b in zip(model.F, linear.B, strict=True)]
     engaged = replace(model, F=F, H=[_minus(row, linear.D, K) for row in model.H])
     return [(", the plan's inputs played,", model), (", the policy engaged,", engaged)]
@@ -161,99 +160,81 @@ def _gaps(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
     """The two inequalities of the module's docstring, without the multipliers."""
 
     def form(G: Rows, Q: Rows) -> Matrix:
-        return gap(model, tube.rho, tube.P, tube.R, G, Q)
+        return gap(model, tube["rho"], tube["P"], tube["R"], G, Q)
 
-    F, p = [row + gain for row, gain in zip(model.F, tube.L, strict=True)], len(model.H)
-    found = [(f"the decrease of V up to the innovation's energy{mode}", form(F, tube.P))]
-    for j, (row, tau) in enumerate(zip(model.H, tube.tau, strict=True)):
+    F, p = [row + gain for row, gain in zip(model.F, tube["L"], strict=True)], len(model.H)
+    found = [(f"the decrease of V up to the innovation's energy{mode}", form(F, tube["P"]))]
+    for j, (row, tau) in enumerate(zip(model.H, tube["tau"], strict=True)):
         what = f"the bound on {model.y[j].name} by V{mode}"
         found.append((what, form([row + unit(j, p)], [[tau]])))
     return found
 
 
-def _read(node: Node, model: Model) -> Tube:
+def _read_tube(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    parts = node.members("rho L P R tau half_widths level inlet assumption", "follows peak")
-    rho = parts["rho"].number()
-    tube = Tube(
-        rho,
-        parts["L"].array(n, p),
-        parts["P"].array(n, n),
-        parts["R"].array(p, p),
-        parts["tau"].array(p),
-        parts["half_widths"].array(p),
-        parts["inlet"].number(),
-        _read_assumption(parts, rho, len(model.u)),
+    table: dict[str, Reader] = {
+        "rho": (),
+        "L": (n, p),
+        "P": (n, n),
+        "R": (p, p),
+        "tau": (p,),
+        "half_widths": (p,),
+        "level": (),
+        "inlet": (),
+        "assumption": lambda entry: entry.read(ASSUMPTION),
+        "follows?": lambda entry: read_level(entry, len(model.u)),
+        "peak?": itself,
+    }
+    tube = node.read(table)
+    rho, energy = tube["rho"], tube["assumption"]["kind"] == "energy"
+    ends = tube["assumption"]["samples"] is not None
+    apart = not tube["follows"] or (rho < 1 and not tube["inlet"])
+    node.require(
+        {
+            "energy is for a number of samples, fading for ever": energy == ends,
+            "a level that follows the commands is for fading, without an inlet": apart,
+        }
     )
-    refuse_if(
-        min(tube.tau) <= 0 or min(tube.half_widths) <= 0,
-        "tau and half-widths should be positive",
+    rated = 0 < rho <= 1 and energy == (rho == 1)
+    node.require(
+        {
+            "rho should be 1 for energy, between 0 and 1 for fading": rated,
+            "tau and half_widths should be positive": min(tube["tau"] + tube["half_widths"]) > 0,
+            "inlet and level should be 0 or more": min(tube["inlet"], tube["level"]) >= 0,
+        },
         "not_below",
-    )
-    refuse_if(
-        min(tube.inlet, tube.assumed.level) < 0, "level and inlet should be 0 or more", "not_below"
-    )
-    refuse_if(
-        tube.assumed.follows is not None and (rho == 1 or tube.inlet),
-        "a level that follows the commands is for fading, without an inlet",
     )
     return tube
 
 
-def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assumption:
-    """The level of a tube's members, and what it bounds."""
-    given = parts["assumption"].members(f"kind {PROVENANCE}", "samples")
-    kind = given["kind"].text()
-    refuse_if(
-        kind not in ("fading", "energy"), f"assumption {kind!r} is unknown; known: fading, energy"
-    )
-    refuse_if(
-        (kind == "energy") != ("samples" in given),
-        "the assumption energy is for a number of samples, fading for ever",
-    )
-    refuse_if(
-        not 0 < rho <= 1 or (kind == "energy") != (rho == 1),
-        "rho should be 1 for the assumption energy, between 0 and 1 for fading",
-        "not_below",
-    )
-    samples = given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None
-    follows = read_level(parts["follows"], inputs) if "follows" in parts else None
-    return Assumption(parts["level"].number(), samples, follows)
-
-
 def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
-    n, p = model.states, len(model.H)
-    plan = node.document("policy", "period start u K L", "tube", made_for={"model": made_for})
-    refuse_if(plan["period"].number() != model.period, "the policy's period is not the model's")
-    plan["start"].array(n)
-    u = plan["u"].array(None, len(model.u))
-    refuse_if(
-        not 0 < len(u) <= MAX_PLAN, f"a plan should have 1 to {MAX_PLAN} samples", "too_large"
-    )
+    n, p, m = model.states, len(model.H), len(model.u)
+    table: dict[str, Reader] = {
+        "period": (),
+        "start": (n,),
+        "u": (None, m),
+        "K": (m, n),
+        "L": (n, p),
+    }
+    policy = node.document("policy", table, "tube", {"model": made_for})
+    node.require({"the period should be the model's": policy["period"] == model.period})
+    limit(len(policy["u"]), MAX_PLAN, "samples of a plan", least=1)
     if model.linear is None:
         raise Rejected("a plan is decided for a model of kind difference_equation")
     low, high = model.linear.input_range
-    refuse_if(
-        any(not low <= entry <= high for row in u for entry in row),
-        "a planned input is outside the model's input range",
-        "not_valid",
-    )
-    return Policy(plan["K"].array(len(model.u), n), plan["L"].array(n, p), len(u))
-
-
-def _labels(tubes: list[Tube]) -> list[str]:
-    return [f"({i}) " if len(tubes) > 1 else "" for i in range(1, len(tubes) + 1)]
+    inside = all(low <= entry <= high for row in policy["u"] for entry in row)
+    node.require({"u should be in the model's input range": inside}, "not_valid")
+    return policy
 
 
 def _shown(model: Model, tube: Tube) -> str:
     """The half-widths of one tube, and for how long they hold."""
-    root = " sqrt(g)" if tube.assumed.follows else ""
+    root, samples = " sqrt(g)" if tube["follows"] else "", tube["assumption"]["samples"]
     widths = " and ".join(
         f"{signal.name} within {signal.quantity(text.above(width))}{root}"
-        for signal, width in zip(model.y, tube.half_widths, strict=True)
+        for signal, width in zip(model.y, tube["half_widths"], strict=True)
     )
-    samples = tube.assumed.samples
-    return f"{widths} " + ("for ever" if samples is None else f"for {_samples(model, samples)}")
+    return f"{widths} for {_samples(model, samples) if samples else 'ever'}"
 
 
 def _samples(model: Model, count: int) -> str:
@@ -265,23 +246,23 @@ def _around_plan(model: Model, policy: Policy | None) -> str:
     if policy is None or model.linear is None:
         return ""
     how = PLAYED
-    if any(policy.K[0]):
+    if any(policy["K"][0]):
         clipped = text.PRINTED["exact_range"](model.linear.input_range)
         how = text.say(ENGAGED, clipped=model.u[0].quantity(clipped))
-    return text.say(PLAN, samples=_samples(model, policy.samples), how=how)
+    return text.say(PLAN, samples=_samples(model, len(policy["u"])), how=how)
 
 
 def _several(tubes: list[Tube]) -> bool:
     """Whether the tubes have observers of their own."""
-    return any(tube.L != tubes[0].L for tube in tubes)
+    return any(tube["L"] != tubes[0]["L"] for tube in tubes)
 
 
 def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int) -> str:
     whose, inlet = "the observer's state", ""
     if _several(tubes):
         whose = "one state with the observers, one for each tube"
-    if any(tube.inlet for tube in tubes):
-        inlet = text.say(INLET, inlets=" and ".join(text.below(tube.inlet) for tube in tubes))
+    if any(tube["inlet"] for tube in tubes):
+        inlet = text.say(INLET, inlets=" and ".join(text.below(tube["inlet"]) for tube in tubes))
     plan = ", as the plan does" if policy else ""
     span = settling * model.period
     return text.say(START, settling=settling, span=span, whose=whose, inlet=inlet, plan=plan)
@@ -295,15 +276,70 @@ def _inside(model: Model, box: Node) -> str:
 
 def _energy(model: Model, tube: Tube) -> str:
     """The bound on the innovations' energy; of one output with R = 1 in its unit, squared."""
-    unit_, energy, assumed = "", "e'Re", tube.assumed
-    if len(model.y) == 1 and tube.R == [[1]]:
+    unit_, energy, samples = "", "e'Re", tube["assumption"]["samples"]
+    if len(model.y) == 1 and tube["R"] == [[1]]:
         unit_, energy = f"({model.y[0].unit})^2" if model.y[0].unit else "", "e^2"
     elif len(model.y) == 1:
-        energy = f"{text.exact(tube.R[0][0])} e^2"
-    level = Signal("", unit_).quantity(text.below(assumed.level))
-    if assumed.samples is not None:
-        return f"sum of {energy} <= {level} over {assumed.samples} samples"
-    growth = f"after every sample, E+ = {text.exact(tube.rho)} E + {energy} from 0"
-    if assumed.follows is None:
+        energy = f"{text.exact(tube['R'][0][0])} e^2"
+    level = Signal("", unit_).quantity(text.below(tube["level"]))
+    if samples:
+        return f"sum of {energy} <= {level} over {samples} samples"
+    growth = f"after every sample, E+ = {text.exact(tube['rho'])} E + {energy} from 0"
+    if tube["follows"] is None:
         return f"E <= {level} {growth}"
-    return f"E <= {level} g {growth}, g = {formula(assumed.follows, model.u)}"
+    return f"E <= {level} g {growth}, g = {formula(tube['follows'], model.u)}"
+
+
+def read_level(node: Node, inputs: int) -> CommandLevel:
+    """{terms, weights} for a model with so many inputs."""
+    given = node.read({"terms": each(_term, 1, MAX_TERMS), "weights": (1, None)})
+    (weights,), terms = given["weights"], given["terms"]
+    known = all(0 <= i < inputs for term in terms for i in term["inputs"])
+    one = len(weights) == len(terms)
+    node.require({"one weight for each term": one, "inputs should be the model's": known})
+    fits = min(weights) >= 0 and sum(weights)
+    node.require({"weights should be 0 or more, some positive": fits}, "not_below")
+    return list(zip(weights, terms, strict=True))
+
+
+def _term(node: Node) -> Term:
+    given = node.read(TERM)
+    node.require({f"at most {MAX_FACTORS} inputs": len(given["inputs"]) <= MAX_FACTORS})
+    fits = given["scale"] > 0 and 0 <= given["fading"] < 1
+    node.require({"scale should be above 0, fading in [0, 1)": fits}, "not_below")
+    return given
+
+
+def formula(level: CommandLevel, u: tuple[Signal, ...]) -> str:
+    """g as a sum, every number exact."""
+    summands, past = [], ""
+    for weight, term in level:
+        if not weight:
+            continue
+        square = _square(term, u)
+        if term["fading"]:
+            square = f"(sum {text.exact(term['fading'])}^i {square or '1'})"
+            past = ", sums over the run's samples, each i samples ago"
+        summands.append(f"{text.exact(weight)} {square}".rstrip())
+    return " + ".join(summands) + past
+
+
+def _square(term: Term, u: tuple[Signal, ...]) -> str:
+    """v² in words; empty where it is 1."""
+    changes, centre, scale = term["of"] == "change", term["centre"], term["scale"]
+    if not (term["inputs"] or changes or centre) and scale == 1:
+        return ""
+    used = [u[i] for i in term["inputs"]]
+    product = " x ".join(_plain(signal.name, "()+*^/-") for signal in used) or "1"
+    unit = Signal("", " ".join(_plain(signal.unit, "()+*^") for signal in used if signal.unit))
+    if changes:
+        product = f"change of {product}"
+    elif centre:
+        product = f"({product} - {unit.quantity(text.exact(centre))})"
+    return f"({product} / {unit.quantity(text.exact(scale))})^2"
+
+
+def _plain(word: str, operators: str) -> str:
+    """A name or unit in a formula: quoted if it could be read as a part of it."""
+    own = not word.startswith('"') and (word in WORDS or any(sign in operators for sign in word))
+    return json.dumps(word) if own else word

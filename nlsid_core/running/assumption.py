@@ -49,21 +49,17 @@ def disturbance_of(
     model: MeasuredState,
     policy: SampledPolicy,
     run: Trajectory,
-    *,
-    S: FloatArray,
-    A: FloatArray,
-    form: str = "response",
-    rate: float = 1.0,
-    gain: float = 1.0,
+    meter: DisturbanceMeter,
 ) -> FloatArray:
-    """(N + 1,) what an assumption of this form bounds, along a run of the policy.
+    """(N + 1,) what the meter's assumption bounds, along a run of the policy.
 
     The run starts with sample 0 of the nominal; y is the measured state, u what was applied.
     Raises DataError if it is shorter than the policy.
     """
     if len(run) < len(policy):
         raise DataError(f"{run.name}: {len(run)} samples, the policy has {len(policy)} steps")
-    observer, meter = StateObserver(model, policy.L), DisturbanceMeter(S, A, form, rate, gain)
+    observer = StateObserver(model, policy.L)
+    meter.restart()
     sizes = np.zeros(len(policy) + 1)
     last = min(len(run) - 1, len(policy))
     for k in range(last + 1):

@@ -1,4 +1,4 @@
-"""Simulated robots to try the chain on: a model, a vector field, a pendulum and a satellite."""
+"""Simulated robots to try the chain on: a model and a vector field."""
 
 import math
 from collections.abc import Callable
@@ -42,68 +42,6 @@ class ModelPlant:
     def step(self, u: FloatArray, push: FloatArray, /) -> None:
         """One sample of the difference equation."""
         self._x = self._A @ self._x + self._B @ (u + push) + self._offset
-
-
-class Pendulum:
-    """q̈ = -(g/l) sin q - d q̇ + u/(m l²): measured [q (rad), q̇ (rad/s)], torque u (N m)."""
-
-    GRAVITY = 9.81  # m/s²
-
-    def __init__(
-        self, period: float, *, length: float = 0.5, mass: float = 1.0, damping: float = 0.5
-    ) -> None:
-        if min(period, length, mass) <= 0.0 or damping < 0.0:
-            raise DataError(f"pendulum: {period} s, {length} m, {mass} kg should be positive")
-        self.period = period
-        self._stiffness, self._damping = self.GRAVITY / length, damping
-        self._gain = 1.0 / (mass * length**2)
-        self._x: FloatArray = np.zeros(2)
-
-    def measure(self, _u: FloatArray, /) -> FloatArray:
-        """The angle and its rate."""
-        return self._x
-
-    def step(self, u: FloatArray, push: FloatArray, /) -> None:
-        """One period."""
-        torque = self._gain * float((u + push)[0])
-
-        def rate(x: FloatArray) -> FloatArray:
-            q, v = x
-            return np.array([v, torque - self._stiffness * math.sin(q) - self._damping * v])
-
-        self._x = integrated(rate, self._x, self.period)
-
-
-class Satellite:
-    """A rigid body: measured [σ; ω], modified Rodrigues parameters and body rates (rad/s).
-
-    σ̇ = ¼((1 - |σ|²)I + 2σσ' + 2[σ×])ω, Hω̇ = u - ω × Hω, H = diag(5, 3, 2) kg m², u in N m.
-    Source: thesis Chapter 7.
-    """
-
-    INERTIA = np.array([5.0, 3.0, 2.0])
-
-    def __init__(self, period: float) -> None:
-        if period <= 0.0:
-            raise DataError(f"satellite: period {period} s should be positive")
-        self.period = period
-        self._x: FloatArray = np.zeros(6)
-
-    def measure(self, _u: FloatArray, /) -> FloatArray:
-        """The attitude and the body rates (6,)."""
-        return self._x
-
-    def step(self, u: FloatArray, push: FloatArray, /) -> None:
-        """One period."""
-        H, torque = self.INERTIA, u + push
-
-        def rate(x: FloatArray) -> FloatArray:
-            sigma, omega = x[:3], x[3:]
-            turning = (1.0 - sigma @ sigma) * omega + 2.0 * sigma * (sigma @ omega)
-            turning = turning + 2.0 * np.cross(sigma, omega)
-            return np.concatenate([turning / 4.0, (torque - np.cross(omega, H * omega)) / H])
-
-        self._x = integrated(rate, self._x, self.period)
 
 
 class FieldPlant:

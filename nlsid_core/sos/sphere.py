@@ -16,6 +16,7 @@ Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Tod
 
 from dataclasses import dataclass, field, replace
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -37,8 +38,18 @@ REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; 
 REFINEMENTS = 1  # a second one was never seen to change the number of iterations
 CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
 CERTIFY_FROM = 1e-6  # of the spread; from here rounding may undo what an iteration gains
-WARM_GAP = 0.03  # of the spread: closer to the optimum an iterate is no good start for another g
+WARM_GAP = 0.03  # of the spread: what an iterate for another g has where that differs much
+WARM_ROOM = 3.0  # times what g differs by: closer to the optimum an iterate is no good start
 WARM_CLEARANCE = 0.5  # of the distance to the boundary that a warm start has to keep
+
+
+class Iterate(NamedTuple):
+    """X, y and m of the normalised problem on the way to its solution, and upper - m there."""
+
+    X: FloatArray
+    y: FloatArray
+    m: float
+    gap: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +57,9 @@ class SphereSolution:
     """m ≤ max m ≤ upper, and the multipliers that show it.
 
     m: shown up to rounding by X (k, k); upper: the dual bound, from y (N,). Both in the unit of g.
-    gap: (upper - m) relative to the spread of g. centred: an earlier iterate (X, y, m) of the
-    normalised problem, far enough from the boundary to start a similar problem from. tau: (L, n+1,
-    n+1) Gram matrices of multipliers chosen before, whose products are in g.
+    gap: (upper - m) relative to the spread of g. path: the iterates before it, from any of which a
+    similar problem can be started. tau: (L, n+1, n+1) Gram matrices of multipliers chosen before,
+    whose products are in g.
     """
 
     m: float
@@ -57,8 +68,39 @@ class SphereSolution:
     y: FloatArray
     gap: float
     iterations: int
-    centred: tuple[FloatArray, FloatArray, float]
+    path: tuple[Iterate, ...]
     tau: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _AtPoints:
+    """V (N, k): at the points v = root⁻¹·weight·monomials, which is orthonormal on the sphere.
+
+    whiten: (k, k), v by the monomials. unit: (k, k), v'(unit)v = 1 on the sphere, and unit_root its
+    inverse Cholesky factor. centre: (N,) weights of the mean on the sphere. normal: (N, N) Cholesky
+    factor of (VV')².
+    """
+
+    V: FloatArray
+    whiten: FloatArray
+    unit: FloatArray
+    unit_root: FloatArray
+    centre: FloatArray
+    normal: FloatArray
+
+    @classmethod
+    def of(cls, basis: IntArray, weight: FloatArray, points: FloatArray) -> "_AtPoints":
+        """Raises SolverError if the points do not determine every product."""
+        moments = _sphere_moments(basis) * np.outer(weight, weight)
+        values, vectors = np.linalg.eigh(moments)
+        whiten = (vectors / np.sqrt(values)) @ vectors.T * weight
+        V = monomial_values(basis, points) @ whiten.T
+        factor, info = lapack.dpotrf((V @ V.T) ** 2, lower=1, clean=1)
+        if info:
+            raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
+        root = np.linalg.inv(np.linalg.cholesky(moments))
+        centre = _sphere_means(factor, V)
+        return cls(V, whiten, moments, root, centre, np.asfortranarray(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +112,7 @@ class SphereProgram:
     takes all variables as nonlinear. constant: whether v has the 1, with which g may have terms of
     degree 1 in the others; where all are nonlinear, the sphere has it as the sum of squares.
     basis: (k, n) exponents of v, lower degree first; weight:
-    (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
+    (k,), Σ (weight·monomial)² = 1 on the sphere.
     points: (N, n) where g has to be evaluated.
 
     Raises DataError if there is no nonlinear variable, n < 2, or half is neither 2 nor 3.
@@ -80,19 +122,13 @@ class SphereProgram:
     nonlinear: tuple[int, ...] | None = None
     half: int = 2
     constant: bool = False
-    chosen: tuple[int, ...] = field(init=False)
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
     points: FloatArray = field(init=False)
-    _V: FloatArray = field(init=False)
-    _whiten: FloatArray = field(init=False)
-    _unit: FloatArray = field(init=False)
-    _unit_root: FloatArray = field(init=False)
-    _centre: FloatArray = field(init=False)
-    _normal: FloatArray = field(init=False)
+    _at: "_AtPoints" = field(init=False)
 
     def __post_init__(self) -> None:
-        chosen = tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
+        chosen = self.chosen
         if self.n < 2 or not chosen or not set(chosen) <= set(range(self.n)):
             raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n, n >= 2")
         if self.half not in (2, 3) or (self.half == 3 and len(chosen) < self.n):
@@ -107,31 +143,13 @@ class SphereProgram:
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis, self.half)
         weight = weights_of(basis, np.isin(np.arange(self.n), chosen))
-        moments = _sphere_moments(basis) * np.outer(weight, weight)
-        values, vectors = np.linalg.eigh(moments)
-        # v = root⁻¹·weight·monomials is orthonormal on the sphere, and v'(moments)v = 1 there.
-        whiten = (vectors / np.sqrt(values)) @ vectors.T * weight
-        V = monomial_values(basis, points) @ whiten.T
-        normal = (V @ V.T) ** 2
-        factor, info = lapack.dpotrf(normal, lower=1, clean=1)
-        if info:
-            raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
-        centre = _sphere_means(factor, V)
-        object.__setattr__(self, "chosen", chosen)
-        keep(
-            self,
-            {
-                "basis": basis,
-                "weight": weight,
-                "points": points,
-                "_V": V,
-                "_whiten": whiten,
-                "_unit": moments,
-                "_unit_root": np.linalg.inv(np.linalg.cholesky(moments)),
-                "_centre": centre,
-                "_normal": np.asfortranarray(factor),
-            },
-        )
+        keep(self, {"basis": basis, "weight": weight, "points": points})
+        object.__setattr__(self, "_at", _AtPoints.of(basis, weight, points))
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The nonlinear variables, or all."""
+        return tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
 
     def solve(
         self,
@@ -156,10 +174,8 @@ class SphereProgram:
             raise DataError("g is not finite on the sphere")
         middle, spread = float(values.mean()), float(np.ptp(values))
         if spread <= 1e-15 * abs(middle):
-            middle_point = (self._unit, self._centre, -1.0)
-            return SphereSolution(
-                middle, middle, 0 * self._unit, self._centre, 0.0, 0, middle_point
-            )
+            path = (Iterate(self._at.unit, self._at.centre, -1.0, 1.0),)
+            return SphereSolution(middle, middle, 0 * self._at.unit, self._at.centre, 0.0, 0, path)
         wanted = (enough - middle) / spread
         found = _solved(self, (values - middle) / spread, tolerance, start, wanted)
         return SphereSolution(
@@ -169,12 +185,12 @@ class SphereProgram:
             y=found.y,
             gap=found.gap,
             iterations=found.iterations,
-            centred=found.centred,
+            path=found.path,
         )
 
     def gram(self, solution: SphereSolution) -> FloatArray:
         """(k, k) Gram matrix of the solution in the monomials `basis`."""
-        Q = self._whiten.T @ solution.X @ self._whiten
+        Q = self._at.whiten.T @ solution.X @ self._at.whiten
         return np.asarray((Q + Q.T) / 2)
 
 
@@ -196,9 +212,9 @@ def _solved(
 
 def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> SphereSolution:
     """The same program as cone data, x = [m, svec X]."""
-    k = program._V.shape[1]
+    k = program._at.V.shape[1]
     i, j = conic.triangle(k)
-    rows = program._V[:, i] * program._V[:, j] * np.where(i == j, 1.0, conic.SQRT2)
+    rows = program._at.V[:, i] * program._at.V[:, j] * np.where(i == j, 1.0, conic.SQRT2)
     size = 1 + len(i)
     found = conic.solve(
         ConeProgram(
@@ -210,10 +226,10 @@ def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> S
         ),
         tolerance=tolerance,
     )
-    centred = _first_iterate(program, g, None)
+    first = Iterate(*_first_iterate(program, g, None), gap=1.0)
     y, m = found.z[: len(g)] / found.z[: len(g)].sum(), float(found.x[0])
     X, upper = conic.smat(found.x[1:]), float(g @ y)
-    return _certified(program, g, SphereSolution(m, upper, X, y, upper - m, 0, centred))
+    return _certified(program, g, SphereSolution(m, upper, X, y, upper - m, 0, (first,)))
 
 
 def _interior_point(
@@ -224,18 +240,18 @@ def _interior_point(
     enough: float,
 ) -> SphereSolution:
     """Predictor-corrector along the HKM direction, for g of spread 1."""
-    V, ones = program._V, np.ones(len(g))
+    V, ones = program._at.V, np.ones(len(g))
     k = V.shape[1]
     X, y, m = _first_iterate(program, g, start)
     best: SphereSolution | None = None
+    path: tuple[Iterate, ...] = ()
     M, work = (np.zeros((len(g), len(g)), order="F") for _ in range(2))  # lower triangles, reused
     for iteration in range(MAX_ITERATIONS + 1):
         Z = (V.T * y) @ V
         upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
-        if upper - m >= WARM_GAP or iteration == 0:
-            centred = (X, y, m)
+        path += (Iterate(X, y, m, upper - m),)
         if upper - m <= max(tolerance, CERTIFY_FROM, m - enough):
-            found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
+            found = SphereSolution(m, upper, X, y, upper - m, iteration, path)
             found = _certified(program, g, found)
             if best is not None and found.gap >= best.gap:
                 return best
@@ -286,15 +302,29 @@ def _first_iterate(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Strictly feasible X, y, m: the least-norm X that meets the equalities, shifted."""
     if start is None:
-        X, y, m = 0 * program._unit, program._centre, float(np.min(g))
+        X, y, m = 0 * program._at.unit, program._at.centre, float(np.min(g))
         clearance = 1.0
     else:
         # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.
-        X, y, m = start.centred
+        X, y, m = _nearby(program, g, start.path)
         clearance = WARM_CLEARANCE * _lowest(program, X)
     X = _corrected(program, X, g - m)
     shift = max(0.0, clearance - _lowest(program, X)) if start else clearance - _lowest(program, X)
-    return X + shift * program._unit, y, m - shift
+    return X + shift * program._at.unit, y, m - shift
+
+
+def _nearby(
+    program: SphereProgram, g: FloatArray, path: tuple[Iterate, ...]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Of another g's iterates the last that is as far from its boundary as the two g differ."""
+    V, (X, y, m, _) = program._at.V, path[0]
+    differ = float(np.ptp(g - m - np.einsum("ij,ij->i", V @ X, V)))
+    least = min(WARM_GAP, WARM_ROOM * differ)
+    for iterate in path:
+        if iterate.gap < least:
+            break
+        X, y, m, _ = iterate
+    return X, y, m
 
 
 def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> SphereSolution:
@@ -302,20 +332,20 @@ def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> 
     X = _corrected(program, found.X, g - found.m)
     shift = max(0.0, -_lowest(program, X)) * (1 + 1e-6)
     m = found.m - shift
-    return replace(found, X=X + shift * program._unit, m=m, gap=found.upper - m)
+    return replace(found, X=X + shift * program._at.unit, m=m, gap=found.upper - m)
 
 
 def _lowest(program: SphereProgram, X: FloatArray) -> float:
     """The largest t with X - t·unit ⪰ 0; v'(unit)v = 1 on the sphere, so m moves by t."""
-    relative = program._unit_root @ X @ program._unit_root.T
+    relative = program._at.unit_root @ X @ program._at.unit_root.T
     return float(np.linalg.eigvalsh(_symmetric(relative))[0])
 
 
 def _corrected(program: SphereProgram, X: FloatArray, values: FloatArray) -> FloatArray:
     """X plus the least-norm matrix that makes v_i'Xv_i equal the values."""
-    V = program._V
+    V = program._at.V
     residual = values - np.einsum("ij,ij->i", V @ X, V)
-    w = lapack.dpotrs(program._normal, residual, lower=1)[0]
+    w = lapack.dpotrs(program._at.normal, residual, lower=1)[0]
     X = X + (V.T * w) @ V
     return np.asarray((X + X.T) / 2)
 

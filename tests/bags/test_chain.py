@@ -27,6 +27,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
+from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
 from nlsid_core import files
 from nlsid_core.errors import DataError, NlsidError
@@ -304,8 +305,9 @@ def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
             times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
             target.write(message.topic, kind, message.data, **times)
     signals = {"responses": [SPEED], "excitations": ["/cmd_vel:twist.linear.x"]}
-    [whole] = read_dataset([trial("05")], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
-    [fewer] = read_dataset([bag], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
+    grid = Grid(0.025, 0.1)
+    [whole] = read_dataset([trial("05")], **signals, grid=grid)  # type: ignore[arg-type]
+    [fewer] = read_dataset([bag], **signals, grid=grid)  # type: ignore[arg-type]
     assert documents.load_model(chain / documents.MODEL).u.path.endswith("|hold(0.1 s)")
     replayed = replay(chain, bag)
     judged = len(replayed.judged) + len(documents.load_model(chain / documents.MODEL))
@@ -448,7 +450,7 @@ def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
     write_faulty_copy(trial("05"), tmp_path / "bag", str(path), FAULTS["scaled by 0.6"])
     signals = ["/odom:twist.twist.linear.x", "/odom:pose.pose.position.x"]
     before, after = (
-        read_dataset([bag], responses=signals, excitations=["/cmd_vel:twist.linear.x"], max_gap=0.1)
+        read_dataset([bag], responses=signals, excitations=["/cmd_vel:twist.linear.x"])
         for bag in (trial("05"), tmp_path / "bag")
     )
     original, copy = before.trajectories[0], after.trajectories[0]

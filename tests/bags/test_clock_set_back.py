@@ -12,7 +12,8 @@ from bags.recordings.bag import Bag
 from bags.recordings.batch import LogOrder
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import read_dataset
-from bags.signals.reader import LOG_TIME, read_signals
+from bags.signals.reader import read_signals
+from bags.signals.sampling import Grid
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.errors import BagError
@@ -51,12 +52,14 @@ def bag(tmp_path: Path) -> Path:
 
 def test_identification_refuses_it_as_it_does_header_stamps(bag: Path) -> None:
     with pytest.raises(BagError) as caught:
-        read_dataset([bag], responses=[SPEED], excitations=[COMMAND], max_gap=0.3, clock="log")
+        read_dataset(
+            [bag], responses=[SPEED], excitations=[COMMAND], grid=Grid(max_gap=0.3, clock="log")
+        )
     assert f"time goes back by 1.9 s at message {SET_AT}: log time 1700000003.900" in str(
         caught.value
     )
     assert "then 1700000002.000000000 s (1 such place)" in str(caught.value)
-    asked_for = read_signals(bag, [SPEED], clock=LOG_TIME, sort=True)[SPEED]
+    [asked_for] = read_signals(bag, [f"{SPEED}|clock(log)"], sort=True).values()
     assert (np.diff(asked_for.stamp_ns) >= 0).all()
 
 

@@ -54,15 +54,15 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
         with McapFile(path) as file:
             found = file.contents
             assert found.ending is None
-            header = wanted["Header"][0]
-            assert (found.profile, found.library) == (header["profile"], header["library"])
-            assert {(str(s.id), s.name, s.encoding, s.data) for s in found.schemas.values()} == {
+            assert {
+                (str(s.id), s.name, s.encoding, s.data) for s in found.declared.schemas.values()
+            } == {
                 (s["id"], s["name"], s["encoding"], data_of(s["data"]))
                 for s in wanted.get("Schema", [])
             }
             assert {
                 (str(c.id), str(c.schema_id), c.topic, c.message_encoding)
-                for c in found.channels.values()
+                for c in found.declared.channels.values()
             } == {
                 (c["id"], c["schema_id"], c["topic"], c["message_encoding"])
                 for c in wanted.get("Channel", [])
@@ -85,7 +85,7 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
                     str(batch.publish_ns[i]),
                     batch.data(i),
                 )
-                for _, batches in file.runs(list(found.channels))
+                for _, batches in file.runs(list(found.declared.channels))
                 for c, batch in batches
                 for i in range(len(batch))
             ]
@@ -150,8 +150,8 @@ def test_the_split_bag_of_five_files_is_one_with_stamps_2_ns_apart() -> None:
         with Bag(PY / storage / "wbag") as bag:
             assert len(bag.files) == 5
     info = bag_info(PY / "mcap" / "wbag")
-    assert {topic.interval for topic in info.topics} == {2e-9}
-    assert all(topic.rate == pytest.approx(5e8) for topic in info.topics)
+    assert {topic.times.interval for topic in info.topics} == {2e-9}
+    assert all(topic.times.rate == pytest.approx(5e8) for topic in info.topics)
 
 
 @needs_resources
@@ -198,15 +198,17 @@ def test_the_replayed_bag_of_a_real_vehicle() -> None:
     assert sum(topic.count for topic in info.values()) == 18558
     command = info["/coug2/controls/command"]
     assert (command.msgtype, command.count) == ("frost_interfaces/msg/UCommand", 1494)
-    assert command.rate == pytest.approx(12.5, abs=0.01)
+    assert command.times.rate == pytest.approx(12.5, abs=0.01)
     for name in ("/coug2/controls/command", "/coug2/depth_data", "/coug2/dvl/velocity"):
-        clock = info[name].clock
+        stamps = info[name].stamps
+        assert stamps is not None
+        clock = stamps.clock
         assert clock is not None
         assert clock.offset == pytest.approx(-514_944, abs=0.1)
         assert clock.drift == 0.0
         assert not clock.same_clock
-    assert info["/coug2/dvl/velocity"].longest == pytest.approx(0.77, abs=0.01)
-    assert info["/coug2/battery/data"].gaps > 1000  # it comes in bursts
+    assert info["/coug2/dvl/velocity"].times.longest == pytest.approx(0.77, abs=0.01)
+    assert info["/coug2/battery/data"].times.gaps > 1000  # it comes in bursts
     read = read_signals(
         COUGARS, ["/coug2/controls/command:fin[*]", "/coug2/depth_data:pose.pose.position.z"]
     )

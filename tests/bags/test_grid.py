@@ -10,6 +10,7 @@ import pytest
 
 from bags.signals.grid import read_dataset, seconds, to_trajectories
 from bags.signals.reader import Samples, bag_digest
+from bags.signals.sampling import Grid
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
@@ -22,20 +23,22 @@ def samples(stamps_ms: list[float], values: list[float], path: str = SPEED) -> S
     return Samples(path, stamp_ns, np.array(values, dtype=np.float64))
 
 
-def to_trajectory(y: list[Samples], u: list[Samples], **options: Any) -> Trajectory:
-    [trajectory] = to_trajectories(y, u, **options)
+def to_trajectory(
+    y: list[Samples], u: list[Samples], *, name: str = "trial", **rules: Any
+) -> Trajectory:
+    [trajectory] = to_trajectories(y, u, Grid(**rules), name=name)
     return trajectory
 
 
 def test_samples_on_the_grid_are_used_as_they_are() -> None:
     y = samples([0, 10, 20, 30], [1.0, 2.0, 3.0, 4.0])
     u = samples([0, 10, 20], [5.0, 6.0, 7.0], COMMAND)
-    trajectory = to_trajectory([y], [u], name="trial", group="step", digest="sha256:0")
+    trajectory = to_trajectory([y], [u], name="run")
     assert trajectory.t.tolist() == [0.0, 0.01, 0.02, 0.03]
     assert trajectory.y[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
     assert trajectory.u[:, 0].tolist() == [5.0, 6.0, 7.0, 7.0]
     assert (trajectory.y_names, trajectory.u_names) == ((SPEED,), (COMMAND,))
-    assert (trajectory.name, trajectory.group, trajectory.digest) == ("trial", "step", "sha256:0")
+    assert trajectory.name == "run"
 
 
 def test_jitter_within_the_tolerance_leaves_the_values_alone() -> None:
@@ -188,7 +191,8 @@ def test_commands_have_a_limit_of_their_own() -> None:
     assert trajectory.u[2:52, 0].tolist() == [2.0] * 50
     with pytest.raises(DataError, match=r"nothing for 0\.41 s; at most 0\.4 s is held"):
         to_trajectory([y], [replace(u, path=f"{COMMAND}|hold(0.4 s)")])
-    parts = to_trajectories([y], [replace(u, path=f"{COMMAND}|hold(0.4 s)")], split_gaps=True)
+    apart = Grid(split_gaps=True)
+    parts = to_trajectories([y], [replace(u, path=f"{COMMAND}|hold(0.4 s)")], apart)
     assert [len(part) for part in parts] == [43, 42]
 
 
@@ -222,6 +226,9 @@ def test_two_bags_of_one_name_are_refused(tmp_path: Path) -> None:
     bags = [speed_bag(tmp_path / day / "trial", [0.0, 0.1], [0.0, 0.1]) for day in ("mon", "tue")]
     with pytest.raises(DataError, match="two bags are called 'trial'"):
         read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
+    named = {bag.parent.name: bag for bag in bags}
+    data = read_dataset(named, responses=[SPEED], excitations=[COMMAND])
+    assert data.names == ("mon", "tue")
 
 
 def test_trials_of_different_sample_times_are_refused(tmp_path: Path) -> None:
@@ -233,7 +240,7 @@ def test_trials_of_different_sample_times_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"slow: sample time 0\.05 s, but fast has 0\.025 s"):
         read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
     with pytest.raises(DataError, match=r"slow: /odom.*is sampled every 0\.05 s"):
-        read_dataset(bags, responses=[SPEED], excitations=[COMMAND], period=0.025)
+        read_dataset(bags, responses=[SPEED], excitations=[COMMAND], grid=Grid(0.025))
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,8 @@ def run_all(file: Path, out: Path) -> None:
             kind, types = bag.types_on(topic)
             texts = [path for path, *_ in numeric_paths(kind, types)][:4]
             paths += [str(SignalPath.parse(f"{topic}:{text}")) for text in texts]
-    read_signals(file, paths, unfinished=True, sort=True)
+    with Bag(file, unfinished=True) as bag:
+        read_signals(bag, paths, sort=True)
     recover(file, out)
 
 
@@ -284,7 +285,7 @@ def _read(file: Path, _: Path) -> None:
         for topic in list(bag.topics)[:4]:
             kind, types = bag.types_on(topic)
             for entry in list(numeric_paths(kind, types))[:3]:
-                read_signals(file, [f"{topic}:{entry[0]}"], unfinished=True)
+                read_signals(bag, [f"{topic}:{entry[0]}"])
 
 
 def _recover(file: Path, out: Path) -> None:

@@ -17,6 +17,7 @@ from bags.chain.steps import Trials, read_trials, split
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.signals.grid import read_dataset, skipped_samples
+from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, NlsidError
@@ -343,13 +344,15 @@ def test_stretches_of_one_bag_are_not_repeats_of_each_other(tmp_path: Path) -> N
     speeds = np.random.default_rng(1).standard_normal(100)
     speeds[40:60] = np.nan
     bag = speed_bag(tmp_path / "run", speeds, np.arange(100.0), custom={"repeat_group": "a"})
-    data = read_dataset([bag], responses=[SPEED], excitations=[COMMAND], split_gaps=True)
+    data = read_dataset([bag], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True))
     assert [len(trial) for trial in data] == [40, 40]
     assert not data.repeats()
     assert skipped_samples(data) == 20
     nothing = speed_bag(tmp_path / "none", np.full(9, np.nan), np.arange(9.0))
     with pytest.raises(DataError, match=r"is nan in message 0 .*\(9 of 9"):
-        read_dataset([nothing], responses=[SPEED], excitations=[COMMAND], split_gaps=True)
+        read_dataset(
+            [nothing], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True)
+        )
 
 
 def test_bags_are_split_by_name_also_where_they_were_cut() -> None:

@@ -46,53 +46,53 @@ def sample(stamp_ns: int, y: float, u: float) -> Sample:
 
 def test_a_response_waits_for_an_excitation_at_or_after_its_stamp() -> None:
     pairing = sampler()
-    assert pairing.excite(5, (0.5,)) == []
-    assert pairing.respond(10, (1.0,)) == []
-    assert pairing.excite(9, (0.9,)) == [], "a command at 10 may still come"
-    assert pairing.excite(12, (1.2,)) == [sample(10, 1.0, 0.9)]
-    assert pairing.respond(12, (2.0,)) == [sample(12, 2.0, 1.2)]
-    assert pairing.respond(13, (3.0,)) == []
+    assert pairing.feed(1, 5, 0.5) == []
+    assert pairing.feed(0, 10, 1.0) == []
+    assert pairing.feed(1, 9, 0.9) == [], "a command at 10 may still come"
+    assert pairing.feed(1, 12, 1.2) == [sample(10, 1.0, 0.9)]
+    assert pairing.feed(0, 12, 2.0) == [sample(12, 2.0, 1.2)]
+    assert pairing.feed(0, 13, 3.0) == []
     assert pairing.flush(13) == [sample(13, 3.0, 1.2)]
 
 
 def test_responses_before_the_first_command_are_counted_and_no_samples() -> None:
     pairing = sampler()
-    pairing.respond(10, (1.0,))
-    pairing.respond(20, (2.0,))
+    pairing.feed(0, 10, 1.0)
+    pairing.feed(0, 20, 2.0)
     assert pairing.flush(19) == []
     assert pairing.incomplete == 1
-    assert pairing.excite(20, (0.5,)) == [sample(20, 2.0, 0.5)]
+    assert pairing.feed(1, 20, 0.5) == [sample(20, 2.0, 0.5)]
 
 
 def test_responses_that_wait_are_released_in_order_of_stamps() -> None:
     pairing = sampler()
-    pairing.excite(5, (0.0,))
+    pairing.feed(1, 5, 0.0)
     for stamp in (30, 10, 20):
-        assert pairing.respond(stamp, (float(stamp),)) == []
-    assert [s.stamp_ns for s in pairing.excite(30, (0.0,))] == [10, 20, 30]
+        assert pairing.feed(0, stamp, float(stamp)) == []
+    assert [s.stamp_ns for s in pairing.feed(1, 30, 0.0)] == [10, 20, 30]
     assert (pairing.late_responses, pairing.duplicate_responses) == (0, 0)
 
 
 def test_what_cannot_be_released_is_counted() -> None:
     pairing = sampler()
-    pairing.respond(10, (1.0,))
-    assert pairing.respond(10, (1.5,)) == []
+    pairing.feed(0, 10, 1.0)
+    assert pairing.feed(0, 10, 1.5) == []
     assert pairing.duplicate_responses == 1
-    assert pairing.excite(10, (0.0,)) == [sample(10, 1.0, 0.0)]
-    assert pairing.respond(10, (1.0,)) == []
+    assert pairing.feed(1, 10, 0.0) == [sample(10, 1.0, 0.0)]
+    assert pairing.feed(0, 10, 1.0) == []
     assert pairing.duplicate_responses == 2
-    assert pairing.respond(9, (0.9,)) == []
+    assert pairing.feed(0, 9, 0.9) == []
     assert pairing.late_responses == 1
 
 
 def test_an_excitation_that_comes_too_late_is_counted_and_still_holds_afterwards() -> None:
     pairing = sampler()
-    pairing.excite(0, (0.0,))
-    pairing.respond(10, (1.0,))
+    pairing.feed(1, 0, 0.0)
+    pairing.feed(0, 10, 1.0)
     assert pairing.flush(10) == [sample(10, 1.0, 0.0)]
-    assert pairing.excite(8, (0.8,)) == []
+    assert pairing.feed(1, 8, 0.8) == []
     assert pairing.late == 1
-    pairing.respond(11, (1.1,))
+    pairing.feed(0, 11, 1.1)
     assert pairing.flush(11) == [sample(11, 1.1, 0.8)]
 
 
@@ -106,10 +106,10 @@ def test_any_interleaving_of_ordered_topics_gives_the_zero_order_hold(data: st.D
     left_y, left_u = list(responses), list(enumerate(commands))
     for kind in order:
         if kind == "y":
-            samples += pairing.respond(stamp := left_y.pop(0), (float(stamp),))
+            samples += pairing.feed(0, stamp := left_y.pop(0), float(stamp))
         else:
             number, stamp = left_u.pop(0)
-            samples += pairing.excite(stamp, (float(number),))
+            samples += pairing.feed(1, stamp, float(number))
     samples = [sample for sample in [*samples, *pairing.flush()] if sample.missing != LOST]
     held = np.searchsorted(commands, responses, side="right") - 1
     complete = [stamp for stamp, k in zip(responses, held, strict=True) if k >= 0]

@@ -13,6 +13,7 @@ from bags.monitoring.replay import replay_messages
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import read_dataset
 from bags.signals.publishers import two_curves
+from bags.signals.sampling import Grid
 from bags.tools.fitness import Level, check_fitness
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTube, design_output_tube
@@ -115,9 +116,7 @@ def test_a_signal_of_two_publishers_is_unknown_bad_and_refused(
             [bag],
             responses=[SPEED],
             excitations=[COMMAND],
-            period=PERIOD,
-            max_gap=0.3,
-            resample="linear",
+            grid=Grid(PERIOD, max_gap=0.3, resample="linear"),
         )
 
 

@@ -49,7 +49,7 @@ def recorded(seed: int) -> Trajectory:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A problem without friction, and three bags with it."""
     folder = tmp_path_factory.mktemp("push")
-    motion = plan_motion(FIELD, start=[0, 0], end=[0.2, 0], seconds=1, m=1)
+    motion = plan_motion(FIELD, start=[0, 0], end=[0.2, 0], seconds=1, u=[0])
     end = motion.x.ends()[-1]
     problem = FunnelProblem(FIELD, motion, goal=Goal(end, np.diag([25.0, 11.0])))
     files.write_document(folder / "problem.json", problem.document())

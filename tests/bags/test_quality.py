@@ -22,10 +22,10 @@ from bags.recordings.quality import LATCHED, Profile, offered, offered_text, pro
 from bags.recordings.repair import repair
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Recent
-from bags.tools.edit import cut, merge, split
+from bags.tools.edit import convert, parts_every
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
-from tests.bag_messages import START_NS, speed_bag
+from tests.bag_messages import START_NS, converted, speed_bag
 from tests.conftest import SHARED
 
 RESOURCES = SHARED / "rosbag2_resources"
@@ -102,8 +102,7 @@ def assert_kept(bag: Path, count: int) -> None:
 
 
 COPIES: dict[str, Callable[[Path, Path], object]] = {
-    "cut": lambda bag, out: cut(bag, out),
-    "merge": lambda bag, out: merge([bag], out),
+    "convert": lambda bag, out: converted(out, bag),
     "recover": lambda bag, out: recover(bag, out),
 }
 
@@ -122,7 +121,8 @@ def test_copies_keep_what_was_offered_and_every_reader_finds_every_message(
 
 
 def test_parts_of_a_split_keep_what_was_offered(tmp_path: Path) -> None:
-    first, second = split(ros2_bag(tmp_path / "bag"), tmp_path / "part", every=10.0).parts
+    with Bag(ros2_bag(tmp_path / "bag")) as bag:
+        first, second = convert([bag], parts_every([bag], tmp_path / "part", 10.0)).parts
     assert_kept(first, 10)
     assert_kept(second, 10)
 
@@ -134,7 +134,7 @@ def test_a_merged_topic_has_the_offers_of_all_bags(tmp_path: Path) -> None:
     with BagWriter(other) as writer:
         writer.add_topic(CHATTER, STRING, offered=(Profile(), Profile(depth=3)))
         writer.add_topic(MAP, STRING)
-    merge([other, plain, bag], tmp_path / "all")
+    converted(tmp_path / "all", other, plain, bag)
     assert sum(counts_by_rosbags(tmp_path / "all").values()) == 24
     profiles = profiles_in(tmp_path / "all")
     assert [(entry["depth"], entry["reliability"]) for entry in profiles[CHATTER]] == [
@@ -162,7 +162,7 @@ def test_a_folder_says_what_its_file_does_not(tmp_path: Path) -> None:
         with Bag(bag) as found:
             durabilities = [profile.durability for profile in found.offered("/odom")]
         assert durabilities == (["transient_local"] if known else [])
-        cut(bag, tmp_path / "part")
+        converted(tmp_path / "part", bag)
         assert counts_by_rosbags(tmp_path / "part") == {"/cmd_vel": 2, "/odom": 2}
         shutil.rmtree(tmp_path / "part")
 
@@ -228,7 +228,7 @@ def test_what_rosbag2_recorded_itself_is_copied_with_its_offers(tmp_path: Path) 
             continue
         out = tmp_path / f"copy_{compared}"
         try:
-            count = cut(metadata.parent, out).messages
+            count = converted(out, metadata.parent).messages
         except BagError:  # some are made to be refused
             continue
         compared += 1
@@ -244,5 +244,5 @@ def test_what_rosbag2_recorded_itself_is_copied_with_its_offers(tmp_path: Path) 
 
 
 def test_a_cut_without_the_latched_topic_still_reads(tmp_path: Path) -> None:
-    cut(ros2_bag(tmp_path / "bag"), tmp_path / "late", start=5.0)
+    converted(tmp_path / "late", ros2_bag(tmp_path / "bag"), start=5.0)
     assert_kept(tmp_path / "late", 15)

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.signals.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_metadata, read_signals
+from bags.signals.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_origin, read_signals
 from bags.tools.recover import recover
 from tests.bag_messages import (
     COMMAND,
@@ -45,14 +45,14 @@ def test_a_single_mcap_file_reads_as_its_folder_does(tmp_path: Path) -> None:
     bag = speed_bag(tmp_path / "trial", [0.1, 0.2], [0.3, 0.4], custom={"repeat_group": "step"})
     file = bag / "trial.mcap"
     assert read_signals(file, [SPEED])[SPEED].values.tolist() == [0.1, 0.2]
-    assert bag_metadata(file) == bag_metadata(bag) == {"repeat_group": "step"}
+    assert bag_origin(file)["custom"] == bag_origin(bag)["custom"] == {"repeat_group": "step"}
     assert bag_digest(file) == bag_digest(bag)
     assert bag_digest(bag) == "sha256:" + hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def test_a_bag_without_metadata_of_its_own_has_none(tmp_path: Path) -> None:
     bag = speed_bag(tmp_path / "trial", [0.1], [0.3])
-    assert bag_metadata(bag) == bag_metadata(bag / "trial.mcap") == {}
+    assert bag_origin(bag)["custom"] == bag_origin(bag / "trial.mcap")["custom"] == {}
 
 
 def test_a_type_without_a_header_is_stamped_by_log_time_and_says_so(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from bags.recordings.bag import Bag
 from bags.recordings.mcap_file import McapFile
 from bags.recordings.writer import BagWriter
-from bags.signals.reader import bag_metadata, read_signals
+from bags.signals.reader import bag_origin, read_signals
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import ODOM, ODOM_TYPE, SPEED, START_NS, odometry, speed_bag
@@ -78,7 +78,7 @@ def test_a_damaged_chunk_is_named_and_the_others_come_back(chunked: Path, tmp_pa
     assert f"the chunk at byte {block.offset}" in recovery.lost[0]
     values = read_signals(tmp_path / "whole", [SPEED])[SPEED].values
     assert set(values) == set(range(120)) - set(range(40, 50))
-    assert bag_metadata(tmp_path / "whole") == {"robot": "car"}
+    assert bag_origin(tmp_path / "whole")["custom"] == {"robot": "car"}
 
 
 def test_records_after_a_damaged_length_are_found_again(chunked: Path, tmp_path: Path) -> None:

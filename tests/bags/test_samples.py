@@ -7,9 +7,8 @@ import pytest
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
-from bags.samples import convert_f1tenth, f1tenth
-from bags.signals.reader import bag_metadata, read_signals
-from nlsid_core.errors import BagError, DataError
+from bags.samples import f1tenth
+from bags.signals.reader import bag_origin, read_signals
 
 SOURCE = Path(__file__).parents[2].parent / "shared" / "data" / "f1tenth" / "F1tenthCar"
 needs_source = pytest.mark.skipif(not SOURCE.is_dir(), reason="needs ../shared/data")
@@ -62,7 +61,7 @@ def test_stamps_are_25_ms_apart_and_commands_come_before_the_motion() -> None:
 
 
 def test_repeats_excitation_source_and_licence_are_in_the_metadata() -> None:
-    metadata = {int(bag.name[-2:]): bag_metadata(bag) for bag in f1tenth()}
+    metadata = {int(bag.name[-2:]): bag_origin(bag)["custom"] for bag in f1tenth()}
     groups = {k: data["repeat_group"] for k, data in metadata.items() if "repeat_group" in data}
     expected: dict[int, str] = {}
     for first, speed in ((1, "0.4"), (12, "0.3"), (23, "0.35")):
@@ -79,40 +78,3 @@ def test_licence_and_citation_ship_beside_the_bags() -> None:
     folder = f1tenth()[0].parent
     assert "CC0 1.0 Universal" in (folder / "LICENSE").read_text()
     assert "Kochdumper" in (folder / "README.md").read_text()
-
-
-@needs_source
-def test_converting_again_gives_the_shipped_bag(tmp_path: Path) -> None:
-    shipped = f1tenth()[4]
-    with Bag(shipped) as source:
-        expected = list(source.messages())
-    for name in ("a", "b"):
-        convert_f1tenth.convert(
-            SOURCE / "measurement_5",
-            tmp_path / name / "trial_05",
-            start_ns=expected[0].log_time_ns,
-        )
-    files = [tmp_path / name / "trial_05" / "trial_05.mcap" for name in ("a", "b")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    with Bag(files[0].parent) as source:
-        assert list(source.messages()) == expected
-        assert source.custom == bag_metadata(shipped)
-
-
-def test_the_converter_refuses_what_is_not_a_trial_and_leaves_nothing(tmp_path: Path) -> None:
-    trial = tmp_path / "measurement_1"
-    trial.mkdir()
-    np.savetxt(trial / "input.csv", np.zeros((120, 2)), delimiter=",")
-    np.savetxt(trial / "trajectory.csv", np.zeros((120, 4)), delimiter=",")
-    np.savetxt(trial / "time.csv", np.arange(121) * 0.025)
-    with pytest.raises(DataError, match=r"should have shape \(121, 4\), has \(120, 4\)"):
-        convert_f1tenth.convert(trial, tmp_path / "out", start_ns=0)
-    np.savetxt(trial / "trajectory.csv", np.zeros((121, 4)), delimiter=",")
-    np.savetxt(trial / "time.csv", np.arange(121) * 0.02)
-    with pytest.raises(DataError, match="not every 25 ms"):
-        convert_f1tenth.convert(trial, tmp_path / "out", start_ns=0)
-    assert not (tmp_path / "out").exists()
-    np.savetxt(trial / "time.csv", np.arange(121) * 0.025)
-    convert_f1tenth.convert(trial, tmp_path / "out", start_ns=0)
-    with pytest.raises(BagError, match="exists already"):
-        convert_f1tenth.convert(trial, tmp_path / "out", start_ns=0)

@@ -19,7 +19,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.grid import filled_samples, read_dataset
 from bags.signals.reader import read_signals
-from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler, sampled_path
+from bags.signals.sampling import LOST, MOST_LOST, Grid, Sample, Sampler
 from bags.tools.listing import bag_signals
 from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.errors import BagError
@@ -249,11 +249,7 @@ def test_messages_give_the_same_bits_as_identification_reads(
         [bag],
         responses=[yaw, SPEED],
         excitations=[COMMAND],
-        period=0.05 if resample != "none" else 0.025,
-        max_gap=0.1,
-        clock=clock,
-        resample=resample,
-        hold=0.2,
+        grid=Grid(0.05 if resample != "none" else 0.025, 0.1, clock, resample, hold=0.2),
     )
     given = replayed(bag, Sampler(trial.y_paths, trial.u_paths, period=trial.period))
     assert trial.y.tolist() == [list(sample.y) for sample in given]
@@ -352,10 +348,7 @@ def test_signals_of_several_topics_and_products_give_the_same_bits(
         [bag],
         responses=[SPEED] if resample == "none" else [SPEED, f"{CMD}:twist.linear.x"],
         excitations=[f"{steering} * {SPEED}", f"{yaw}|derivative(0.1 s)"],
-        period=0.025 if resample == "none" else 0.05,
-        max_gap=0.1,
-        resample=resample,
-        hold=0.2,
+        grid=Grid(0.025 if resample == "none" else 0.05, 0.1, resample=resample, hold=0.2),
     )
     assert trial.u_paths[0] == (
         f"{steering}|hold(0.2 s) * {SPEED}|hold(0.2 s)"
@@ -383,14 +376,15 @@ def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_
     bag = drive(tmp_path / "drive", stamped=False)
     signals = {"responses": [SPEED], "excitations": [f"{CMD}:linear.x"]}
     with pytest.raises(BagError) as caught:
-        read_dataset([bag], **signals, max_gap=0.1)  # type: ignore[arg-type]
+        read_dataset([bag], **signals, grid=Grid(max_gap=0.1))  # type: ignore[arg-type]
     for part in (
         f"{SPEED} has a header stamp",
         f"{CMD}:linear.x has a log time",
         "set `clock: log`",
     ):
         assert part in str(caught.value)
-    [trial] = read_dataset([bag], **signals, period=0.025, max_gap=0.1, clock="log")  # type: ignore[arg-type]
+    grid = Grid(0.025, 0.1, "log")
+    [trial] = read_dataset([bag], **signals, grid=grid)  # type: ignore[arg-type]
     assert trial.u_paths == (f"{CMD}:linear.x|clock(log)|hold(0.1 s)",)
     assert len(trial) == 190
     with pytest.raises(BagError, match=r"/cmd_vel .* has no header stamp; .*`clock: log`"):
@@ -434,10 +428,7 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
         bags,
         responses=[f"{ODOM}:pose.pose.orientation.yaw|unwrap|derivative(0.1 s)"],
         excitations=[f"{CMD}:linear.x"],
-        period=0.025,
-        max_gap=0.04,
-        hold=0.15,
-        clock="log",
+        grid=Grid(0.025, 0.04, "log", hold=0.15),
     )
     fit = identify(data, Polynomial(4))
     model = replace(fit.model, training="sha256:0")
@@ -464,10 +455,9 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     whole, lossy = tmp_path / "whole", tmp_path / "lossy"
     speed_bag(whole, y, u)
     speed_bag(lossy, y, u, lost=lost)
+    grid = Grid(max_gap=0.08, resample="linear")
     data, gappy = (
-        read_dataset(
-            [bag], responses=[SPEED], excitations=[COMMAND], max_gap=0.08, resample="linear"
-        )
+        read_dataset([bag], responses=[SPEED], excitations=[COMMAND], grid=grid)
         for bag in (whole, lossy)
     )
     assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
@@ -586,9 +576,9 @@ def test_a_command_that_is_unknown_is_not_mended_by_another_of_its_stamp() -> No
 
 
 def test_a_configuration_is_written_into_the_paths_unless_they_say_otherwise() -> None:
-    options: dict[str, Any] = {"clock": "log", "resample": "last", "hold": 0.5, "max_gap": 0.1}
-    assert sampled_path(Y, **options, response=True) == f"{Y}|clock(log)|hold(0.1 s)"
-    assert sampled_path(U, **options, response=False) == f"{U}|clock(log)|hold(0.5 s)"
+    grid = Grid(clock="log", resample="last", hold=0.5, max_gap=0.1)
+    assert grid.path(Y, response=True) == f"{Y}|clock(log)|hold(0.1 s)"
+    assert grid.path(U, response=False) == f"{U}|clock(log)|hold(0.5 s)"
     own = f"{Y}|linear(0.3 s)|clock(header)"
-    assert sampled_path(own, **options, response=True) == own
-    assert sampled_path(f"{Y}|to( deg )", response=True) == f"{Y}|to( deg )"
+    assert grid.path(own, response=True) == own
+    assert Grid().path(f"{Y}|to( deg )", response=True) == f"{Y}|to( deg )"

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
+from bags.recordings.cdr import Step
 from bags.recordings.message_types import header_stamp_ns, is_stamped, standard_types, types_in_bag
-from bags.signals.signal import SignalPath, Step
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError
 from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, START_NS, joints, odometry
 

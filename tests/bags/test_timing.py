@@ -9,8 +9,9 @@ import bags
 from bags.signals.delays import delay
 from bags.signals.reader import Samples, read_signals
 from bags.signals.repeats import find_period, same_excitation
-from bags.signals.resample import Method, resample
-from bags.signals.timing import clock_relation, without_duplicates
+from bags.signals.resample import resample
+from bags.signals.sampling import Grid
+from bags.signals.timing import clock_relation
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 
@@ -41,11 +42,6 @@ def test_simulated_time_is_told_by_its_pace() -> None:
     found = clock_relation(np.rint(0.4e9 * t).astype(np.int64), stamps(t))
     assert found.drift == pytest.approx(-0.6)
     assert str(found) == "stamps run at 0.4 times the pace of log time: simulated time?"
-
-
-def test_the_first_of_each_stamp_is_kept() -> None:
-    assert without_duplicates(np.array([3, 3, 4, 4, 4, 9])).tolist() == [0, 2, 5]
-    assert without_duplicates(np.zeros(0, dtype=np.int64)).tolist() == []
 
 
 @pytest.mark.parametrize("true", [0.0, 0.13, 0.42])
@@ -81,28 +77,28 @@ def test_repeats_are_told_from_steps_of_another_height() -> None:
     assert not same_excitation(np.ones(100), np.ones(100))
 
 
-@pytest.mark.parametrize("method", ["hold", "linear", "cubic"])
-def test_resampling_is_off_by_no_more_than_its_bound(method: Method) -> None:
+@pytest.mark.parametrize("hold", [False, True])
+def test_resampling_is_off_by_no_more_than_its_bound(hold: bool) -> None:
     rng = np.random.default_rng(9)
     t = np.cumsum(rng.uniform(0.005, 0.015, 400))
     samples = Samples("/x:y", stamps(t), np.sin(5 * t) + 0.3 * np.cos(11 * t))
     at = np.linspace(t[3], t[-4], 1000)
-    found = resample(samples, stamps(at), method=method, max_gap=0.02)
+    found = resample(samples, stamps(at), hold=hold, max_gap=0.02)
     error = np.abs(found.values - np.sin(5 * at) - 0.3 * np.cos(11 * at)).max()
     assert error <= 1.05 * found.error
     assert found.error < 30 * error
-    on_samples = resample(samples, samples.stamp_ns, method=method, max_gap=0.02)
+    on_samples = resample(samples, samples.stamp_ns, hold=hold, max_gap=0.02)
     np.testing.assert_allclose(on_samples.values, samples.values, atol=1e-12)
 
 
 def test_resampling_refuses_gaps_and_times_outside() -> None:
     samples = Samples("/x:y", stamps(np.array([0.0, 0.1, 0.9, 1.0])), np.arange(4.0))
     with pytest.raises(DataError, match=r"a gap of 0\.8 s after 1700000000\.100000000 s"):
-        resample(samples, stamps(np.array([0.5])), method="linear", max_gap=0.2)
+        resample(samples, stamps(np.array([0.5])), hold=False, max_gap=0.2)
     with pytest.raises(DataError, match="nothing recorded at 1700000002"):
-        resample(samples, stamps(np.array([2.0])), method="linear", max_gap=0.2)
+        resample(samples, stamps(np.array([2.0])), hold=False, max_gap=0.2)
     with pytest.raises(DataError, match="a gap of 1 s"):
-        resample(samples, stamps(np.array([2.0])), method="hold", max_gap=0.2)
+        resample(samples, stamps(np.array([2.0])), hold=True, max_gap=0.2)
 
 
 def test_stamps_that_go_back_are_sorted_on_request(tmp_path: Path) -> None:
@@ -114,15 +110,6 @@ def test_stamps_that_go_back_are_sorted_on_request(tmp_path: Path) -> None:
     assert read_signals(bag, [SPEED], sort=True)[SPEED].values.tolist() == [0, 1, 2, 3]
 
 
-def test_of_messages_with_one_stamp_the_first_is_kept_on_request(tmp_path: Path) -> None:
-    times = [START_NS + k * PERIOD_NS for k in (0, 1, 1, 2)]
-    bag = speed_bag(tmp_path / "x", [0.0, 1.0, 9.0, 2.0], [0.0] * 4, stamps_ns=times)
-    with pytest.raises(DataError, match="have the same stamp"):
-        bags.read([bag], responses=[SPEED], excitations=[COMMAND])
-    found = bags.read([bag], responses=[SPEED], excitations=[COMMAND], drop_duplicates=True)
-    assert found.trajectories[0].y[:, 0].tolist() == [0.0, 1.0, 2.0]
-
-
 def test_a_bag_with_a_gap_gives_a_trajectory_per_stretch(tmp_path: Path) -> None:
     ticks = [*range(30), *range(50, 90)]
     times = [START_NS + k * PERIOD_NS for k in ticks]
@@ -131,7 +118,7 @@ def test_a_bag_with_a_gap_gives_a_trajectory_per_stretch(tmp_path: Path) -> None
     options = {"responses": [SPEED], "excitations": [COMMAND]}
     with pytest.raises(DataError, match="a gap of"):
         bags.read([bag], **options)  # type: ignore[arg-type]
-    found = bags.read([bag], split_gaps=True, **options)  # type: ignore[arg-type]
+    found = bags.read([bag], grid=Grid(split_gaps=True), **options)  # type: ignore[arg-type]
     assert [(trial.name, len(trial)) for trial in found] == [("x.1", 30), ("x.2", 40)]
     np.testing.assert_array_equal(found.trajectories[1].y[:, 0], np.arange(50.0, 90.0))
     np.testing.assert_array_equal(found.trajectories[1].u[:, 0], np.arange(50.0, 90.0))

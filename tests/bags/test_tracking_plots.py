@@ -16,7 +16,7 @@ from bags.pictures import plots, tracking_plots
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification.states import free_run_error
-from nlsid_core.running.assumption import disturbance_of
+from nlsid_core.running.assumption import disturbance_of, meter_of
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Reading, Status
@@ -124,7 +124,7 @@ def test_the_bound_is_drawn_above_the_commissioning_runs_disturbance() -> None:
         design.model, design.policy, design.funnel, Dataset((trial,))
     )
     axes = figure.axes[4]
-    sizes = disturbance_of(design.model, design.policy, trial, S=design.funnel.S, A=design.funnel.A)
+    sizes = disturbance_of(design.model, design.policy, trial, meter_of(design.funnel))
     np.testing.assert_array_equal(line(axes, "commissioning runs")[:, 1], sizes)
     a = design.funnel.assumption
     assert set(line(axes, f"assumed bound, {a.safety_factor:g} times")[:, 1]) == {a.bound}

@@ -11,7 +11,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.plants import ModelPlant, Pendulum, Satellite
+from nlsid_core.running.plants import ModelPlant
 from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD
 
@@ -132,45 +132,3 @@ def test_each_input_has_limits_and_a_rest_of_its_own() -> None:
 def test_limits_that_make_no_sense_are_refused(lowest: float, highest: float, rate: float) -> None:
     with pytest.raises(DataError, match="limits"):
         Limits(lowest=lowest, highest=highest, stop_rate=rate)
-
-
-def test_a_small_swing_of_the_pendulum_has_its_textbook_period() -> None:
-    pendulum = Pendulum(0.01, length=0.5, damping=0.0)
-    pendulum.step(np.zeros(1), np.array([0.05]))
-    angles = []
-    for _ in range(1000):
-        angles.append(pendulum.measure(np.zeros(1))[0])
-        pendulum.step(np.zeros(1), np.zeros(1))
-    signs = np.sign(angles)
-    crossings = np.flatnonzero((signs[:-1] < 0) & (signs[1:] >= 0))
-    assert np.diff(crossings).mean() * 0.01 == pytest.approx(
-        2 * math.pi * math.sqrt(0.5 / 9.81), rel=2e-3
-    )
-
-
-@pytest.mark.slow
-def test_a_free_satellite_keeps_its_angular_momentum_and_energy() -> None:
-    satellite = Satellite(0.01)
-    satellite.step(np.array([20.0, 30.0, -10.0]), np.zeros(3))
-
-    def momentum_and_energy() -> list[float]:
-        sigma, omega = np.split(satellite.measure(np.zeros(3)), 2)
-        H, cross = Satellite.INERTIA, np.cross(np.eye(3), sigma)
-        rotation = (
-            np.eye(3)
-            + (8 * cross @ cross - 4 * (1 - sigma @ sigma) * cross) / (1 + sigma @ sigma) ** 2
-        )  # from inertial to body axes; M. Shuster, A Survey of Attitude Representations
-        return [*(rotation.T @ (H * omega)), omega @ (H * omega)]
-
-    before = momentum_and_energy()
-    for _ in range(500):
-        satellite.step(np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(momentum_and_energy(), before, rtol=1e-9)
-
-
-def test_a_push_adds_to_the_satellites_torque() -> None:
-    pushed, driven = Satellite(0.01), Satellite(0.01)
-    pushed.step(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-    driven.step(np.array([1.0, 0.0, 0.0]), np.zeros(3))
-    np.testing.assert_array_equal(pushed.measure(np.zeros(3)), driven.measure(np.zeros(3)))
-    assert pushed.measure(np.zeros(3))[3] > 0

@@ -19,8 +19,9 @@ from nlsid_core.design import (
     integrate_nominal,
 )
 from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
+from nlsid_core.errors import CertificateMismatch, DataError, Infeasible
 from nlsid_core.proofs import check
+from tests.core.kernel import refusals
 from tests.marks import slow_among
 
 Files = dict[str, Any]
@@ -161,14 +162,14 @@ def stages_without_end(files: Files) -> None:
 
 
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
-    (swapped_order, "stage1 ends at 2 s, the next starts at 0 s"),
-    (start_shrunk, "that stage1 ends inside the next at 1 s"),
-    (other_funnel, "stage2: the funnel was made for another|around another nominal"),
-    (stage_missing, "unknown member 'stage3'"),
-    (stage_left_out, "stage1 ends at 1 s, the next starts at 2 s"),
-    (multiplier_raised, "that stage1 ends inside the next at 1 s"),
-    (proof_exchanged, "stage1 ends at 1 s, the next starts at 0 s"),
-    (stages_without_end, "a composition has 2 to 100 stages, not 100001"),
+    (swapped_order, "not_covered"),
+    (start_shrunk, "not_definite"),
+    (other_funnel, "mismatch"),
+    (stage_missing, "malformed"),
+    (stage_left_out, "not_covered"),
+    (multiplier_raised, "not_definite"),
+    (proof_exchanged, "not_covered"),
+    (stages_without_end, "too_large"),
 ]
 
 
@@ -195,7 +196,7 @@ def test_a_forged_composition_is_refused_for_what_it_is(
 ) -> None:
     forged = json.loads(json.dumps(files))
     forge(forged)
-    with pytest.raises(CertificateRejected, match=reason):
+    with refusals.refused(reason):
         check(rebound(forged, tmp_path))
 
 
@@ -208,7 +209,7 @@ def test_a_stage_goal_may_not_be_shrunk(files: Files, tmp_path: Path) -> None:
     forged = json.loads(json.dumps(files))
     goal = forged["stage3.proof.json"]["claim"]["goal"]
     goal["P"] = (1.02 * np.array(goal["P"])).tolist()
-    with pytest.raises(CertificateRejected, match="stage3: that the funnel ends in the goal"):
+    with refusals.refused("not_definite"):
         check(rebound(forged, tmp_path))
 
 

@@ -77,7 +77,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
         "pieces": [],
         "goal_multiplier": 0.995,
     }
-    claimed = Verdict("continuous_funnel", "all of it", Fraction(1))
+    claimed = Verdict("all of it", Fraction(1), (), {})
     goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
     claim = {"kind": "continuous_funnel", "goal": goal}
     forged = Design(*parts, claim, proof, claimed, None)
@@ -189,11 +189,8 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     for trust in (0.05, 0.2):
         D = improve(
             forms.samples,
-            forms.pairs,
-            8,
             proof_basis(setting.steps.program),
             weights=np.ones(8),
-            margins=forms.margins,
             trust=trust,
         )
         largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()

@@ -10,7 +10,7 @@ from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
-from nlsid_core.kernel.positivity import expanded, positive, read_witness
+from nlsid_core.kernel.positivity import WITNESS, expanded, positive, read_squares
 from nlsid_core.polynomial import constant, monomials, variables
 from nlsid_core.sos import Program, SumOfSquares, solve
 from nlsid_core.sos.program import Identity
@@ -75,14 +75,14 @@ def prove(level: float, spurious: float, identity: Identity) -> None:
     sigma[np.ix_(at, at)] = found.Q
     stated, _ = closed_loop.stated_multiplier(inner, sigma, scale, ring)
     stated["basis"] = inner.tolist()
-    multiplier = expanded(read_witness(Node(stated, "multiplier"), ring), ring)
+    multiplier = expanded(read_squares(Node(stated, "multiplier").members(WITNESS), ring), ring)
     nu = {tuple(e): Fraction(float(c)) for e, c in identity.equality_multipliers[0].terms()}
     basis, w = identity.gram.basis, ring.variables[1]
     c = Fraction(level) - w * w - closed_loop.polynomial(nu, ring) * step.h[0]
     c += multiplier * (step.size - 1)
     squares = closed_loop.stated_squares(c, basis, identity.gram.Q, scale, ring)
     squares["basis"] = basis.tolist()
-    positive(c, read_witness(Node(squares, "reach"), ring), ring, "reach")
+    positive(c, read_squares(Node(squares, "reach").members(WITNESS), ring), ring, "reach")
 
 
 def test_a_bound_that_lets_the_spurious_roots_in_does_not_prove_the_small_reach() -> None:

@@ -51,7 +51,7 @@ def test_a_friction_that_equations_leave_out_is_measured_and_the_funnel_holds_wi
         a, b = rate(x, u)
         return [a + w[0], b + w[1]]
 
-    motion = plan_motion(rate, start=[0, 0], end=[0.2, 0], seconds=1, m=1, u=[0.0])
+    motion = plan_motion(rate, start=[0, 0], end=[0.2, 0], seconds=1, u=[0.0])
     problem = ContinuousTracking(pushed, motion, goal=[0.2, 0.3], uncertain=push.box)
     found = design(problem)
     np.testing.assert_array_equal(found.model.uncertain[:2], push.box)

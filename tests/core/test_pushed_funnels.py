@@ -24,7 +24,7 @@ def lane_change() -> Nominal:
     def still(x: Any, u: Any) -> Any:
         return drifting(x, u, np.zeros(1))
 
-    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, m=1)
+    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, u=[0])
 
 
 def level(found: FunnelDesign, t: float, X: FloatArray) -> FloatArray:
@@ -108,7 +108,7 @@ def test_factors_are_as_near_as_the_scale_that_they_are_written_in_needs() -> No
         start=[0, 0],
         end=[1, 0],
         seconds=4,
-        m=1,
+        u=[0],
         limits=limits,
     )
     problem = ContinuousTracking(

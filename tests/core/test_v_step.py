@@ -62,11 +62,11 @@ def test_what_bounds_pushes_is_taken_to_first_order_in_d() -> None:
 
 
 def test_bounds_are_kept() -> None:
-    samples, pairs = contracting(4)
+    samples = contracting(4)
     rows = np.array([[0.9, 0.0], [0.5, 0.7]])
-    options: dict[str, Any] = {"weights": np.ones(3), "margins": [0.05] * 6, "trust": 0.4}
-    free = improve(samples, pairs, 3, powers(2, 2), **options)
-    kept = improve(samples, pairs, 3, powers(2, 2), bounds=[rows, rows[:1], rows[:0]], **options)
+    options: dict[str, Any] = {"weights": np.ones(3), "trust": 0.4}
+    free = improve(samples, powers(2, 2), **options)
+    kept = improve(samples, powers(2, 2), bounds=[rows, rows[:1], rows[:0]], **options)
     assert np.einsum("ri,ij,rj->r", rows, np.linalg.inv(np.eye(2) + free[0]), rows).max() > 1.01
     for k, count in enumerate((2, 1, 0)):
         reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(np.eye(2) + kept[k]), rows)
@@ -74,7 +74,7 @@ def test_bounds_are_kept() -> None:
     np.testing.assert_allclose(kept[2], free[2], atol=0.1)
 
 
-def contracting(knots: int) -> tuple[list[Affine], list[tuple[int, int]]]:
+def contracting(knots: int, margin: float = 0.05) -> list[Affine]:
     """x₁' = -x₁ + 0.3x₂ - 0.2x₁³, x₂' = -0.3x₁ - 2x₂ - 0.3x₂³: c(D = 0) is a sum of squares."""
     y, mu = np.zeros((2, len(powers(2, 3)))), np.zeros(len(powers(2, 2)))
     terms = {
@@ -88,24 +88,24 @@ def contracting(knots: int) -> tuple[list[Affine], list[tuple[int, int]]]:
     for (row, *power), value in terms.items():
         y[row, np.flatnonzero((powers(2, 3) == power).all(axis=1))] = value
     mu[0] = 0.8
-    samples, pairs = [], []
+    samples = []
     for k in range(knots - 1):
         for sign, (own, other) in ((1, (k, k + 1)), (-1, (k + 1, k))):
             form = affine_form(Sample(own, other, 4.0, sign, y, np.eye(2)))
+            form.constant[0] -= margin
             samples.append(form.with_multiplier(mu, 2))
-            pairs.append((own, other))
-    return samples, pairs
+    return samples
 
 
-def by_cvxpy(samples: list[Affine], pairs: list[tuple[int, int]], free: int, **of: Any) -> Any:
+def by_cvxpy(samples: list[Affine], free: int, **of: Any) -> Any:
     """The same program in Gram matrices of all monomials up to degree 2; the optimal value."""
     basis, rows = powers(2, 2), powers(2, 4)
     D = [cp.Variable((2, 2), symmetric=True) for _ in range(free)]
     limits = [sign * d << of["trust"] * np.eye(2) for d in D for sign in (1, -1)]
-    for form, (own, other), margin in zip(samples, pairs, of["margins"], strict=True):
+    for form in samples:
         Q = cp.Variable((6, 6), PSD=True)
-        c: Any = form.constant - margin * (rows.sum(axis=1) == 0)
-        for knot, part in ((own, form.own), (other, form.others)):
+        c: Any = form.constant
+        for knot, part in zip(form.knots, (form.own, form.others), strict=True):
             if knot < free:
                 c = c + part @ cp.hstack([D[knot][0, 0], D[knot][0, 1], D[knot][1, 1]])
         for at, row in enumerate(rows):
@@ -118,20 +118,15 @@ def by_cvxpy(samples: list[Affine], pairs: list[tuple[int, int]], free: int, **o
 
 
 def test_the_optimum_is_that_of_a_general_solver() -> None:
-    samples, pairs = contracting(4)
-    options: dict[str, Any] = {
-        "weights": np.array([1.0, 0.5, 0.8]),
-        "margins": [0.05] * len(samples),
-        "trust": 0.4,
-    }
-    D = improve(samples, pairs, 3, powers(2, 2), **options)
-    best = by_cvxpy(samples, pairs, 3, **options)
+    samples = contracting(4)
+    options: dict[str, Any] = {"weights": np.array([1.0, 0.5, 0.8]), "trust": 0.4}
+    D = improve(samples, powers(2, 2), **options)
+    best = by_cvxpy(samples, 3, **options)
     assert np.abs(np.linalg.eigvalsh(D)).max() <= 0.4
     reached = options["weights"] @ np.trace(D, axis1=1, axis2=2)
     assert best - 1e-4 <= reached <= best + 0.02 * options["weights"].sum()
 
 
 def test_margins_that_nothing_keeps_are_said() -> None:
-    samples, pairs = contracting(4)
     with pytest.raises(SolverError, match="keeps the margins"):
-        improve(samples, pairs, 3, powers(2, 2), weights=np.ones(3), margins=[50.0] * 6, trust=0.4)
+        improve(contracting(4, 50.0), powers(2, 2), weights=np.ones(3), trust=0.4)

@@ -1,7 +1,9 @@
 """What every test over DDS needs, and what most do: a ROS domain, and the F1TENTH chain's files."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,3 +30,26 @@ def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return out / documents.FUNNEL
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    """Ends what a test started."""
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture
+def bench(stack: ExitStack) -> Any:
+    """A node beside those that a test starts."""
+    from tests.ros.processes import Bench  # where ROS is there
+
+    return Bench(stack)
+
+
+@pytest.fixture
+def robot(stack: ExitStack, funnel: Path) -> Any:
+    """A car that the test drives, and its funnel, latched."""
+    from tests.ros.robot import Robot
+
+    return Robot(stack, funnel.parent)

@@ -1,16 +1,18 @@
 """Nodes as real processes, over real DDS."""
 
+import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -18,12 +20,16 @@ from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from nlsid_ros import qos
+
 SpinUntil = Callable[[Callable[[], bool]], None]
 ROOT = Path(__file__).parents[2]
-STARTED = 60.0  # s: patience with a process or with discovery on a busy machine
+LOAD = os.getloadavg()[0] / (os.cpu_count() or 1)  # processes that want each processor
+STARTED = 60.0 * min(max(1.0, LOAD), 4.0)  # s: patience with a process or with discovery
 
 ros_test = [
     pytest.mark.ros,
@@ -148,3 +154,71 @@ def set_parameter(
     answer = call(node, spin_until, f"/{name}/set_parameters", SetParameters, parameters=change)
     [result] = answer.results
     return "" if result.successful else str(result.reason)
+
+
+class Bench:
+    """A node of this process, the nodes that are started beside it, and what they say.
+
+    said: of each node the texts and values of its diagnostics. levels: of the newest.
+    """
+
+    def __init__(self, stack: ExitStack, name: str = "test_robot") -> None:
+        self.stack = stack
+        self.node, self._spin_until = stack.enter_context(node_here(name))
+        self._started: list[subprocess.Popen[str]] = []
+        self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
+        self.levels: dict[str, bytes] = {}
+        self.listen(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.said.setdefault(status.name, []).append((status.message, values))
+            self.levels[status.name] = status.level
+
+    def start(self, name: str, **parameters: object) -> subprocess.Popen[str]:
+        """Start a node of nlsid."""
+        self._started.append(self.stack.enter_context(process(f"nlsid_ros.{name}", **parameters)))
+        return self._started[-1]
+
+    def spin_until(self, condition: Callable[[], bool]) -> None:
+        """Wait until it holds; fails with what a node printed that ended with status 1."""
+
+        def holds() -> bool:
+            for each in self._started:
+                if each.poll() == 1 and each.stdout is not None:
+                    raise AssertionError(each.stdout.read())
+            return condition()
+
+        self._spin_until(holds)
+
+    def listen(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile = qos.STREAM,
+    ) -> None:
+        """Subscribe."""
+        self.node.create_subscription(kind, topic, callback, profile)
+
+    def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
+        """Whether `node` has said `text`."""
+        return any(text in said for said, _ in self.said.get(node, []))
+
+    def hears(self, text: str, node: str = "funnel_monitor") -> None:
+        """Wait until `node` has said `text`."""
+        self.spin_until(lambda: self.has_said(text, node))
+
+    def waits(self, seconds: float) -> None:
+        """Let time pass."""
+        until = time.monotonic() + seconds
+        self.spin_until(lambda: time.monotonic() > until)
+
+    def call(self, name: str, kind: type = Trigger, **request: object) -> Any:
+        """The answer of a service."""
+        return call(self.node, self.spin_until, name, kind, **request)
+
+    def set(self, name: str, key: str, value: float | str) -> str:
+        """Change a node's parameter; why it was refused, empty if it was not."""
+        return set_parameter(self.node, self.spin_until, name, key, value)

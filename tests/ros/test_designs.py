@@ -1,8 +1,8 @@
 """Nothing is used that the kernel has not proved here: bundles, true, forged and hostile."""
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,38 +15,45 @@ from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
+from bags.chain.steps import design_funnel_files
 from bags.designs import documents
 from bags.designs.bundle import MAX_BYTES, Bundle
-from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.progress import silent
 from nlsid_ros import qos
-from tests.ros.processes import call, node_here, process, ros_test, stop
-from tests.ros.robot import GOOD, MONITOR, Robot
+from tests.ros.processes import Bench, refusal, ros_test
+from tests.ros.robot import GOOD, Robot
 
 pytestmark = ros_test
-CONTROLLER = "nlsid_ros.tracking_controller"
 NODES = ("funnel_monitor", "tracking_controller")
 
 
 @pytest.fixture
-def robot(funnel: Path) -> Iterator[Robot]:
+def used(robot: Robot) -> Robot:
     """A robot with a monitor and a controller that listen to its bundle."""
-    with ExitStack() as stack:
-        node, spin_until = stack.enter_context(node_here("test_robot"))
-        stack.enter_context(process(MONITOR, stale_after=5.0, allow_old_stamps=True))
-        stack.enter_context(process(CONTROLLER, highest=0.4, stale_after=5.0))
-        robot = Robot(node, spin_until, funnel.parent)
-        robot.ready()
-        robot.spin_until(lambda: robot.has_said("idle", "tracking_controller"))
-        yield robot
+    robot.start("tracking_controller", highest=0.4, stale_after=5.0)
+    robot.watched(stale_after=5.0, allow_old_stamps=True)
+    robot.ready()
+    robot.hears("idle", "tracking_controller")
+    return robot
+
+
+@pytest.fixture(scope="session")
+def wider(funnel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of another proved funnel of the same model."""
+    folder = tmp_path_factory.mktemp("wider")
+    shutil.copytree(funnel.parent, folder, dirs_exist_ok=True)
+    config = load_config(config_file("f1tenth.yaml"))
+    assert config.funnel is not None
+    changed = config.funnel.model_copy(update={"safety_factor": 2.0})
+    settings = config.model_copy(update={"funnel": changed})
+    design_funnel_files(folder / documents.MODEL, settings, folder)
+    return folder
 
 
 def start(robot: Robot) -> Trigger.Response:
     """The controller's answer to ~/start."""
-    return call(robot.node, robot.spin_until, "/tracking_controller/start")
+    return robot.call("/tracking_controller/start")
 
 
 def with_policy(bundle: Bundle, change: Callable[[Json], Json]) -> Bundle:
@@ -74,14 +81,15 @@ def says(robot: Robot, node: str, key: str, text: str) -> bool:
 def refused(robot: Robot, because: str) -> None:
     """Both nodes say that they refuse, at ERROR, and no run can be begun."""
     for name in NODES:
-        robot.spin_until(lambda name=name: robot.has_said(because, name))  # type: ignore[misc]
+        robot.hears(because, name)
         assert robot.levels[name] == DiagnosticStatus.ERROR
     answer = start(robot)
     assert not answer.success
     assert "refused" in answer.message
 
 
-def test_a_forged_policy_is_refused_and_moves_nothing(robot: Robot) -> None:
+def test_a_forged_policy_is_refused_and_moves_nothing(used: Robot) -> None:
+    robot = used
     robot.publish(with_policy(robot.bundle, stronger))
     refused(robot, "design refused: policy.json is not the policy this proof is about")
     robot.publish(robot.bundle)
@@ -91,7 +99,8 @@ def test_a_forged_policy_is_refused_and_moves_nothing(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("missing", ["proof", "policy", "model", "funnel"])
-def test_a_design_without_one_of_its_files_is_refused(robot: Robot, missing: str) -> None:
+def test_a_design_without_one_of_its_files_is_refused(used: Robot, missing: str) -> None:
+    robot = used
     robot.publish(Bundle({role: c for role, c in robot.bundle.contents.items() if role != missing}))
     refused(robot, "design refused")
 
@@ -106,14 +115,16 @@ def test_a_design_without_one_of_its_files_is_refused(robot: Robot, missing: str
     ],
     ids=["nested", "huge", "numbers", "another document"],
 )
-def test_what_is_no_bundle_is_refused_by_name(robot: Robot, text: str, because: str) -> None:
+def test_what_is_no_bundle_is_refused_by_name(used: Robot, text: str, because: str) -> None:
+    robot = used
     robot.latched.publish(String(data=text))
     refused(robot, because)
 
 
-def test_a_second_publisher_is_refused_and_the_run_goes_on_as_it_was(robot: Robot) -> None:
+def test_a_second_publisher_is_refused_and_the_run_goes_on_as_it_was(used: Robot) -> None:
+    robot = used
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     second = robot.node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
     second.publish(String(data=with_policy(robot.bundle, stronger).text()))
     refused(robot, "/funnel_publisher/design has 2 publishers")
@@ -128,37 +139,22 @@ def test_a_second_publisher_is_refused_and_the_run_goes_on_as_it_was(robot: Robo
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_only_the_expected_funnel_is_used(funnel: Path, name: str) -> None:
-    own = files.digest(funnel.read_bytes())
-    other = "0" * 64
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(f"nlsid_ros.{name}", highest=0.4, expected_digest=own) as good,
-        process(f"nlsid_ros.{name}", highest=0.4, expected_digest=f"'{other}'", __node="picky"),
-    ):
-        robot = Robot(node, spin_until, funnel.parent)
-        spin_until(lambda: robot.has_said(f"not the expected sha256:{other}", "picky"))
-        assert robot.levels["picky"] == DiagnosticStatus.ERROR
-        spin_until(lambda: robot.has_said("", name))
-        spin_until(lambda: any("PROVED" in values["design"] for _, values in robot.said[name]))
-        stop(good)
+def test_only_the_expected_funnel_is_used(funnel: Path, name: str, robot: Robot) -> None:
+    own, other = files.digest(funnel.read_bytes()), "0" * 64
+    robot.start(name, highest=0.4, expected_digest=own)
+    robot.start(name, highest=0.4, expected_digest=f"'{other}'", __node="picky")
+    robot.hears(f"not the expected sha256:{other}", "picky")
+    assert robot.levels["picky"] == DiagnosticStatus.ERROR
+    robot.spin_until(lambda: says(robot, name, "design", "PROVED"))
 
 
 def test_an_older_design_is_not_taken_after_the_one_in_use_was_published_again(
-    robot: Robot, tmp_path: Path
+    used: Robot, wider: Path
 ) -> None:
     """The older one is proved too, but its check takes long enough to be overtaken."""
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, tmp_path, progress=silent)
-    assert config.funnel is not None
-    wider = config.funnel.model_copy(update={"safety_factor": 2.0})
-    design_funnel_files(
-        tmp_path / documents.MODEL, config.model_copy(update={"funnel": wider}), tmp_path
-    )
-    other = Bundle.load(tmp_path / documents.FUNNEL)
+    robot, other = used, Bundle.load(wider / documents.FUNNEL)
     proof = other.contents["proof"].decode().replace('"proof":', " " * 3 * 10**6 + '"proof":')
-    name = "tracking_controller"
-    own = robot.bundle.digest
+    name, own = "tracking_controller", robot.bundle.digest
     robot.spin_until(lambda: says(robot, name, "funnel", own))
     assert own != other.digest
     robot.said.clear()
@@ -175,10 +171,11 @@ def test_an_older_design_is_not_taken_after_the_one_in_use_was_published_again(
     robot.spin_until(lambda: says(robot, name, "funnel", other.digest))
 
 
-def test_a_control_loop_goes_on_while_a_proof_is_checked(robot: Robot) -> None:
+def test_a_control_loop_goes_on_while_a_proof_is_checked(used: Robot) -> None:
     """The proof's numbers are padded so that deciding takes much longer than a sample."""
+    robot = used
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     robot.said.clear()
     proof = robot.bundle.contents["proof"].decode().replace('"proof":', " " * 10**6 + '"proof":')
     padded = Bundle({**robot.bundle.contents, "proof": proof.encode()})
@@ -197,3 +194,48 @@ def test_a_control_loop_goes_on_while_a_proof_is_checked(robot: Robot) -> None:
     over = "unknown: the proof covers 117 samples; they are over"  # on a machine that is busy
     assert "inside" in texts
     assert texts <= {"inside", over}, "it went on all the time"
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "forged": lambda path: path.write_text(path.read_text().replace("1.5", "1.4")),
+    "no proof": lambda path: path.with_name(documents.FUNNEL_PROOF).unlink(),
+    "no funnel": lambda path: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_the_publisher_refuses_what_is_not_proved(
+    funnel: Path, tmp_path: Path, damage: str
+) -> None:
+    path = tmp_path / "damaged" / funnel.name
+    shutil.copytree(funnel.parent, path.parent)
+    DAMAGE[damage](path)
+    assert "not published, not proved" in refusal("nlsid_ros.funnel_publisher", funnel=path)
+
+
+def test_the_publisher_publishes_anew_what_is_changed_and_proved_and_not_what_is_forged(
+    bench: Bench, funnel: Path, wider: Path, tmp_path: Path
+) -> None:
+    """The files are changed, and then the parameter that names them."""
+    heard: list[str] = []
+    name, path = "funnel_publisher", tmp_path / "used" / funnel.name
+    shutil.copytree(funnel.parent, path.parent)
+    bench.listen(
+        String,
+        f"/{name}/design",
+        lambda message: heard.append(Bundle.parse(message.data).digest),
+        qos.DOCUMENT,
+    )
+    bench.start(name, funnel=path)
+    bench.spin_until(lambda: len(heard) == 1)
+    for file in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
+        shutil.copyfile(wider / file, path.with_name(file))
+    bench.spin_until(lambda: heard[-1] == files.digest((wider / funnel.name).read_bytes()))
+    count, design = len(heard), files.load_document(path)
+    forged = design | {"tubes": [design["tubes"][0] | {"level": 2.0}]}
+    files.write_document(path, forged)
+    bench.hears("REJECTED", name)
+    assert "not the funnel this proof is about" in bench.set(name, "funnel", str(path))
+    assert len(heard) == count
+    assert bench.set(name, "funnel", str(funnel)) == ""
+    bench.spin_until(lambda: heard[-1] == heard[0])

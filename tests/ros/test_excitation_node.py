@@ -1,108 +1,74 @@
 """The excitation node over DDS: within its limits, repeated exactly, stopped when asked."""
 
 import json
+import math
 import signal
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from subprocess import Popen
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
-from rclpy.client import Client
-from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
-from bags.samples import f1tenth
+from bags.signals.grid import read_dataset
+from bags.signals.reader import bag_origin
+from bags.signals.sampling import Grid
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.designs import VECTOR_FIELD
 from nlsid_ros import qos
-from tests.ros.processes import (
-    SpinUntil,
-    call,
-    node_here,
-    process,
-    refusal,
-    ros_test,
-    service,
-    stop,
-)
+from nlsid_ros.messages import stamp_ns_of
+from tests.continuous_stage import stage
+from tests.ros.processes import Bench, ros_test, service, stop
 
 pytestmark = ros_test
 
-EXCITATION = "nlsid_ros.excitation"
 LIMITS: dict[str, object] = {"lowest": -0.1, "highest": 0.4, "slew": 2.0, "fade": 0.2}
 
 
-class Excited(NamedTuple):
-    """A node that hears (sent: stamp in ns, command) the excitation that runs in a process."""
+class Excited(Bench):
+    """Hears (sent: stamp in ns, command) the excitation that runs in a process."""
 
-    node: Node
-    spin_until: SpinUntil
-    running: Popen[str]
-    start: Client
-    sent: list[tuple[int, float]]
+    def __init__(self, stack: ExitStack, **parameters: object) -> None:
+        super().__init__(stack)
+        self.sent: list[tuple[int, float]] = []
+        self.did: list[str] = []
+        self.listen(TwistStamped, "/cmd_vel", self._on_command)
+        self.listen(String, "/excitation/experiment", self._on_experiment, qos.DOCUMENT)
+        self.running = self.start("excitation", **(LIMITS | parameters))
+        self.hears("idle", "excitation")
+        self.spin_until(lambda: self.node.count_publishers("/cmd_vel") == 1)
 
+    def _on_command(self, message: TwistStamped) -> None:
+        self.sent.append((stamp_ns_of(message), message.twist.linear.x))
 
-@contextmanager
-def heard(parameters: dict[str, object]) -> Iterator[Excited]:
-    """The node at work and waiting for ~/start, heard on its topic."""
-    sent: list[tuple[int, float]] = []
+    def _on_experiment(self, message: String) -> None:
+        self.did.append(message.data)
 
-    def hear(message: TwistStamped) -> None:
-        stamp = message.header.stamp
-        sent.append((stamp.sec * 10**9 + stamp.nanosec, message.twist.linear.x))
+    def inputs(self) -> FloatArray:
+        """The commands that were sent."""
+        return np.array([u for _, u in self.sent])
 
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(EXCITATION, **(LIMITS | parameters)) as running,
-    ):
-        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
-        start = service(node, spin_until, "/excitation/start")
-        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
-        yield Excited(node, spin_until, running, start, sent)
+    def begin(self, above: float = -math.inf) -> None:
+        """Begin, and wait for a command that is large enough."""
+        self.waits(0.5)
+        assert not self.sent, "nothing moves before it is asked to"
+        assert self.call("/excitation/start").success
+        self.spin_until(lambda: bool(self.sent) and self.sent[-1][1] > above)
 
-
-def excite(
-    parameters: dict[str, object], *, stop_after: float | None = None
-) -> tuple[list[tuple[int, float]], list[str]]:
-    """(stamp, command) of everything sent after ~/start, and what was said to have been done."""
-    did: list[str] = []
-
-    def hear_experiment(message: String) -> None:
-        did.append(message.data)
-
-    with heard(parameters) as (node, spin_until, running, start, sent):
-        node.create_subscription(String, "/excitation/experiment", hear_experiment, qos.DOCUMENT)
-        halt = service(node, spin_until, "/excitation/stop")
-        settled = time.monotonic() + 0.5
-        spin_until(lambda: time.monotonic() > settled)
-        assert not sent, "nothing moves before it is asked to"
-        start.call_async(Trigger.Request())
-        spin_until(lambda: bool(sent))
-        if stop_after is not None:
-            asked = time.monotonic() + stop_after
-            spin_until(lambda: time.monotonic() > asked)
-            halt.call_async(Trigger.Request())
-        quiet = [0, time.monotonic()]
-
-        def ended() -> bool:
-            if len(sent) != quiet[0]:
-                quiet[:] = [len(sent), time.monotonic()]
-            return time.monotonic() - quiet[1] > 1.0
-
-        spin_until(ended)
-        stop(running)
-    return sent, did
+    def end(self) -> None:
+        """Wait until it has said how it ended, and the robot rests."""
+        self.spin_until(lambda: bool(self.did) and "ended" in json.loads(self.did[-1]))
+        self.spin_until(lambda: self.sent[-1][1] == 0.0)
+        self.waits(0.5)
 
 
-def test_repeats_are_the_same_signal_within_the_limits() -> None:
+def test_repeats_are_the_same_signal_within_the_limits(stack: ExitStack) -> None:
     parameters: dict[str, object] = {
         "period": 0.02,
         "duration": 2.0,
@@ -111,8 +77,10 @@ def test_repeats_are_the_same_signal_within_the_limits() -> None:
         "lowest_hz": 0.5,
         "highest_hz": 3.0,
     }
-    sent, did = excite(parameters)
-    stamps, inputs = np.array([s for s, _ in sent]), np.array([u for _, u in sent])
+    robot = Excited(stack, **parameters)
+    robot.begin()
+    robot.end()
+    stamps, inputs = np.array([s for s, _ in robot.sent]), robot.inputs()
     assert (np.diff(stamps) == 20_000_000).all(), "on an exact grid"
     half = len(inputs) // 2
     assert half >= 125
@@ -122,7 +90,7 @@ def test_repeats_are_the_same_signal_within_the_limits() -> None:
     assert np.ptp(inputs) > 0.3
     assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
     assert inputs[-1] == 0.0
-    said = [json.loads(text) for text in did]
+    said = [json.loads(text) for text in robot.did]
     assert [(each["repeat"], each.get("ended", "")) for each in said] == [
         (1, ""),
         (2, ""),
@@ -135,7 +103,7 @@ def test_repeats_are_the_same_signal_within_the_limits() -> None:
 
 
 @pytest.mark.parametrize("kind", ["chirp", "prbs", "steps"])
-def test_every_kind_stays_within_the_limits(kind: str) -> None:
+def test_every_kind_stays_within_the_limits(kind: str, stack: ExitStack) -> None:
     parameters: dict[str, object] = {
         "kind": kind,
         "period": 0.02,
@@ -145,8 +113,10 @@ def test_every_kind_stays_within_the_limits(kind: str) -> None:
         "lowest_hz": 1.0,
         "highest_hz": 4.0,
     }
-    sent, _ = excite(parameters)
-    inputs = np.array([u for _, u in sent])
+    robot = Excited(stack, **parameters)
+    robot.begin()
+    robot.end()
+    inputs = robot.inputs()
     assert len(inputs) >= 80
     assert -0.1 <= inputs.min() < 0.0
     assert 0.2 < inputs.max() <= 0.4
@@ -154,93 +124,136 @@ def test_every_kind_stays_within_the_limits(kind: str) -> None:
     assert inputs[-1] == 0.0
 
 
-def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
-    sent, did = excite({"kind": "steps", "period": 0.02, "pause": 0.0}, stop_after=1.5)
-    assert json.loads(did[-1])["ended"] == "stopped when asked to"
-    assert json.loads(did[-1])["repeat_group"] == "", "half a repeat is none"
-    inputs = [u for _, u in sent]
-    assert inputs[-1] == 0.0
-    assert len(inputs) < 200
-    assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed(stack: ExitStack) -> None:
+    robot = Excited(stack, kind="steps", period=0.02, pause=0.0)
+    robot.begin(above=0.2)
+    assert robot.call("/excitation/stop").success
+    robot.end()
+    assert json.loads(robot.did[-1])["ended"] == "stopped when asked to"
+    assert json.loads(robot.did[-1])["repeat_group"] == "", "half a repeat is none"
+    assert np.abs(np.diff(robot.inputs())).max() <= 2.0 * 0.02 * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ended_by_a_signal_it_leaves_the_robot_at_rest(how: signal.Signals) -> None:
-    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0}
-    with heard(steps | {"lowest": 0.3, "rest": 0.3}) as (_, spin_until, running, start, sent):
-        start.call_async(Trigger.Request())
-        spin_until(lambda: bool(sent) and sent[-1][1] > 0.35)
-        running.send_signal(how)
-        spin_until(lambda: running.poll() is not None and sent[-1][1] == 0.3)
-        assert running.returncode == 0
-    assert np.abs(np.diff([u for _, u in sent])).max() <= 2.0 * 0.02 * (1 + 1e-9)
+def test_ended_by_a_signal_it_leaves_the_robot_at_rest(
+    how: signal.Signals, stack: ExitStack
+) -> None:
+    robot = Excited(stack, kind="steps", period=0.02, pause=0.0, lowest=0.3, rest=0.3)
+    robot.begin(above=0.35)
+    robot.running.send_signal(how)
+    robot.spin_until(lambda: robot.running.poll() is not None and robot.sent[-1][1] == 0.3)
+    assert robot.running.returncode == 0
+    assert np.abs(np.diff(robot.inputs())).max() <= 2.0 * 0.02 * (1 + 1e-9)
 
 
-def test_held_up_for_a_while_it_ends_and_does_not_set_the_robot_in_motion_again() -> None:
+def test_held_up_for_a_while_it_ends_and_does_not_set_the_robot_in_motion_again(
+    stack: ExitStack,
+) -> None:
     """What is late is not played on; a base that stops when no command comes rests by then."""
-    said: dict[str, bytes] = {}
-
-    def hear_status(message: DiagnosticArray) -> None:
-        said[message.status[0].message] = message.status[0].level
-
-    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0}
-    with heard(steps) as (node, spin_until, running, start, sent):
-        node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        start.call_async(Trigger.Request())
-        spin_until(lambda: bool(sent) and sent[-1][1] > 0.2)
-        running.send_signal(signal.SIGSTOP)
-        later = time.monotonic() + 1.5
-        spin_until(lambda: time.monotonic() > later)
-        before = len(sent)
-        running.send_signal(signal.SIGCONT)
-        spin_until(lambda: any("before this node's clock; 0.1 s are allowed" in s for s in said))
-        spin_until(lambda: len(sent) > before)
-        assert {u for _, u in sent[before:]} == {0.0}
-        assert said[next(s for s in said if "s are allowed" in s)] == DiagnosticStatus.ERROR
-        stop(running)
+    robot = Excited(stack, kind="steps", period=0.02, pause=0.0)
+    robot.begin(above=0.2)
+    robot.running.send_signal(signal.SIGSTOP)
+    robot.waits(1.5)
+    before = len(robot.sent)
+    robot.running.send_signal(signal.SIGCONT)
+    robot.hears("before this node's clock; 0.1 s are allowed", "excitation")
+    robot.spin_until(lambda: len(robot.sent) > before)
+    assert set(robot.inputs()[before:]) == {0.0}
+    assert robot.levels["excitation"] == DiagnosticStatus.ERROR
 
 
-def test_a_recorder_that_does_not_answer_is_said(tmp_path: Path) -> None:
-    said: dict[str, bytes] = {}
-
-    def hear(message: DiagnosticArray) -> None:
-        said[message.status[0].message] = message.status[0].level
-
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(
-            "nlsid_ros.trajectory_recorder",
-            topics="[/cmd_vel]",
-            bag=tmp_path / "bag",
-            at_once=False,
-        ) as recorder,
-        process(EXCITATION, **LIMITS, recorder="trajectory_recorder") as running,
-    ):
-        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        spin_until(lambda: "waiting for ~/start" in said)
-
-        def started() -> bool:
-            return bool(call(node, spin_until, "/excitation/start").success)
-
-        spin_until(lambda: node.count_clients("/trajectory_recorder/start") == 1)
-        recorder.send_signal(signal.SIGSTOP)
-        spin_until(started)
-        spin_until(lambda: any("has not answered for 10 s" in text for text in said))
-        assert said[next(s for s in said if "has not" in s)] == DiagnosticStatus.ERROR
-        recorder.send_signal(signal.SIGCONT)
-        stop(running)
+def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves(
+    stack: ExitStack,
+) -> None:
+    """Steps of speed while another node steers; when that one stops, the robot goes to rest."""
+    robot, turned = Excited(stack, kind="steps", period=0.02, pause=0.0, others="/teleop"), set()
+    robot.listen(TwistStamped, "/cmd_vel", lambda message: turned.add(message.twist.angular.z))
+    steering = robot.node.create_publisher(TwistStamped, "/teleop", qos.STREAM)
+    robot.spin_until(lambda: robot.node.count_subscribers("/teleop") == 1)
+    refused = robot.call("/excitation/start")
+    assert refused.message == "nothing on /teleop for 1 s, which has the other fields"
+    message = TwistStamped()
+    message.twist.linear.x, message.twist.angular.z = 9.0, 0.7
+    timer = robot.node.create_timer(0.1, lambda: steering.publish(message))
+    robot.begin(above=0.2)
+    timer.cancel()
+    robot.end()
+    assert turned == {0.7}
+    assert robot.inputs().max() <= 0.4
+    assert json.loads(robot.did[-1])["ended"].startswith("nothing on /teleop for 1 s")
 
 
-def test_a_recorded_command_is_replayed_within_the_limits() -> None:
-    trial: Path = f1tenth()[4]
-    sent, _ = excite({"kind": "replay", "bag": trial, "pause": 0.0, "slew": 100.0, "fade": 0.0})
-    inputs = [u for _, u in sent]
-    assert max(inputs) == pytest.approx(0.4)
-    assert len(inputs) > 100
+COMMAND, RESPONSE = "/joint_commands:effort[0]", "/joint_states:position[0]"
+JOINTS: dict[str, object] = {"lowest": -0.3, "highest": 0.3, "slew": 5.0, "fade": 0.2}
+SIGNAL: dict[str, object] = {"period": 0.01, "duration": 2.0, "pause": 0.8, "highest_hz": 4.0}
+SIGNAL |= {"command": COMMAND, "command_type": "sensor_msgs/msg/JointState"}
 
 
-@pytest.mark.parametrize(
-    "missing", [{"lowest": 0.0, "highest": 0.0, "slew": 1.0}, {"highest": 1.0, "slew": 0.0}]
-)
-def test_without_limits_it_does_not_run(missing: dict[str, object]) -> None:
-    assert "to what the robot may do" in refusal(EXCITATION, **missing)
+def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repeats(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """The robot's position is the integral of the effort."""
+    bags, field = tmp_path / "trials", tmp_path / VECTOR_FIELD
+    bags.mkdir()
+    files.write_document(field, stage()[0].document())
+    topics = "[/joint_states, /joint_commands]"
+    kind, types = "sensor_msgs/msg/JointState", ("response_type", "command_type")
+    wiring = {"response": RESPONSE, "command": COMMAND} | dict.fromkeys(types, kind)
+    bench.start("plant", kind="vector_field", model=field, state="'0.0'", **wiring)
+    recorder = bench.start("trajectory_recorder", topics=topics, bag=bags / "trial", at_once=False)
+    bench.start("excitation", **(JOINTS | SIGNAL), repeats=3, recorder="trajectory_recorder")
+    bench.spin_until(lambda: bench.node.count_subscribers("/joint_states") == 1)
+    bench.spin_until(lambda: bench.node.count_subscribers("/joint_commands") == 2)
+    bench.hears("idle", "excitation")
+    bench.spin_until(lambda: bench.call("/excitation/start").success)
+    bench.hears("done", "excitation")
+    stop(recorder)
+
+    trials = [bags / name for name in ("trial", "trial_2", "trial_3")]
+    assert sorted(bags.iterdir()) == trials
+    for number, trial in enumerate(trials, start=1):
+        custom = bag_origin(trial)["custom"]
+        assert json.loads(custom["experiment"])["repeat"] == number
+        assert int(custom["/joint_commands received"]) >= 230
+        assert custom["/joint_commands lost"] == "0"
+    data = read_dataset(
+        trials,
+        responses=[RESPONSE],
+        excitations=[COMMAND],
+        grid=Grid(0.01, max_gap=0.5, resample="linear"),
+    )
+    [(group, members)] = data.repeats().items()
+    assert group.startswith("/joint_commands:effort[0], multisine, sha256:")
+    assert len(members) == 3
+    assert all(np.ptp(member.u) > 0.3 and np.ptp(member.y) > 0.01 for member in members)
+    first = members[0].u[:, 0]
+    for member in members[1:]:
+        common = min(len(first), len(member))
+        assert abs(len(first) - len(member)) <= 3
+        assert np.corrcoef(first[:common], member.u[:common, 0])[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("recorder", ["none", "busy", "does not answer"])
+def test_a_recorder_that_gives_no_bag_stops_the_experiment_before_it_moves(
+    bench: Bench, recorder: str, tmp_path: Path
+) -> None:
+    name, at_once = "trajectory_recorder", recorder == "busy"
+    if recorder != "none":
+        process = bench.start(name, topics="[/joints]", bag=tmp_path / "own", at_once=at_once)
+        bench.hears("", name)
+    bench.start("excitation", **(JOINTS | SIGNAL), recorder=name)
+    bench.hears("idle", "excitation")
+    start = service(bench.node, bench.spin_until, "/excitation/start")
+    if recorder == "none":
+        answer = bench.call("/excitation/start")
+        assert "there is no recorder trajectory_recorder" in answer.message
+        return
+    bench.spin_until(lambda: bench.node.count_clients(f"/{name}/start") == 1)
+    if recorder == "does not answer":
+        process.send_signal(signal.SIGSTOP)
+    bench.spin_until(lambda: bench.call("/excitation/start").success)
+    says = "no bag from the recorder: recording" if at_once else "has not answered for 10 s"
+    bench.hears(says, "excitation")
+    assert bench.levels["excitation"] == DiagnosticStatus.ERROR
+    process.send_signal(signal.SIGCONT)
+    assert start.service_is_ready(), "it goes on"

@@ -4,7 +4,6 @@ import itertools
 import math
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,8 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -22,12 +20,14 @@ from std_msgs.msg import String
 
 from benchmarks.monitor import COMMAND, STATE, bundle_of, timing_funnel
 from nlsid_ros import qos
+from nlsid_ros.messages import stamp_of
 from tests.ros import domains
 from tests.ros.domains import own_domain
-from tests.ros.processes import node_here, process, ros_test, stop
-from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
+from tests.ros.processes import Bench, node_here, process, ros_test, stop
+from tests.ros.robot import GOOD, PERIOD_NS, Robot
 
 pytestmark = ros_test
+MONITOR = "nlsid_ros.funnel_monitor"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,12 +40,10 @@ def domain() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def robot(funnel: Path) -> Iterator[Robot]:
     """One robot with one monitor, which each test restarts."""
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(MONITOR, stale_after=0.5, allow_old_stamps=True) as monitor,
-    ):
-        yield Robot(node, spin_until, funnel.parent)
-        stop(monitor)
+    with ExitStack() as stack:
+        robot = Robot(stack, funnel.parent)
+        robot.start("funnel_monitor", stale_after=0.5, allow_old_stamps=True)
+        yield robot
 
 
 @pytest.mark.parametrize(
@@ -67,27 +65,29 @@ def test_a_state_that_cannot_be_trusted_is_named_and_only_a_new_run_is_inside(
     """A tube around the simulation starts again, from four samples; an alarm is latched."""
     robot.restart()
     robot.drive(samples, speed=speed)
-    robot.spin_until(lambda: robot.has_said(says))
+    robot.hears(says)
     robot.said.clear()
     robot.drive([300, 301, 302, 303])
-    robot.spin_until(lambda: robot.has_said(""))
+    robot.hears("")
     assert not robot.has_said("inside")
     robot.drive([304, 305])
     if says == "outside":
         robot.spin_until(lambda: len(robot.said["funnel_monitor"]) > 1)
         assert not robot.has_said("inside")
     else:
-        robot.spin_until(lambda: robot.has_said("inside"))
+        robot.hears("inside")
 
 
 def test_the_terminal_says_when_the_robot_leaves(robot: Robot) -> None:
-    with process(MONITOR, __node="talking_monitor", allow_old_stamps=True) as monitor:
+    with process(
+        "nlsid_ros.funnel_monitor", __node="talking_monitor", allow_old_stamps=True
+    ) as monitor:
         robot.ready(monitors=2)
-        robot.spin_until(lambda: robot.has_said(" yet", "talking_monitor"))
+        robot.hears(" yet", "talking_monitor")
         robot.drive(GOOD)
-        robot.spin_until(lambda: robot.has_said("inside", "talking_monitor"))
+        robot.hears("inside", "talking_monitor")
         robot.drive([10, 11], speed=1e300)
-        robot.spin_until(lambda: robot.has_said("outside", "talking_monitor"))
+        robot.hears("outside", "talking_monitor")
         output = stop(monitor)
     assert "[INFO]" in next(line for line in output.splitlines() if line.endswith(": inside"))
     [outside] = [line for line in output.splitlines() if "outside" in line]
@@ -97,7 +97,7 @@ def test_the_terminal_says_when_the_robot_leaves(robot: Robot) -> None:
 def test_messages_that_come_twice_count_once(robot: Robot) -> None:
     robot.restart()
     robot.drive([k for k in range(12) for _ in range(2)], slower=0.5)
-    robot.spin_until(lambda: robot.has_said("unknown: no speed"))
+    robot.hears("unknown: no speed")
     texts = [text for text, _ in robot.said["funnel_monitor"]]
     assert "inside" in texts
     assert texts[-1] == "unknown: no speed for 0.5 s", "nothing else went wrong"
@@ -109,23 +109,25 @@ def test_a_publisher_that_dies_ends_the_run_and_one_that_returns_can_begin_anoth
 ) -> None:
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     robot.node.destroy_publisher(robot.odom)
-    robot.spin_until(lambda: robot.has_said("unknown: no speed"))
+    robot.hears("unknown: no speed")
     robot.odom = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
 
 
 def test_two_monitors_say_the_same(robot: Robot) -> None:
-    with process(MONITOR, __node="second_monitor", allow_old_stamps=True) as second:
+    with process(
+        "nlsid_ros.funnel_monitor", __node="second_monitor", allow_old_stamps=True
+    ) as second:
         robot.ready(monitors=2)
-        robot.spin_until(lambda: robot.has_said(" yet", "second_monitor"))
+        robot.hears(" yet", "second_monitor")
         robot.restart()
         robot.drive(GOOD)
-        robot.spin_until(lambda: robot.has_said("inside"))
-        robot.spin_until(lambda: robot.has_said("inside", "second_monitor"))
+        robot.hears("inside")
+        robot.hears("inside", "second_monitor")
         stop(second)
 
 
@@ -134,9 +136,9 @@ def test_in_simulated_time_a_slow_simulation_is_not_a_silent_robot(robot: Robot)
     with process(MONITOR, **simulated) as monitor:
         robot.ready(monitors=2)
         robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
-        robot.spin_until(lambda: robot.has_said(" yet", "simulated_monitor"))
+        robot.hears(" yet", "simulated_monitor")
         robot.drive(GOOD, slower=8.0, clock=True)  # 0.2 s of wall time between samples
-        robot.spin_until(lambda: robot.has_said("inside", "simulated_monitor"))
+        robot.hears("inside", "simulated_monitor")
         assert not robot.has_said("no speed for", "simulated_monitor")
         stop(monitor)
 
@@ -146,20 +148,21 @@ def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
 ) -> None:
     """A simulation is reset, and its robot does not come back: nothing is due for a long time."""
     name = "simulated_monitor"
-    with process(MONITOR, use_sim_time=True, stale_after=0.5, __node=name) as monitor:
+    with process(
+        "nlsid_ros.funnel_monitor", use_sim_time=True, stale_after=0.5, __node=name
+    ) as monitor:
         robot.ready(monitors=2)
         robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
-        robot.spin_until(lambda: robot.has_said(" yet", name))
+        robot.hears(" yet", name)
         robot.drive(GOOD, clock=True)
-        robot.spin_until(lambda: robot.has_said("inside", name))
+        robot.hears("inside", name)
         for k in range(80):
-            sec, nanosec = divmod(10**18 - 10**11 + k * PERIOD_NS, 10**9)
-            robot.clock.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
-            due = time.monotonic() + PERIOD_NS * 1e-9
-            robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-        robot.spin_until(lambda: robot.has_said("this node's clock went back by 100 s", name))
+            past = stamp_of(10**18 - 10**11 + k * PERIOD_NS)
+            robot.clock.publish(Clock(clock=past))
+            robot.waits(PERIOD_NS * 1e-9)
+        robot.hears("this node's clock went back by 100 s", name)
         robot.said.clear()
-        robot.spin_until(lambda: robot.has_said("", name))
+        robot.hears("", name)
         assert not robot.has_said("inside", name)
         stop(monitor)
 
@@ -167,7 +170,7 @@ def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
 def test_a_recorder_that_waits_for_simulated_time_says_so(robot: Robot, tmp_path: Path) -> None:
     settings: dict[str, object] = {"topics": "[/odom]", "bag": tmp_path / "bag"}
     with process("nlsid_ros.trajectory_recorder", **settings, use_sim_time=True) as recorder:
-        robot.spin_until(lambda: robot.has_said("nobody publishes /clock", "trajectory_recorder"))
+        robot.hears("nobody publishes /clock", "trajectory_recorder")
         stop(recorder)
 
 
@@ -175,7 +178,7 @@ def test_a_recording_stops_while_there_is_room_to_finish_it(robot: Robot, tmp_pa
     bag = tmp_path / "full"
     settings: dict[str, object] = {"topics": "[/odom]", "bag": bag, "least_free": 1e11}
     with process("nlsid_ros.trajectory_recorder", **settings) as recorder:
-        robot.spin_until(lambda: robot.has_said("are to stay free", "trajectory_recorder"))
+        robot.hears("are to stay free", "trajectory_recorder")
         stop(recorder)
     assert (bag / "metadata.yaml").is_file(), "the bag was closed"
 
@@ -184,9 +187,9 @@ def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path
     bag = tmp_path / "bag"
     robot.said.clear()
     with process("nlsid_ros.trajectory_recorder", topics="[/odom]", bag=bag) as recorder:
-        robot.spin_until(lambda: robot.has_said("nothing on /odom yet", "trajectory_recorder"))
+        robot.hears("nothing on /odom yet", "trajectory_recorder")
         shutil.rmtree(bag)
-        robot.spin_until(lambda: robot.has_said("recording stopped: ", "trajectory_recorder"))
+        robot.hears("recording stopped: ", "trajectory_recorder")
         assert robot.levels["trajectory_recorder"] == DiagnosticStatus.ERROR
         stop(recorder)
     assert not bag.exists()
@@ -194,50 +197,40 @@ def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path
 
 @pytest.mark.parametrize("role", ["response", "excitation"])
 def test_an_array_of_another_length_is_named_and_a_run_goes_on_if_it_is_no_command(
-    role: str,
+    role: str, stack: ExitStack
 ) -> None:
-    said: list[str] = []
-
-    def hear(message: DiagnosticArray) -> None:
-        said.extend(status.message for status in message.status)
-
     design = timing_funnel(1000)
-    with (
-        own_domain(),
-        node_here("test_joints") as (node, spin_until),
-        process(MONITOR, source="/benchmark", stale_after=5.0, allow_old_stamps=True) as monitor,
-    ):
-        latched = node.create_publisher(String, "/benchmark/design", qos.DOCUMENT)
-        latched.publish(String(data=bundle_of(design).text()))
-        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        state, command = (
-            node.create_publisher(JointState, path.partition(":")[0], qos.STREAM)
-            for path in (STATE, COMMAND)
-        )
-        spin_until(lambda: min(p.get_subscription_count() for p in (state, command)) == 1)
+    stack.enter_context(own_domain())
+    bench = Bench(stack)
+    bench.start("funnel_monitor", source="/benchmark", stale_after=5.0, allow_old_stamps=True)
+    latched = bench.node.create_publisher(String, "/benchmark/design", qos.DOCUMENT)
+    latched.publish(String(data=bundle_of(design).text()))
+    state, command = (
+        bench.node.create_publisher(JointState, path.partition(":")[0], qos.STREAM)
+        for path in (STATE, COMMAND)
+    )
+    bench.spin_until(lambda: min(p.get_subscription_count() for p in (state, command)) == 1)
 
-        def send(samples: range, *, short: str = "") -> None:
-            for k in samples:
-                for publisher, whose in ((command, "excitation"), (state, "response")):
-                    message = JointState(position=[] if whose == short else [0.0])
-                    message.header.stamp.sec, message.header.stamp.nanosec = 7, k * 10**6
-                    publisher.publish(message)
+    def send(samples: range, *, short: str = "") -> None:
+        for k in samples:
+            for publisher, whose in ((command, "excitation"), (state, "response")):
+                message = JointState(position=[] if whose == short else [0.0])
+                message.header.stamp.sec, message.header.stamp.nanosec = 7, k * 10**6
+                publisher.publish(message)
 
-        send(range(10))
-        spin_until(lambda: "inside" in said)
-        send(range(10, 11), short=role)
-        spin_until(lambda: any("'position' has 0 elements" in text for text in said))
-        said.clear()
-        send(range(11, 11 + len(design.model) - 1))  # too few to start a run
-        if role == "response":  # its sample is lost, and its command is known
-            spin_until(lambda: "inside" in said)
-            stop(monitor)
-            return
-        spin_until(lambda: any("waiting for the first" in text for text in said))
-        said.clear()  # the sample before the short one may have been judged late
-        spin_until(lambda: len(said) > 1)  # a heartbeat or two
-        assert not [text for text in said if not text.startswith("unknown")]
-        stop(monitor)
+    send(range(10))
+    bench.hears("inside")
+    send(range(10, 11), short=role)
+    bench.hears("'position' has 0 elements")
+    bench.said.clear()
+    send(range(11, 11 + len(design.model) - 1))  # too few to start a run
+    if role == "response":  # its sample is lost, and its command is known
+        bench.hears("inside")
+        return
+    bench.hears("waiting for the first")
+    bench.said.clear()  # the sample before the short one may have been judged late
+    bench.spin_until(lambda: len(bench.said.get("funnel_monitor", [])) > 1)  # a heartbeat or two
+    assert all(text.startswith("unknown") for text, _ in bench.said["funnel_monitor"])
 
 
 def test_discovery_is_kept_to_this_machine_and_to_one_domain_per_test(

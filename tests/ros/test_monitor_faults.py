@@ -1,81 +1,51 @@
-"""What a monitor must not forget, must not believe, and must not wait for."""
+"""What a monitor must not forget, must not believe, and must not wait for; what an alarm does."""
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
-from tests.ros.processes import node_here, process, ros_test
-from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
+from bags.monitoring.announcement import Run
+from nlsid_core import files
+from nlsid_ros import qos
+from tests.ros.processes import ros_test
+from tests.ros.robot import GOOD, PERIOD_NS, Robot
 
 pytestmark = ros_test
 NAME = "funnel_monitor"
 LATE = 1.0  # s that the machine may be busy
+PLAYED = {"stale_after": 5.0, "allow_old_stamps": True}
 
 
-@pytest.fixture
-def watched(funnel: Path) -> Iterator[Callable[..., Robot]]:
-    """A robot and its monitor, which takes parameters."""
-    with ExitStack() as stack:
-        node, spin_until = stack.enter_context(node_here("test_robot"))
+def served(
+    robot: Robot, name: str, called: list[str], says: Callable[[], tuple[bool, str]]
+) -> None:
+    """A service that a monitor may call."""
 
-        def make(**settings: object) -> Robot:
-            stack.enter_context(process(MONITOR, **settings))
-            robot = Robot(node, spin_until, funnel.parent)
-            robot.spin_until(lambda: robot.has_said("no speed yet"))
-            return robot
+    def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        called.append(name)
+        response.success, response.message = says()
+        return response
 
-        yield make
-
-
-def waits(robot: Robot, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    robot.spin_until(lambda: time.monotonic() > until)
-
-
-def feed(
-    robot: Robot,
-    samples: int,
-    *,
-    ahead: float = 0.0,
-    period_ns: int = PERIOD_NS,
-    frame: str = "",
-    clock: bool = False,
-) -> int:
-    """Samples at rest in real time, stamped `ahead` s of now at the first; the next stamp (ns)."""
-    first, began = time.time_ns() + round(ahead * 1e9), time.monotonic()
-    for k in range(samples):
-        command, state = TwistStamped(), Odometry()
-        for message in (command, state):
-            stamp = message.header.stamp
-            stamp.sec, stamp.nanosec = divmod(first + k * period_ns, 10**9)
-        state.header.frame_id = frame
-        if clock:
-            robot.clock.publish(Clock(clock=state.header.stamp))
-        robot.command.publish(command)
-        robot.odom.publish(state)
-        due = began + (k + 1) * period_ns * 1e-9
-        robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-    return first + samples * period_ns
+    robot.node.create_service(Trigger, name, serve)
 
 
 def test_outside_stays_outside_until_a_restart_whatever_is_published_meanwhile(
-    watched: Callable[..., Robot],
+    robot: Robot,
 ) -> None:
-    robot = watched(stale_after=0.5, allow_old_stamps=True)
+    robot.watched(stale_after=0.5, allow_old_stamps=True, hysteresis=1.0, clear_after=60.0)
     robot.ready()
     robot.drive(GOOD)
     robot.drive([10], speed=1e3)
-    robot.spin_until(lambda: robot.has_said("outside"))
+    robot.hears("outside")
+    assert {"margin", "worst axis", "assumption", "assuming"} <= robot.said[NAME][-1][1].keys()
     robot.said.clear()
     robot.publish(robot.bundle)
     robot.drive([11, 12, 13])
@@ -83,93 +53,147 @@ def test_outside_stays_outside_until_a_restart_whatever_is_published_meanwhile(
     robot.spin_until(lambda: len(robot.said[NAME]) > 5)  # heartbeats after the silence
     assert {text[:7] for text, _ in robot.said[NAME]} == {"outside"}
     assert robot.levels[NAME] == DiagnosticStatus.ERROR
+    assert robot.set(NAME, "hysteresis", 0.0) == robot.set(NAME, "clear_after", 0.0) == ""
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     assert robot.levels[NAME] == DiagnosticStatus.OK
 
 
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"ahead": -3600.0}, "unknown: a response is stamped 3.6e+03 s before this node's clock"),
-        ({"ahead": 3600.0}, "unknown: a response is stamped 3.6e+03 s after this node's clock"),
+        ({"ahead": -3600.0}, " is stamped 3.6e+03 s before this node's clock"),
+        ({"ahead": 3600.0}, " is stamped 3.6e+03 s after this node's clock"),
         ({"period_ns": 30_303_030}, "unknown: the sample at t ="),
     ],
     ids=["an hour old", "an hour ahead", "33 Hz"],
 )
 def test_samples_that_are_not_of_now_or_not_of_the_models_rate_are_not_inside(
-    watched: Callable[..., Robot], given: dict[str, float], says: str
+    robot: Robot, given: dict[str, float], says: str
 ) -> None:
-    robot = watched(stale_after=LATE)
+    robot.watched(stale_after=LATE)
     robot.ready()
     while not robot.has_said(says):  # on a busy machine a command may be late for its sample
-        feed(robot, 10, **given)  # type: ignore[arg-type]
+        robot.drive_now(10, **given)
     robot.said.clear()
-    feed(robot, 10, **given)  # type: ignore[arg-type]
+    robot.drive_now(10, **given)
     assert not robot.has_said("inside")
 
 
-def test_samples_of_now_are_inside_and_another_frame_is_not(watched: Callable[..., Robot]) -> None:
-    robot = watched(stale_after=LATE)
+def test_samples_of_now_are_inside_and_another_frame_is_not(robot: Robot) -> None:
+    robot.watched(stale_after=LATE)
     robot.ready()
-    feed(robot, 10, frame="odom")
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.drive_now(10, frame="odom")
+    robot.hears("inside")
     robot.restart()
-    feed(robot, 3, frame="odom")
-    feed(robot, 3, frame="map")
-    robot.spin_until(lambda: robot.has_said("unknown: the response is in frame 'map', not in"))
+    robot.drive_now(3, frame="odom")
+    robot.drive_now(3, frame="map")
+    robot.hears("unknown: the response is in frame 'map', not in")
 
 
-def test_two_values_at_one_stamp_are_named(watched: Callable[..., Robot]) -> None:
-    robot = watched(stale_after=LATE, allow_old_stamps=True)
+def test_two_values_at_one_stamp_are_named(robot: Robot) -> None:
+    robot.watched(stale_after=LATE, allow_old_stamps=True)
     robot.ready()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     robot.drive([GOOD[-1]], speed=0.001)
-    robot.spin_until(lambda: robot.has_said("unknown: speed has two values at one stamp"))
+    robot.hears("unknown: speed has two values at one stamp")
     robot.said.clear()
     for k in range(GOOD[-1] + 1, GOOD[-1] + 8):
         robot.drive([k])
         robot.drive([k], speed=0.001)
-    waits(robot, 2.0)
+    robot.waits(2.0)
     assert not robot.has_said("inside"), "nobody knows which of the two is the robot"
 
 
-def test_the_right_type_is_taken_after_a_wrong_one(watched: Callable[..., Robot]) -> None:
-    robot = watched(stale_after=LATE, allow_old_stamps=True)
+def test_the_right_type_is_taken_after_a_wrong_one(robot: Robot) -> None:
+    robot.watched(stale_after=LATE, allow_old_stamps=True)
     robot.node.destroy_publisher(robot.odom)
     robot.spin_until(lambda: robot.node.count_publishers("/odom") == 0)
     wrong = robot.node.create_publisher(PoseStamped, "/odom", 10)
-    robot.spin_until(lambda: robot.has_said("/odom"))
+    robot.hears("/odom")
     robot.node.destroy_publisher(wrong)
     robot.odom = robot.node.create_publisher(Odometry, "/odom", 10)
-    robot.ready()
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
 
 
-def test_a_dead_simulator_is_not_a_robot_that_is_inside(watched: Callable[..., Robot]) -> None:
-    robot = watched(use_sim_time=True, stale_after=0.1)
+def test_simulated_time_is_heard_in_regular_runs_and_where_it_stands_still_none_is_inside(
+    robot: Robot,
+) -> None:
+    robot.watched(use_sim_time=True, stale_after=0.1)
     robot.ready()
     robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
-    feed(robot, 10, clock=True)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.drive_now(100, clock=True)
+    robot.hears("inside")
+    assert not robot.has_said("no speed for")
     robot.said.clear()
-    robot.spin_until(lambda: robot.has_said("unknown: simulated time stands still"))
+    robot.hears("unknown: simulated time stands still")
     robot.said.clear()
-    waits(robot, 2.5)
+    robot.waits(2.5)
     assert robot.said[NAME]
     assert not robot.has_said("inside")
 
 
-def test_the_clock_is_heard_in_regular_runs_in_simulated_time(
-    watched: Callable[..., Robot],
-) -> None:
-    robot = watched(use_sim_time=True, stale_after=0.1)
+def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(robot: Robot) -> None:
+    robot.watched(warning_margin=1.0, **PLAYED)
     robot.ready()
-    robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
-    feed(robot, 100, clock=True)
-    robot.spin_until(lambda: robot.has_said("inside"))
-    assert not robot.has_said("no speed for")
+    robot.drive(GOOD, speed=0.001)
+    robot.hears("warning")
+    assert not robot.has_said("inside")
+    assert robot.set(NAME, "warning_margin", 0.0) == ""
+    robot.drive([10, 11, 12], speed=0.001)
+    robot.hears("inside")
+
+
+def test_every_alarm_calls_all_services_once(robot: Robot) -> None:
+    """After a restart, and when a run is announced before anybody looked at the alarm."""
+    called: list[str] = []
+    settings = {"nominal": "profile", "controller": "controller"}
+    for name in ("/halt", "/keep"):
+        served(robot, name, called, lambda: (True, ""))
+    robot.watched(stop_service="/halt", snapshot_service="/keep", **settings, **PLAYED)
+    announce = robot.node.create_publisher(String, "/controller/run", qos.DOCUMENT)
+    robot.ready()
+    robot.spin_until(lambda: announce.get_subscription_count() == 1)
+
+    def leave(run: int) -> None:
+        """A run that is announced, begins inside and leaves."""
+        start_ns = 10**18 + 100 * run * PERIOD_NS
+        begun = Run(start_ns, robot.bundle.digest).document()
+        announce.publish(String(data=files.encode(begun).decode()))
+        robot.drive([100 * run + k for k in range(-6, 6)])
+        robot.drive([100 * run + k for k in (6, 7, 8)], speed=1e3)
+
+    leave(1)
+    robot.hears("outside")
+    robot.spin_until(lambda: len(called) == 2)
+    robot.drive([109, 110], speed=1e3)
+    assert sorted(called) == ["/halt", "/keep"]
+    robot.restart()
+    leave(2)
+    robot.hears("outside")
+    robot.spin_until(lambda: len(called) == 4)
+    leave(3)  # nobody has restarted the monitor: it calls because a run begins
+    robot.spin_until(lambda: len(called) >= 6)
+
+
+def test_an_alarm_with_nobody_to_call_says_so_and_calls_until_somebody_answers(
+    robot: Robot,
+) -> None:
+    robot.watched(stop_service="/nobody", **PLAYED)
+    robot.ready()
+    robot.drive(GOOD)
+    robot.drive([10, 11], speed=1e3)
+    robot.hears("outside")
+    robot.hears("; /nobody: not there to be called")
+    assert robot.levels[NAME] == DiagnosticStatus.ERROR
+    called: list[str] = []
+    served(robot, "/nobody", called, lambda: (len(called) > 2, "the base is busy"))
+    robot.hears("; /nobody: the base is busy")
+    robot.spin_until(lambda: len(called) == 3)
+    robot.said.clear()
+    robot.hears("outside")
+    assert not robot.has_said("/nobody"), "it did it"

@@ -1,36 +1,96 @@
-"""Recorder and player as processes over DDS: what is recorded is what was sent."""
+"""The recorder over DDS: what is recorded is what was sent, whatever happens meanwhile."""
 
+import os
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from nav_msgs.msg import Goals
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from bags.recordings.bag import Bag
-from bags.recordings.message_types import header_stamp_ns
+from bags.recordings.definitions import standard_definition
+from bags.recordings.message_types import decode, header_stamp_ns
 from bags.samples import f1tenth
+from nlsid_core.errors import BagError
 from nlsid_ros import qos
-from tests.ros.processes import STARTED, call, node_here, process, refusal, ros_test, stop
+from nlsid_ros.messages import stamp_of
+from tests.ros.processes import STARTED, Bench, ros_test, stop
 
 pytestmark = ros_test
 
-RECORDER = "nlsid_ros.trajectory_recorder"
-PLAYER = "nlsid_ros.bag_player"
+RECORDER = "trajectory_recorder"
 TOPICS = ["/odom", "/cmd_vel", "/steering_command"]
 TRIAL_05 = f1tenth()[4]
+GOALS = "nav_msgs/msg/Goals"  # installed, but younger than the definitions that rosbags ships
+SHARE = Path(sys.prefix) / "share"
+BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class Joints(Bench):
+    """Publishes stamped joint positions, and calls the recorder's services."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        super().__init__(stack)
+        self.sent: list[bytes] = []
+        self.joints = self.node.create_publisher(JointState, "/joints", qos.STREAM)
+
+    def records(
+        self, publisher: Publisher | None = None, /, **settings: object
+    ) -> "subprocess.Popen[str]":
+        """Start a recorder, and wait until it hears the publisher."""
+        recorder = self.start(RECORDER, **settings)
+        heard = publisher or self.joints
+        self.spin_until(lambda: heard.get_subscription_count() == 1)
+        return recorder
+
+    def received(self, topic: str, count: int) -> None:
+        """Wait until the recorder says that so many messages came on the topic."""
+        key = f"{topic} received"
+
+        def said() -> bool:
+            heard = self.said.get(RECORDER, [])
+            return bool(heard) and heard[-1][1].get(key) == str(count)
+
+        self.spin_until(said)
+
+    def publish(self, count: int, *, every: float = 0.002, stamp_ns: int | None = None) -> None:
+        """Publish so many joint states."""
+        for _ in range(count):
+            message = JointState(name=["wheel"], position=[float(len(self.sent))])
+            message.header.stamp = stamp_of(time.time_ns() if stamp_ns is None else stamp_ns)
+            self.sent.append(serialize_message(message))
+            self.joints.publish(self.sent[-1])  # serialised: padding is as it happens to be
+            time.sleep(every)
+
+    def ask(self, what: str) -> tuple[bool, str]:
+        """The recorder's answer."""
+        answer = self.call(f"/{RECORDER}/{what}")
+        return answer.success, answer.message
+
+
+@pytest.fixture
+def robot(stack: ExitStack) -> Joints:
+    return Joints(stack)
 
 
 def messages_on(bag: Path, topic: str) -> list[bytes]:
@@ -38,47 +98,261 @@ def messages_on(bag: Path, topic: str) -> list[bytes]:
         return [message.data for message in source.messages([topic])]
 
 
-def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(tmp_path: Path) -> None:
-    bag = tmp_path / "recorded"
-    reports: list[dict[str, str]] = []
-    texts: list[str] = []
+def data_by_three_readers(bag: Path, topic: str) -> list[list[bytes]]:
+    """The messages on a topic as we, rosbags and mcap read them."""
+    with Bag(bag) as source:
+        files, ours = source.files, [m.data for m in source.messages([topic])]
+    with AnyReader([bag]) as reader:
+        wanted = [c for c in reader.connections if c.topic == topic]
+        rosbags = [bytes(data) for _, _, data in reader.messages(wanted)]
+    mcap: list[bytes] = []
+    for file in files:
+        with file.open("rb") as stream:
+            reading = make_reader(stream, validate_crcs=True).iter_messages([topic])
+            mcap += [message.data for *_, message in reading]
+    return [ours, rosbags, mcap]
 
-    def report(message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == "trajectory_recorder":
-                texts.append(status.message)
-                reports.append({pair.key: pair.value for pair in status.values})
 
-    def all_received() -> bool:
-        return bool(reports) and reports[-1].get("/odom received") == "121"
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+@pytest.mark.parametrize("split", [{"split_time": 0.5}, {"split_size": 0.05}], ids=str)
+def test_a_split_bag_is_read_back_bit_equal_by_three_readers(
+    robot: Joints, tmp_path: Path, compression: str, split: dict[str, object]
+) -> None:
+    bag = tmp_path / "run"
+    settings = {"topics": "[/joints]", "bag": bag, "compression": compression, **split}
+    recorder = robot.records(**settings, chunk_period=0.05)
+    robot.publish(700 if "split_time" in split else 1600, every=0.0015)
+    robot.received("/joints", len(robot.sent))
+    stop(recorder)
+    with Bag(bag) as source:
+        names = [file.name for file in source.files]
+    assert len(names) >= 2
+    assert names == [f"run_{k}.mcap" for k in range(len(names))]
+    assert data_by_three_readers(bag, "/joints") == [robot.sent] * 3
 
-    with (
-        node_here("test_observer") as (node, spin_until),
-        process(RECORDER, topics=TOPICS, bag=bag) as recorder,
-    ):
-        node.create_subscription(DiagnosticArray, "/diagnostics", report, qos.EVENTS)
-        spin_until(lambda: bool(reports))
-        assert texts[0] == "; ".join(f"nothing on {topic} yet" for topic in TOPICS)
-        started = time.monotonic()
-        with process(PLAYER, bag=TRIAL_05) as player:
-            spin_until(all_received)
-            output = player.communicate()[0]
-            assert player.returncode == 0, output
-        assert time.monotonic() - started > 3.0, "a trial lasts 3 s"
-        stop(recorder, signal.SIGINT)
 
-    assert texts[-1] == "recording"
-    expected = {
-        "bag": str(bag),
-        "/odom received": "121",
-        "/odom lost": "0",
-        "/cmd_vel received": "120",
-        "/cmd_vel lost": "0",
-        "/steering_command received": "120",
-        "/steering_command lost": "0",
+@pytest.mark.parametrize("given", [True, False], ids=["msg file", "type description"])
+def test_a_type_that_is_not_standard_is_recorded_with_its_definition(
+    robot: Joints, tmp_path: Path, given: bool
+) -> None:
+    bag = tmp_path / "run"
+    settings: dict[str, object] = {"topics": "[/goals]", "bag": bag, "snapshot": 10.0}
+    if given:
+        definition = SHARE / "nav_msgs" / "msg" / "Goals.msg"
+        if not definition.is_file():
+            pytest.skip("this ROS is installed elsewhere")
+        settings |= {"definitions": f"[{definition}]", "start_type_description_service": False}
+    with pytest.raises(BagError, match="not known"):
+        standard_definition(GOALS)
+    goals = robot.node.create_publisher(Goals, "/goals", qos.STREAM)
+    message = Goals()
+    message.header.frame_id = "map"
+    serialised = serialize_message(message)
+    recorder = robot.records(goals, **settings)
+    goals.publish(serialised)
+    robot.received("/goals", 1)
+    assert robot.ask("snapshot")[0]
+    stop(recorder)
+    for recorded in (bag, tmp_path / "run_snapshot_1"):
+        assert data_by_three_readers(recorded, "/goals") == [[serialised]] * 3
+    with Bag(bag) as source:
+        [raw] = source.messages()
+        msgtype, types = source.types_on("/goals")
+    assert decode(raw.data, msgtype, types).header.frame_id == "map"  # type: ignore[attr-defined]
+    with AnyReader([bag]) as reader:
+        [connection] = reader.connections
+        assert reader.deserialize(raw.data, connection.msgtype).header.frame_id == "map"  # type: ignore[attr-defined]
+
+
+def test_a_type_nobody_describes_is_refused_by_name_and_the_others_go_on(
+    robot: Joints, tmp_path: Path
+) -> None:
+    bag = tmp_path / "partly"
+    robot.node.create_publisher(Goals, "/goals", qos.STREAM)
+    settings = {"topics": ["/joints", "/goals"], "start_type_description_service": False}
+    recorder = robot.records(bag=bag, **settings)
+    robot.hears(f"'{GOALS}' is not known; give its Goals.msg", RECORDER)
+    assert robot.levels[RECORDER] == DiagnosticStatus.ERROR
+    robot.publish(3)
+    time.sleep(0.3)
+    output = stop(recorder)
+    assert "in the parameter definitions" in output
+    assert data_by_three_readers(bag, "/joints") == [robot.sent] * 3
+
+
+@pytest.mark.parametrize("described", [True, False])
+def test_a_definition_that_is_not_the_publishers_is_not_used(
+    robot: Joints, tmp_path: Path, described: bool
+) -> None:
+    other = tmp_path / "nav_msgs" / "msg" / "Goals.msg"
+    other.parent.mkdir(parents=True)
+    other.write_text("float64 x\n")
+    settings = {
+        "topics": "[/goals]",
+        "bag": tmp_path / "run",
+        "definitions": f"[{other}]",
+        "start_type_description_service": described,
     }
-    assert expected.items() <= reports[-1].items()
-    assert float(reports[-1]["/odom rate [Hz]"]) == pytest.approx(40.0, rel=0.01)
+    goals = robot.node.create_publisher(Goals, "/goals", qos.STREAM)
+    recorder = robot.records(goals, **settings)
+    goals.publish(Goals())
+    if described:
+        robot.received("/goals", 1)
+    else:
+        robot.hears(f"'{GOALS}' is published with hash RIHS01_", RECORDER)
+    stop(recorder)
+    with Bag(tmp_path / "run") as source:
+        assert source.count("/goals") == int(described)
+        if described:
+            _, types = source.types_on("/goals")
+            assert [name for name, _ in types.fielddefs[GOALS][1]] == ["header", "goals"]
+
+
+def test_bags_begin_and_end_when_asked_and_nothing_between_them_is_lost(
+    robot: Joints, tmp_path: Path
+) -> None:
+    bag = tmp_path / "run"
+    recorder = robot.records(topics="[/joints]", bag=bag, at_once=False)
+    robot.hears("waiting for ~/start", RECORDER)
+    robot.publish(3)
+    assert robot.ask("stop") == (False, "nothing is being recorded")
+    assert robot.ask("start") == (True, str(bag))
+    assert robot.ask("start") == (False, f"recording {bag} already")
+    robot.publish(5)
+    time.sleep(0.2)
+    assert robot.ask("stop") == (True, f"{bag} is closed")
+    assert (bag / "metadata.yaml").is_file(), "closed while the node runs on"
+    assert robot.ask("start") == (True, f"{bag}_2")
+    robot.publish(4)
+    time.sleep(0.2)
+    stop(recorder)
+    assert data_by_three_readers(bag, "/joints") == [robot.sent[3:8]] * 3
+    assert data_by_three_readers(Path(f"{bag}_2"), "/joints") == [robot.sent[8:]] * 3
+
+
+def test_gaps_in_the_stamps_rate_and_jitter_are_in_the_diagnostics_and_the_bag(
+    robot: Joints, tmp_path: Path
+) -> None:
+    bag = tmp_path / "run"
+    base, period = 10**18, 10_000_000
+    recorder = robot.records(topics="[/joints]", bag=bag)
+    for k in [*range(50), *range(53, 80), *range(82, 100)]:
+        robot.publish(1, stamp_ns=base + k * period + (100_000 if k % 2 else 0))
+    robot.received("/joints", 95)
+    said = robot.said[RECORDER][-1][1]
+    stop(recorder)
+    with Bag(bag) as source:
+        kept = source.custom
+    for values in (said, kept):
+        assert values["/joints received"] == "95"
+        assert values["/joints lost"] == "0"
+        assert values["/joints gaps"] == "2"
+        assert float(values["/joints rate [Hz]"]) == pytest.approx(100.0, rel=0.02)
+        assert float(values["/joints jitter [ms]"]) == pytest.approx(0.1, rel=0.1)
+
+
+def test_messages_that_dds_lost_are_counted(robot: Joints, tmp_path: Path) -> None:
+    bag = tmp_path / "run"
+    sensor = robot.node.create_publisher(String, "/sensor", BEST_EFFORT)
+    big, sent = String(data="x" * 20_000), 6000
+    recorder = robot.records(sensor, topics="[/sensor]", bag=bag)
+    sensor.publish(String(data="first"))
+    time.sleep(0.5)
+    recorder.send_signal(signal.SIGSTOP)
+    for _ in range(sent):
+        sensor.publish(big)
+    recorder.send_signal(signal.SIGCONT)
+    for _ in range(20):
+        sensor.publish(String(data="last"))
+        time.sleep(0.05)
+    robot.hears("messages lost on /sensor", RECORDER)
+    output = stop(recorder)
+    assert "messages lost" in output
+    with Bag(bag) as source:
+        lost, received = int(source.custom["/sensor lost"]), source.count("/sensor")
+    assert lost > 0
+    assert lost + received == sent + 21
+
+
+def test_what_overflowed_while_the_recorder_could_not_take_it_is_counted(
+    robot: Joints, tmp_path: Path
+) -> None:
+    bag = tmp_path / "run"
+    recorder = robot.records(topics="[/joints]", bag=bag)
+    robot.publish(10)
+    time.sleep(0.5)
+    recorder.send_signal(signal.SIGSTOP)
+    robot.publish(12_000, every=0.0)
+    recorder.send_signal(signal.SIGCONT)
+    time.sleep(0.5)
+    robot.publish(10, every=0.05)
+    robot.hears("messages lost on /joints", RECORDER)
+    stop(recorder)
+    with Bag(bag) as source:
+        lost, received = int(source.custom["/joints lost"]), source.count("/joints")
+    assert lost > 1000
+    assert lost + received == len(robot.sent)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 12 MB in memory."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)]
+    if os.geteuid() or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("mounting a small tmpfs needs root")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_on_a_full_disk_all_that_came_before_is_in_a_closed_bag_and_the_node_lives(
+    robot: Joints, small_disk: Path
+) -> None:
+    bag = small_disk / "run"
+    settings = {"topics": "[/noise]", "bag": bag, "least_free": 0.0, "compression": "none"}
+    noise = robot.node.create_publisher(String, "/noise", qos.STREAM)
+    recorder = robot.records(noise, **settings)
+    for k in range(120):
+        noise.publish(String(data=f"{k:08}" + "x" * 50_000))
+        time.sleep(0.02)
+    robot.hears("No space left on device", RECORDER)
+    assert robot.levels[RECORDER] == DiagnosticStatus.ERROR
+    assert robot.ask("stop")[1].startswith("recording stopped: [Errno 28]")
+    assert recorder.poll() is None
+    output = stop(recorder)
+    assert "recording stopped: [Errno 28] No space left on device" in output
+    assert "Traceback" not in output
+    ours, rosbags, mcap = data_by_three_readers(bag, "/noise")
+    assert ours == rosbags == mcap
+    assert [int(data[8:16]) for data in ours] == list(range(len(ours)))
+    assert 4e6 < len(ours) * 50_000 < 12e6
+    with Bag(bag) as source:
+        assert source.custom["ended"].startswith("recording stopped: [Errno 28]")
+
+
+def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(
+    robot: Joints, tmp_path: Path
+) -> None:
+    bag = tmp_path / "recorded"
+    recorder = robot.start(RECORDER, topics=TOPICS, bag=bag)
+    robot.spin_until(lambda: RECORDER in robot.said)
+    nothing = "; ".join(f"nothing on {topic} yet" for topic in TOPICS)
+    assert robot.said[RECORDER][0][0] == nothing
+    started = time.monotonic()
+    player = robot.start("bag_player", bag=TRIAL_05)
+    robot.received("/odom", 121)
+    robot.received("/cmd_vel", 120)
+    robot.spin_until(lambda: player.poll() is not None)
+    assert player.returncode == 0
+    assert time.monotonic() - started > 3.0, "a trial lasts 3 s"
+    stop(recorder, signal.SIGINT)
+
+    text, values = robot.said[RECORDER][-1]
+    assert text == "recording"
+    assert values["bag"] == str(bag)
+    assert {values[f"{topic} lost"] for topic in TOPICS} == {"0"}
+    assert float(values["/odom rate [Hz]"]) == pytest.approx(40.0, rel=0.01)
     with Bag(bag) as source:
         assert source.custom["/odom received"] == "121"
     for topic in TOPICS:
@@ -88,31 +362,18 @@ def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(tmp_path: Path) -
     assert len(recorded) == 361
     assert [m.publish_time for m in recorded] == [header_stamp_ns(m.data) for m in recorded]
     arrivals = [m.log_time for m in recorded]
-    assert 2.9 < (arrivals[-1] - arrivals[0]) / 1e9 < 3.5
-    assert abs(time.time_ns() - arrivals[-1]) < 60 * 10**9, "log time is the time of arrival"
+    assert (arrivals[-1] - arrivals[0]) / 1e9 > 2.9
+    assert abs(time.time_ns() - arrivals[-1]) < 3600 * 10**9, "log time is the time of arrival"
 
 
-def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None:
+def test_a_killed_recorder_loses_at_most_the_last_second(robot: Joints, tmp_path: Path) -> None:
     bag = tmp_path / "killed"
-    sent: list[int] = []
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(RECORDER, topics=["/joints"], bag=bag) as recorder,
-    ):
-        publisher = node.create_publisher(JointState, "/joints", qos.STREAM)
-        spin_until(lambda: publisher.get_subscription_count() == 1)
-
-        def publish() -> None:
-            sent.append(time.time_ns())
-            message = JointState(name=["wheel"], position=[float(len(sent))])
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(sent[-1], 10**9)
-            publisher.publish(message)
-
-        node.create_timer(0.002, publish)
-        spin_until(lambda: len(sent) >= 1250)
-        recorder.kill()
-        recorder.wait()
-        killed_ns = time.time_ns()
+    recorder = robot.records(topics=["/joints"], bag=bag)
+    robot.publish(1250)
+    recorder.kill()
+    killed_ns = time.time_ns()
+    recorder.wait()
+    sent = list(map(header_stamp_ns, robot.sent))
 
     kept: list[int] = []
     with (bag / "killed.mcap").open("rb") as stream:
@@ -124,55 +385,38 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None
             pass
     assert kept == sent[: len(kept)]
     assert len(kept) > 500
-    lost = sent[len(kept) :]
-    assert all((killed_ns - stamp_ns) / 1e9 <= 1.0 for stamp_ns in lost)
+    assert all((killed_ns - stamp_ns) / 1e9 <= 1.0 for stamp_ns in sent[len(kept) :])
 
-    with process(RECORDER, topics=["/joints"], bag=tmp_path / "next") as recorder:
-        while not (tmp_path / "next").exists():
-            time.sleep(0.05)
-        assert recorder.poll() is None
-        output = stop(recorder)
-    assert f"{bag} was not closed; repaired, {len(kept)} messages kept" in output
-    with AnyReader([bag]) as reader:
-        assert [header_stamp_ns(bytes(data)) for *_, data in reader.messages()] == kept
-    with (bag / "killed.mcap").open("rb") as stream:
-        finished = [m.data for *_, m in make_reader(stream, validate_crcs=True).iter_messages()]
-    assert list(map(header_stamp_ns, finished)) == kept
+    recorder = robot.start(RECORDER, topics=["/joints"], bag=tmp_path / "next")
+    robot.spin_until((tmp_path / "next").exists)
+    assert f"{bag} was not closed; repaired, {len(kept)} messages kept" in stop(recorder)
+    assert data_by_three_readers(bag, "/joints") == [robot.sent[: len(kept)]] * 3
 
 
-def test_sigterm_closes_the_bag(tmp_path: Path) -> None:
+def test_sigterm_closes_the_bag(robot: Joints, tmp_path: Path) -> None:
     bag = tmp_path / "terminated"
     typed = "['odom:=nav_msgs/msg/Odometry', '/never:=std_msgs/msg/String']"
-    with process(RECORDER, topics=typed, bag=bag) as recorder:
-        with process(PLAYER, bag=TRIAL_05, topics=["/odom"], rate=50.0) as player:
-            assert player.wait(timeout=STARTED) == 0
-        time.sleep(0.2)
-        stop(recorder, signal.SIGTERM)
+    recorder = robot.start(RECORDER, topics=typed, bag=bag)
+    assert robot.start("bag_player", bag=TRIAL_05, topics=["/odom"]).wait(timeout=STARTED) == 0
+    robot.received("/odom", 121)
+    stop(recorder, signal.SIGTERM)
     assert messages_on(bag, "/odom") == messages_on(TRIAL_05, "/odom")
 
 
 def test_best_effort_topics_and_documents_latched_before_the_start_are_recorded(
-    tmp_path: Path,
+    robot: Joints, tmp_path: Path
 ) -> None:
     bag = tmp_path / "mixed"
-    with node_here("test_robot") as (node, spin_until):
-        latched = node.create_publisher(String, "/document", qos.DOCUMENT)
-        latched.publish(String(data="published before the recording"))
-        best_effort = QoSProfile(
-            depth=10,
-            reliability=ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.VOLATILE,
-        )
-        sensor = node.create_publisher(String, "/sensor", best_effort)
-        with process(RECORDER, topics=["/document", "/sensor"], bag=bag) as recorder:
-            spin_until(lambda: sensor.get_subscription_count() == 1)
-            spin_until(lambda: latched.get_subscription_count() == 1)
-            for _ in range(5):
-                sensor.publish(String(data="reading"))
-                time.sleep(0.05)
-            time.sleep(0.3)
-            stop(recorder)
-    assert len(messages_on(bag, "/document")) == 1
+    latched = robot.node.create_publisher(String, "/document", qos.DOCUMENT)
+    latched.publish(String(data="published before the recording"))
+    sensor = robot.node.create_publisher(String, "/sensor", BEST_EFFORT)
+    recorder = robot.records(sensor, topics=["/document", "/sensor"], bag=bag)
+    robot.received("/document", 1)
+    for _ in range(5):
+        sensor.publish(String(data="reading"))
+        time.sleep(0.05)
+    time.sleep(0.3)
+    stop(recorder)
     assert b"published before the recording" in messages_on(bag, "/document")[0]
     assert len(messages_on(bag, "/sensor")) >= 4
     with Bag(bag) as recorded:
@@ -182,61 +426,22 @@ def test_best_effort_topics_and_documents_latched_before_the_start_are_recorded(
         assert qos.playing_of(recorded.offered("/document")).durability == qos.DOCUMENT.durability
 
 
-@pytest.mark.parametrize(
-    ("module", "parameters", "message"),
-    [
-        (RECORDER, {}, "no topics to record; set the parameter topics"),
-        (RECORDER, {"topics": "['/x:=os/system']"}, "'os/system' is not a message type"),
-        (RECORDER, {"topics": "['/x:=no_such_msgs/msg/Y']"}, "no_such_msgs/msg/Y"),
-        (RECORDER, {"topics": "[/x]", "bag": TRIAL_05}, "trial_05 exists already"),
-        (RECORDER, {"topics": "['/x*:=std_msgs/msg/String']"}, "a pattern cannot have a type"),
-        (RECORDER, {"topics": "[/x]", "compression": "zip"}, "it should be one of zstd, lz4, none"),
-        (RECORDER, {"topics": "[/x]", "definitions": "[/nowhere]"}, "no message definitions; give"),
-        (RECORDER, {"topics": "[/x]", "chunk_period": 5.0}, "Min: 0.05, Max: 0.9, value: 5.0"),
-        (PLAYER, {}, "no bag to play; set the parameter bag"),
-        (PLAYER, {"rate": "fast"}, "parameter rate (speed, 1: as recorded): "),
-        (PLAYER, {"rate": 200.0}, "Min: 0.01, Max: 100.0, value: 200.0"),
-        (PLAYER, {"wait_for": -1}, "parameter wait_for (subscribers each topic must have first)"),
-        (PLAYER, {"bag": "nowhere"}, "there is no bag nowhere"),
-        (PLAYER, {"bag": TRIAL_05, "topics": "[/imu]"}, "has no topic /imu; it has: /cmd_vel"),
-        (
-            PLAYER,
-            {"bag": TRIAL_05, "topics": "[/odom]", "wait_timeout": 0.2},
-            "fewer than 1 subscribers on /odom after 0.2 s",
-        ),
-    ],
-)
-def test_what_a_node_cannot_do_it_says_and_exits_with_status_1(
-    module: str, parameters: dict[str, object], message: str
-) -> None:
-    assert message in refusal(module, **parameters)
-
-
-def test_patterns_and_snapshots(tmp_path: Path) -> None:
+def test_patterns_and_snapshots(robot: Joints, tmp_path: Path) -> None:
     bag = tmp_path / "patterned"
-    settings: dict[str, object] = {"topics": "['/robot/*']", "bag": bag, "snapshot": 60.0}
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(RECORDER, **settings) as recorder,
-    ):
-        names = ("/robot/a", "/robot/b", "/other")
-        a, b, other = (node.create_publisher(String, name, qos.STREAM) for name in names)
-        spin_until(lambda: min(a.get_subscription_count(), b.get_subscription_count()) == 1)
-        assert other.get_subscription_count() == 0
-
-        def ask(what: str) -> str:
-            answer = call(node, spin_until, f"/trajectory_recorder/{what}")
-            assert answer.success, answer.message
-            return str(answer.message)
-
-        for publisher in (a, b):
-            publisher.publish(String(data="before"))
-        time.sleep(0.3)
-        assert ask("stop") == f"{bag} is closed"
-        a.publish(String(data="after"))
-        time.sleep(0.3)
-        assert ask("snapshot").startswith("3 messages in ")
-        stop(recorder)
+    names = ("/robot/a", "/robot/b", "/other")
+    a, b, other = (robot.node.create_publisher(String, name, qos.STREAM) for name in names)
+    recorder = robot.records(a, topics="['/robot/*']", bag=bag, snapshot=60.0)
+    robot.spin_until(lambda: b.get_subscription_count() == 1)
+    assert other.get_subscription_count() == 0
+    for publisher in (a, b):
+        publisher.publish(String(data="before"))
+    robot.received("/robot/b", 1)
+    robot.received("/robot/a", 1)
+    assert robot.ask("stop") == (True, f"{bag} is closed")
+    a.publish(String(data="after"))
+    time.sleep(0.3)
+    assert robot.ask("snapshot")[1].startswith("3 messages in ")
+    stop(recorder)
     assert [m[8:].rstrip(b"\0") for m in messages_on(bag, "/robot/a")] == [b"before"]
     assert len(messages_on(bag, "/robot/b")) == 1
     snapshot = tmp_path / "patterned_snapshot_1"
@@ -244,35 +449,24 @@ def test_patterns_and_snapshots(tmp_path: Path) -> None:
     assert texts == [b"before", b"after"]
 
 
-def test_in_simulated_time_log_times_are_the_simulations(tmp_path: Path) -> None:
+def test_in_simulated_time_log_times_are_the_simulations(robot: Joints, tmp_path: Path) -> None:
     """The simulation runs at a tenth of real time and starts at 100 s."""
-    bag, sent = tmp_path / "run", 0
-    with (
-        node_here("test_simulator") as (node, spin_until),
-        process(RECORDER, bag=bag, topics="[/joints]", use_sim_time=True) as recorder,
-    ):
-        clock = node.create_publisher(Clock, "/clock", qos.STREAM)
-        joints = node.create_publisher(JointState, "/joints", qos.STREAM)
-        spin_until(lambda: clock.get_subscription_count() == 1)
-        spin_until(lambda: joints.get_subscription_count() == 1)
-        began = time.monotonic()
-        while (t := time.monotonic() - began) < 3.0:
-            now_ns = 100 * 10**9 + round(t * 1e8)
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
-            clock.publish(message)
-            if t > 1.0:
-                state = JointState()
-                state.header.stamp = message.clock
-                joints.publish(state)
-                sent += 1
-            due = time.monotonic() + 0.01
-            spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-        stop(recorder)
+    bag = tmp_path / "run"
+    clock = robot.node.create_publisher(Clock, "/clock", qos.STREAM)
+    recorder = robot.records(bag=bag, topics="[/joints]", use_sim_time=True)
+    robot.spin_until(lambda: clock.get_subscription_count() == 1)
+    began = time.monotonic()
+    while (t := time.monotonic() - began) < 3.0:
+        now_ns = 100 * 10**9 + round(t * 1e8)
+        clock.publish(Clock(clock=stamp_of(now_ns)))
+        if t > 1.0:
+            robot.publish(1, stamp_ns=now_ns)
+        robot.waits(0.01)
+    stop(recorder)
     with Bag(bag) as source:
         heard = [(m.log_time_ns, header_stamp_ns(m.data)) for m in source.messages(["/joints"])]
-    assert len(heard) == sent
+    assert len(heard) == len(robot.sent)
     assert all(100.05 < log_ns / 1e9 < 100.5 for log_ns, _ in heard)
     late = sorted(abs(log_ns - stamp_ns) for log_ns, stamp_ns in heard)
     assert late[len(late) // 2] < 20e6, "half of them within 0.2 s of real time"
-    assert len({log_ns for log_ns, _ in heard}) > sent // 2, "not one time for each look"
+    assert len({log_ns for log_ns, _ in heard}) > len(heard) // 2, "not one time for each look"

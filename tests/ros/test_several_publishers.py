@@ -3,8 +3,6 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -20,39 +18,23 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from bags.recordings.bag import Bag
 from bags.signals.publishers import counted_in_turn
 from nlsid_ros import graph, qos
-from tests.ros.processes import ROOT, call, node_here, process, ros_test, stop
-from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Ear, Robot
+from nlsid_ros.messages import stamp_of
+from tests.ros.processes import ROOT, Bench, node_here, ros_test, stop
+from tests.ros.robot import GOOD, PERIOD_NS, Robot
 
 pytestmark = ros_test
 NAME = "funnel_monitor"
-CONTROLLER = "nlsid_ros.tracking_controller"
-RECORDER = "nlsid_ros.trajectory_recorder"
 LATE = 1.0  # s that the machine may be busy
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @pytest.fixture
-def made(funnel: Path) -> Iterator[Callable[..., Robot]]:
-    """A robot and a node beside it, which takes parameters."""
-    with ExitStack() as stack:
-        node, spin_until = stack.enter_context(node_here("test_robot"))
-
-        def make(module: str, says: str, **settings: object) -> Robot:
-            stack.enter_context(process(module, **settings))
-            robot = Robot(node, spin_until, funnel.parent)
-            name = module.rpartition(".")[2]
-            robot.spin_until(lambda: robot.has_said(says, name))
-            return robot
-
-        yield make
-
-
-def watched(made: Callable[..., Robot]) -> Robot:
+def watched(robot: Robot) -> Robot:
     """A robot whose monitor has said inside."""
-    robot = made(MONITOR, "no speed yet", stale_after=LATE, allow_old_stamps=True)
+    robot.watched(stale_after=LATE, allow_old_stamps=True)
     robot.ready()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
     robot.said.clear()
     return robot
 
@@ -61,62 +43,61 @@ def both(robot: Robot, second: Publisher, message: type, samples: range) -> None
     """Samples of the robot, and between them the same at rest from `second`, 1 ms earlier."""
     for k in samples:
         early = message()
-        stamp = early.header.stamp
-        stamp.sec, stamp.nanosec = divmod(10**18 + k * PERIOD_NS - 10**6, 10**9)
+        early.header.stamp = stamp_of(10**18 + k * PERIOD_NS - 10**6)
         second.publish(early)
         robot.drive([k])
 
 
 def test_a_simulator_beside_the_robot_makes_the_state_unknown_until_it_is_gone(
-    made: Callable[..., Robot],
+    watched: Robot,
 ) -> None:
-    robot = watched(made)
+    robot = watched
     simulator = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
-    robot.spin_until(lambda: robot.has_said("unknown: /odom has 2 publishers: /test_robot, /test"))
+    robot.hears("unknown: /odom has 2 publishers: /test_robot, /test")
     robot.said.clear()
     both(robot, simulator, Odometry, range(10, 30))
-    robot.spin_until(lambda: robot.has_said("publishers"))
+    robot.hears("publishers")
     assert not robot.has_said("inside")
     robot.node.destroy_publisher(simulator)
     robot.spin_until(lambda: robot.node.count_publishers("/odom") == 1)
     robot.restart()
     robot.drive(list(range(40, 60)))
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
 
 
 def test_a_second_publisher_of_commands_is_named_and_if_both_send_the_state_is_unknown(
-    made: Callable[..., Robot],
+    watched: Robot,
 ) -> None:
-    robot = watched(made)
+    robot = watched
     other = robot.node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
-    robot.spin_until(lambda: robot.has_said("/cmd_vel has 2 publishers"))
+    robot.hears("/cmd_vel has 2 publishers")
     robot.restart()
     robot.drive(list(range(10, 20)))
-    robot.spin_until(lambda: robot.has_said("inside; /cmd_vel has 2 publishers"))
+    robot.hears("inside; /cmd_vel has 2 publishers")
     both(robot, other, TwistStamped, range(20, 40))
-    robot.spin_until(lambda: robot.has_said("unknown: messages of several publishers come in turn"))
+    robot.hears("unknown: messages of several publishers come in turn")
 
 
-def test_a_publisher_that_is_there_and_says_nothing_is_named(made: Callable[..., Robot]) -> None:
-    robot = made(MONITOR, "no speed yet")
-    robot.spin_until(lambda: robot.has_said("nothing on /odom for 2 s, though /test_robot publish"))
+def test_a_publisher_that_is_there_and_says_nothing_is_named(robot: Robot) -> None:
+    robot.watched()
+    robot.hears("nothing on /odom for 2 s, though /test_robot publish")
     assert robot.levels[NAME] in (DiagnosticStatus.WARN, DiagnosticStatus.STALE)
 
 
-def test_a_driver_that_comes_back_best_effort_is_heard_again(made: Callable[..., Robot]) -> None:
-    robot = watched(made)
+def test_a_driver_that_comes_back_best_effort_is_heard_again(watched: Robot) -> None:
+    robot = watched
     robot.node.destroy_publisher(robot.odom)
     robot.spin_until(lambda: robot.node.count_publishers("/odom") == 0)
     robot.odom = robot.node.create_publisher(Odometry, "/odom", BEST_EFFORT)
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
 
 
 def test_a_driver_that_was_killed_and_replaced_counts_for_the_lease_of_dds(
-    made: Callable[..., Robot],
+    watched: Robot,
 ) -> None:
-    robot = watched(made)
+    robot = watched
     robot.node.destroy_publisher(robot.odom)
     robot.spin_until(lambda: robot.node.count_publishers("/odom") == 0)
     code = (
@@ -125,15 +106,15 @@ def test_a_driver_that_was_killed_and_replaced_counts_for_the_lease_of_dds(
         "time.sleep(100)"
     )
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT) as driver:
-        robot.spin_until(lambda: robot.has_said("nothing on /odom for 2 s, though /driver"))
+        robot.hears("nothing on /odom for 2 s, though /driver")
         driver.kill()
     killed = time.monotonic()
     robot.odom = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
-    robot.spin_until(lambda: robot.has_said("/odom has 2 publishers: /driver, /test_robot"))
+    robot.hears("/odom has 2 publishers: /driver, /test_robot")
     robot.spin_until(lambda: time.monotonic() > killed + graph.LEASE + LATE)
     robot.restart()
     robot.drive(GOOD)
-    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.hears("inside")
 
 
 @pytest.mark.parametrize(
@@ -145,88 +126,82 @@ def test_a_driver_that_was_killed_and_replaced_counts_for_the_lease_of_dds(
     ids=["0", "an hour ahead"],
 )
 def test_a_command_with_a_stamp_that_is_none_is_told_as_that(
-    made: Callable[..., Robot], ahead: float | None, says: str
+    robot: Robot, ahead: float | None, says: str
 ) -> None:
-    robot = made(MONITOR, "no speed yet", stale_after=LATE)
+    robot.watched(stale_after=LATE)
     robot.ready()
-    for _ in range(20):
-        now_ns = time.time_ns()
-        command, state = TwistStamped(), Odometry()
-        stamp = state.header.stamp
-        stamp.sec, stamp.nanosec = divmod(now_ns, 10**9)
-        if ahead is not None:
-            command.header.stamp.sec = now_ns // 10**9 + round(ahead)
-        robot.command.publish(command)
-        robot.odom.publish(state)
-        due = time.monotonic() + 0.025
-        robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-    robot.spin_until(lambda: robot.has_said(says))
+
+    def drive(samples: int, command_ahead: float | None) -> None:
+        """States, and after each its command, for which it waits."""
+        first_ns = time.time_ns()
+        for k in range(samples):
+            command, state = TwistStamped(), Odometry()
+            state.header.stamp = stamp_of(first_ns + k * PERIOD_NS)
+            if command_ahead is not None:
+                ahead_ns = round(command_ahead * 1e9)
+                command.header.stamp = stamp_of(first_ns + k * PERIOD_NS + ahead_ns)
+            robot.odom.publish(state)
+            robot.waits(0.005)
+            robot.command.publish(command)
+            robot.waits(0.02)
+
+    drive(20, ahead)
+    robot.hears(says)
     assert not robot.has_said("inside")
-    first_ns = time.time_ns()
-    for k in range(40):
-        command, state = TwistStamped(), Odometry()
-        for message in (command, state):
-            stamp = message.header.stamp
-            stamp.sec, stamp.nanosec = divmod(first_ns + k * PERIOD_NS, 10**9)
-        robot.odom.publish(state)
-        time.sleep(0.005)  # for which a sample waits
-        robot.command.publish(command)
-        due = time.monotonic() + 0.02
-        robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-    robot.spin_until(lambda: robot.has_said("inside"))
+    drive(40, 0.0)
+    robot.hears("inside")
     assert robot.said[NAME][-1][1]["late commands"] == "0"
 
 
 def test_a_controller_does_not_act_on_two_robots_and_names_who_else_commands(
-    made: Callable[..., Robot],
+    robot: Robot,
 ) -> None:
-    robot = made(CONTROLLER, "idle", highest=0.4, stale_after=LATE)
     name = "tracking_controller"
-    robot.spin_until(lambda: robot.has_said("/cmd_vel has 2 publishers: /test_robot, /", name))
+    robot.start(name, highest=0.4, stale_after=LATE)
+    robot.hears("idle", name)
+    robot.hears("/cmd_vel has 2 publishers: /test_robot, /", name)
     assert robot.levels[name] == DiagnosticStatus.WARN
     simulator = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
     time.sleep(1.0)  # until the controller knows of it
-    answer = call(robot.node, robot.spin_until, f"/{name}/start")
+    answer = robot.call(f"/{name}/start")
     assert not answer.success
     assert "/odom has 2 publishers" in answer.message
     robot.node.destroy_publisher(simulator)
-    robot.spin_until(lambda: call(robot.node, robot.spin_until, f"/{name}/start").success)
-    robot.drive([0, 1, 2], shift_ns=time.time_ns() - 10**18)
+    robot.spin_until(lambda: robot.call(f"/{name}/start").success)
+    robot.drive_now(3)
     robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
-    robot.spin_until(lambda: robot.has_said("stopped: /odom has 2 publishers", name))
-    with process(CONTROLLER, highest=0.4):
-        robot.spin_until(lambda: robot.has_said("2 nodes are called /tracking_controller", name))
+    robot.hears("stopped: /odom has 2 publishers", name)
+    robot.start(name, highest=0.4)
+    robot.hears("2 nodes are called /tracking_controller", name)
 
 
 def test_a_recorder_names_publishers_in_turn_and_one_that_says_nothing_and_follows_another(
-    tmp_path: Path,
+    bench: Bench, tmp_path: Path
 ) -> None:
     bag = tmp_path / "bag"
-    topics = ["/odom", "/silent", "/driver"]
-    with node_here("test_robot") as (node, spin_until), ExitStack() as stack:
-        robot = Ear(node, spin_until)
-        recorder = stack.enter_context(process(RECORDER, topics=topics, bag=bag))
-        first, second = (node.create_publisher(Odometry, "/odom", qos.STREAM) for _ in range(2))
-        node.create_publisher(Odometry, "/silent", qos.STREAM)
-        reliable = node.create_publisher(Odometry, "/driver", qos.STREAM)
-        spin_until(lambda: min(p.get_subscription_count() for p in (first, second, reliable)) == 1)
-        for k in range(20):
-            for publisher in (first, second) if k > 10 else (first,):
-                publisher.publish(Odometry())
-            time.sleep(0.01)
-        node.destroy_publisher(reliable)
-        driver = node.create_publisher(Odometry, "/driver", BEST_EFFORT)
-        spin_until(lambda: driver.get_subscription_count() == 1)
-        driver.publish(Odometry())
-        name = "trajectory_recorder"
-        for text in (
-            "/odom has 2 publishers: /test_robot, /test_robot; stop all but one",
-            "lost messages are not counted: several publishers send on it",
-            "/driver: /test_robot came later and offers less (Best effort publisher and reliable",
-            "nothing on /silent for 2 s, though /test_robot publishes it",
-        ):
-            spin_until(lambda text=text: robot.has_said(text, name))  # type: ignore[misc]
-        stop(recorder)
+    topics, node, name = ["/odom", "/silent", "/driver"], bench.node, "trajectory_recorder"
+    recorder = bench.start(name, topics=topics, bag=bag)
+    first, second = (node.create_publisher(Odometry, "/odom", qos.STREAM) for _ in range(2))
+    node.create_publisher(Odometry, "/silent", qos.STREAM)
+    reliable = node.create_publisher(Odometry, "/driver", qos.STREAM)
+    heard = (first, second, reliable)
+    bench.spin_until(lambda: min(p.get_subscription_count() for p in heard) == 1)
+    for k in range(20):
+        for publisher in (first, second) if k > 10 else (first,):
+            publisher.publish(Odometry())
+        time.sleep(0.01)
+    node.destroy_publisher(reliable)
+    driver = node.create_publisher(Odometry, "/driver", BEST_EFFORT)
+    bench.spin_until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(Odometry())
+    for text in (
+        "/odom has 2 publishers: /test_robot, /test_robot; stop all but one",
+        "lost messages are not counted: several publishers send on it",
+        "/driver: /test_robot came later and offers less (Best effort publisher and reliable",
+        "nothing on /silent for 2 s, though /test_robot publishes it",
+    ):
+        bench.hears(text, name)
+    stop(recorder)
     with Bag(bag) as source:
         assert source.count("/driver") == 1
         [counts] = [batch.sequence for _, batch in source.batches(["/odom"])]

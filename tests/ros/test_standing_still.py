@@ -23,14 +23,14 @@ pytestmark = ros_test
 RECORDER = "nlsid_ros.trajectory_recorder"
 STUCK = """
 import ctypes, threading
-from nlsid_ros.running import run
+from nlsid_ros.starting import entry_point
 from nlsid_ros.trajectory_recorder import TrajectoryRecorder
 
 class Stuck(TrajectoryRecorder):
     def _keep_up(self):
         {how}
 
-run(Stuck, None)
+entry_point(Stuck)()
 """
 SAID = "trajectory_recorder: the executor has stood still for 2 s: ended by its watchdog"
 

@@ -15,8 +15,8 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from bags.designs import documents
 from nlsid_core.funnels.tube import TubeFunnel
-from tests.ros.processes import node_here, process, ros_test, stop
-from tests.ros.robot import GOOD, MONITOR, Robot
+from tests.ros.processes import ros_test, stop
+from tests.ros.robot import GOOD, Robot
 
 pytestmark = ros_test
 
@@ -50,7 +50,9 @@ class Reader:
                 yield json.loads(line[6:])
 
 
-def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(funnel: Path) -> None:
+def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
+    robot: Robot, funnel: Path
+) -> None:
     port = free_port()
     proved = documents.load_proved(funnel).design.funnel
     assert isinstance(proved, TubeFunnel)
@@ -58,32 +60,28 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(funnel: Path) -
     names = {"__ns": "/robot1"}
     shared = {"/robot1/odom": "/odom", "/robot1/cmd_vel": "/cmd_vel"}
     signals = {"allow_old_stamps": True, "source": "/funnel_publisher", "stale_after": 5.0}
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(MONITOR, **signals, **names, **shared) as monitor,
-        process("nlsid_ros.viewer", port=port, **names) as viewer,
-    ):
-        robot = Robot(node, spin_until, funnel.parent)
-        robot.ready()
-        margin = "/robot1/funnel_monitor/margin"
-        spin_until(lambda: node.count_subscribers(margin) == 1)
-        reader = Reader(port)
-        k = 0
+    monitor = robot.start("funnel_monitor", **signals, **names, **shared)
+    viewer = robot.start("viewer", port=port, **names)
+    robot.ready()
+    margin = "/robot1/funnel_monitor/margin"
+    robot.spin_until(lambda: robot.node.count_subscribers(margin) == 1)
+    reader = Reader(port)
+    k = 0
 
-        def drive_until(word: str) -> None:
-            nonlocal k
-            while reader.verdict != word:
-                robot.drive([k := k + 1])
+    def drive_until(word: str) -> None:
+        nonlocal k
+        while reader.verdict != word:
+            robot.drive([k := k + 1])
 
-        robot.drive(GOOD)
-        k = GOOD[-1]
-        drive_until("inside")
-        assert reader.names == ["speed [m/s]"]
-        assert reader.signals[1] == pytest.approx(width, rel=1e-4)
-        assert reader.samples > 5
-        spin_until(lambda: reader.verdict == "late")
-        monitor.send_signal(signal.SIGSTOP)
-        spin_until(lambda: reader.verdict == "stale")
-        monitor.send_signal(signal.SIGCONT)
-        spin_until(lambda: reader.verdict != "stale")
-        stop(viewer)
+    robot.drive(GOOD)
+    k = GOOD[-1]
+    drive_until("inside")
+    assert reader.names == ["speed [m/s]"]
+    assert reader.signals[1] == pytest.approx(width, rel=1e-4)
+    assert reader.samples > 5
+    robot.spin_until(lambda: reader.verdict == "late")
+    monitor.send_signal(signal.SIGSTOP)
+    robot.spin_until(lambda: reader.verdict == "stale")
+    monitor.send_signal(signal.SIGCONT)
+    robot.spin_until(lambda: reader.verdict != "stale")
+    stop(viewer)

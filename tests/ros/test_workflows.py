@@ -1,40 +1,45 @@
 """The three workflows as one command starts them, and the launch files behind them."""
 
+import math
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM, Signals
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
-from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from bags.chain.config import load_config
+from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth
+from bags.samples import dart, f1tenth
+from bags.setup.candidates import look
+from bags.setup.proposing import propose
+from bags.setup.written import yaml_text
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
-from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import ROOT, STARTED, SpinUntil, call, node_here, process, ros_test
+from nlsid_ros.messages import stamp_ns_of, stamp_of
+from tests.ros.processes import ROOT, STARTED, Bench, process, ros_test, stop
 
 pytestmark = ros_test
 
@@ -42,47 +47,17 @@ ENDED = 40.0  # s for all nodes of a workflow to end when asked to
 PATIENT = ["stale_after:=1.0", "command_wait:=0.5"]  # the machine may be busy with other tests
 
 
-class Operator:
-    """Hears what the nodes say and calls their services."""
-
-    def __init__(self, node: Node, spin_until: SpinUntil) -> None:
-        self.node, self.spin_until = node, spin_until
-        self.said: dict[str, list[str]] = {}
-        self.values: dict[str, dict[str, str]] = {}
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.said.setdefault(status.name, []).append(status.message)
-            self.values[status.name] = {entry.key: entry.value for entry in status.values}
-
-    def has_said(self, node: str, text: str) -> bool:
-        """Whether `node` has said something with `text`."""
-        return any(text in said for said in self.said.get(node, []))
-
-    def hears(self, node: str, text: str) -> None:
-        """Wait for it."""
-        self.spin_until(lambda: self.has_said(node, text))
-
-    def call(self, service: str) -> None:
-        """Call a std_srvs/Trigger that succeeds."""
-        assert self.asks(service) == ""
-
-    def asks(self, service: str) -> str:
-        """Call a std_srvs/Trigger; why it did not succeed, empty if it did."""
-        answer = call(self.node, self.spin_until, service)
-        return "" if answer.success else str(answer.message)
-
-    def waits(self, seconds: float) -> None:
-        """Let time pass."""
-        until = time.monotonic() + seconds
-        self.spin_until(lambda: time.monotonic() > until)
-
-
 @pytest.fixture
-def operator() -> Iterator[Operator]:
-    with node_here("test_operator") as (node, spin_until):
-        yield Operator(node, spin_until)
+def margins(bench: Bench) -> dict[int, dict[str, float]]:
+    """The numbers of the monitor's margins, by stamp (ns)."""
+    heard: dict[int, dict[str, float]] = {}
+
+    def hear(message: JointState) -> None:
+        numbers = zip(message.name, message.position, strict=True)
+        heard[stamp_ns_of(message)] = dict(numbers)
+
+    bench.listen(JointState, "/funnel_monitor/margin", hear)
+    return heard
 
 
 @contextmanager
@@ -100,22 +75,22 @@ def live(workflow: str, *arguments: str) -> Iterator[None]:
             running.wait(timeout=ENDED)
 
 
-def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> None:
+def test_monitor_only_on_an_existing_stack(bench: Bench, funnel: Path) -> None:
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     with live("monitor", f"funnel:={funnel}", "allow_old_stamps:=true", *PATIENT):
-        operator.hears("funnel_monitor", " yet")
+        bench.hears(" yet", "funnel_monitor")
         topics = "['/odom', '/cmd_vel']"
-        with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
-            operator.hears("funnel_monitor", "inside")
-            operator.hears("funnel_monitor", "unknown: no speed for 1 s")
-            assert player.wait(timeout=STARTED) == 0
-    assert not operator.has_said("funnel_monitor", "outside")
-    assert not operator.has_said("funnel_monitor", "violated")
+        player = bench.start("bag_player", bag=trial, topics=topics)
+        bench.hears("inside", "funnel_monitor")
+        bench.hears("unknown: no speed for 1 s", "funnel_monitor")
+        assert player.wait(timeout=STARTED) == 0
+    assert not bench.has_said("outside", "funnel_monitor")
+    assert not bench.has_said("violated", "funnel_monitor")
 
 
 @pytest.mark.parametrize("how", [SIGTERM, SIGKILL], ids=["SIGTERM", "SIGKILL"])
 def test_nodes_end_with_the_command_that_started_them(
-    operator: Operator, funnel: Path, how: Signals
+    bench: Bench, funnel: Path, how: Signals
 ) -> None:
     model = funnel.with_name(documents.MODEL)
     arguments = [f"funnel:={funnel}", f"model:={model}", "plant:=true", "highest:=0.4", *PATIENT]
@@ -125,27 +100,27 @@ def test_nodes_end_with_the_command_that_started_them(
     def hear(message: TwistStamped) -> None:
         commands.append(message.twist.linear.x)
 
-    operator.node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+    bench.listen(TwistStamped, "/cmd_vel", hear)
     running = subprocess.Popen(command, cwd=ROOT)
     try:
-        operator.hears("funnel_monitor", "waiting for the controller")
-        operator.hears("tracking_controller", "idle")
-        counted = operator.node.count_subscribers
-        operator.spin_until(lambda: counted("/cmd_vel") >= 3)  # plant, monitor and this one
-        operator.waits(1.0)  # the graph knows a subscription before its publisher does
-        operator.call("/tracking_controller/start")
-        operator.hears("funnel_monitor", "inside")
+        bench.hears("waiting for the controller", "funnel_monitor")
+        bench.hears("idle", "tracking_controller")
+        counted = bench.node.count_subscribers
+        bench.spin_until(lambda: counted("/cmd_vel") >= 3)  # plant, monitor and this one
+        bench.waits(1.0)  # the graph knows a subscription before its publisher does
+        assert bench.call("/tracking_controller/start").success
+        bench.hears("inside", "funnel_monitor")
         children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
         assert len(children) == 4
         running.send_signal(how)
         running.wait(timeout=ENDED)
-        operator.spin_until(lambda: not any(_runs(child) for child in children))
-        operator.spin_until(lambda: operator.node.get_node_names() == ["test_operator"])
+        bench.spin_until(lambda: not any(_runs(child) for child in children))
+        bench.spin_until(lambda: bench.node.get_node_names() == ["test_robot"])
     finally:
         running.kill()
         running.wait()
     assert max(commands) > 0.0
-    operator.spin_until(lambda: commands[-1] == 0.0)  # it ramped down
+    bench.spin_until(lambda: commands[-1] == 0.0)  # it ramped down
 
 
 def _runs(pid: str) -> bool:
@@ -158,7 +133,7 @@ def _runs(pid: str) -> bool:
 
 
 def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
-    operator: Operator, tmp_path: Path
+    bench: Bench, margins: dict[int, dict[str, float]], tmp_path: Path
 ) -> None:
     """Around the model's own simulation: margins heard are those of the replay, bit for bit."""
     content = yaml.safe_load((ROOT / "config" / "f1tenth.yaml").read_text())
@@ -178,29 +153,23 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
         for stamp, reading in zip(replayed.stamps_ns, replayed.readings, strict=True)
         if reading.status is Status.INSIDE
     ]
-    heard: dict[int, float] = {}
-
-    def margin(message: JointState) -> None:
-        heard[stamp_ns_of(message)] = message.position[0]
-
-    operator.node.create_subscription(JointState, "/funnel_monitor/margin", margin, qos.STREAM)
     funnel = out / documents.FUNNEL
     with live("monitor", f"funnel:={funnel}", "allow_old_stamps:=true", *PATIENT):
-        operator.hears("funnel_monitor", " yet")
+        bench.hears(" yet", "funnel_monitor")
         topics = "['/odom', '/cmd_vel']"
-        with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
-            operator.hears("funnel_monitor", "inside")
-            operator.spin_until(lambda: {stamp for stamp, _ in expected} <= heard.keys())
-            assert player.wait(timeout=STARTED) == 0
-        operator.hears("funnel_monitor", "unknown: no speed for 1 s")
+        player = bench.start("bag_player", bag=trial, topics=topics)
+        bench.hears("inside", "funnel_monitor")
+        bench.spin_until(lambda: {stamp for stamp, _ in expected} <= margins.keys())
+        assert player.wait(timeout=STARTED) == 0
+        bench.hears("unknown: no speed for 1 s", "funnel_monitor")
     assert len(expected) > 100
-    assert [(stamp, heard[stamp]) for stamp, _ in expected] == expected
-    assert not operator.has_said("funnel_monitor", "outside")
-    assert not operator.has_said("funnel_monitor", "violated")
+    assert [(stamp, margins[stamp]["margin"]) for stamp, _ in expected] == expected
+    assert not bench.has_said("outside", "funnel_monitor")
+    assert not bench.has_said("violated", "funnel_monitor")
 
 
 def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
-    operator: Operator, funnel: Path
+    bench: Bench, funnel: Path
 ) -> None:
     def robot(name: str, push: float) -> list[str]:
         return [
@@ -217,33 +186,32 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
         for name, push in (("gentle", 0.05), ("hard", 0.6)):
             stack.enter_context(live("control", *robot(name, push)))
         for name in ("gentle", "hard"):
-            operator.hears(f"{name}/tracking_controller", "idle")
-            operator.hears(f"{name}/funnel_monitor", "waiting for the controller")
+            bench.hears("idle", f"{name}/tracking_controller")
+            bench.hears("waiting for the controller", f"{name}/funnel_monitor")
         for name in ("gentle", "hard"):
-            operator.call(f"/{name}/tracking_controller/start")
+            assert bench.call(f"/{name}/tracking_controller/start").success
         for name in ("gentle", "hard"):
-            operator.hears(f"{name}/funnel_monitor", "inside")
-        operator.waits(1.0)
+            bench.hears("inside", f"{name}/funnel_monitor")
+        bench.waits(1.0)
         for name in ("gentle", "hard"):
-            operator.call(f"/{name}/plant/push")
-        operator.hears("hard/funnel_monitor", "outside the tube")
+            assert bench.call(f"/{name}/plant/push").success
+        bench.hears("outside the tube", "hard/funnel_monitor")
         ends = ("asked to", "outside: funnel_monitor says")  # whichever is heard first
-        operator.spin_until(
+        bench.spin_until(
             lambda: any(
-                operator.has_said("hard/tracking_controller", f"idle; stopped: {end}")
-                for end in ends
+                bench.has_said(f"idle; stopped: {end}", "hard/tracking_controller") for end in ends
             )
         )
-        operator.hears("gentle/tracking_controller", "idle; stopped: the plan is over")
-        names = {name for name, _ in operator.node.get_topic_names_and_types()}
-    assert not operator.has_said("gentle/funnel_monitor", "outside")
-    assert not operator.has_said("gentle/funnel_monitor", "violated")
+        bench.hears("idle; stopped: the plan is over", "gentle/tracking_controller")
+        names = {name for name, _ in bench.node.get_topic_names_and_types()}
+    assert not bench.has_said("outside", "gentle/funnel_monitor")
+    assert not bench.has_said("violated", "gentle/funnel_monitor")
     assert {"/gentle/odom", "/hard/odom", "/diagnostics"} <= names
     assert not {"/odom", "/cmd_vel"} & names, "nothing is outside the namespaces"
 
 
 def test_all_nodes_in_one_process_hold_the_loop_while_a_proof_is_decided(
-    operator: Operator, funnel: Path, tmp_path: Path
+    bench: Bench, margins: dict[int, dict[str, float]], funnel: Path, tmp_path: Path
 ) -> None:
     """Every sample is judged and has its command: nobody starves. Then a push, and an alarm."""
     for file in funnel.parent.iterdir():
@@ -256,37 +224,32 @@ def test_all_nodes_in_one_process_hold_the_loop_while_a_proof_is_decided(
         "push:=0.6",
         *PATIENT,
     ]
-    margins: dict[int, float] = {}
-
-    def judge(message: JointState) -> None:
-        margins[stamp_ns_of(message)] = message.position[message.name.index("margin")]
 
     def inside() -> list[int]:
-        return sorted(stamp_ns for stamp_ns, margin in margins.items() if margin >= 0.0)
+        return sorted(stamp for stamp, numbers in margins.items() if numbers["margin"] >= 0.0)
 
-    operator.node.create_subscription(JointState, "/funnel_monitor/margin", judge, qos.STREAM)
     with live("control", *given, "--one-process"):
-        operator.hears("tracking_controller", "idle")
-        operator.hears("funnel_monitor", "waiting for the controller")
-        operator.call("/tracking_controller/start")
-        operator.hears("funnel_monitor", "inside")
-        operator.said.clear()
+        bench.hears("idle", "tracking_controller")
+        bench.hears("waiting for the controller", "funnel_monitor")
+        assert bench.call("/tracking_controller/start").success
+        bench.hears("inside", "funnel_monitor")
+        bench.said.clear()
         proof = tmp_path / documents.FUNNEL_PROOF
         proof.write_text(proof.read_text().replace('"proof":', " " * 10**6 + '"proof":'))
-        operator.hears("tracking_controller", "idle; stopped: the p")
+        bench.hears("idle; stopped: the p", "tracking_controller")
         stamps = inside()
         assert len(stamps) == 117
         assert {round((b - a) / 25e6) for a, b in pairwise(stamps)} == {1}
-        operator.call("/funnel_monitor/restart")
-        operator.spin_until(lambda: operator.asks("/tracking_controller/start") == "")
-        operator.spin_until(lambda: len(inside()) > 140)
-        operator.call("/plant/push")
-        operator.hears("funnel_monitor", "outside the tube")
-        operator.hears("tracking_controller", "idle; stopped: ")
+        assert bench.call("/funnel_monitor/restart").success
+        bench.spin_until(lambda: bench.call("/tracking_controller/start").success)
+        bench.spin_until(lambda: len(inside()) > 140)
+        assert bench.call("/plant/push").success
+        bench.hears("outside the tube", "funnel_monitor")
+        bench.hears("idle; stopped: ", "tracking_controller")
 
 
 def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
-    operator: Operator, funnel: Path, tmp_path: Path
+    bench: Bench, funnel: Path, tmp_path: Path
 ) -> None:
     trials = tmp_path / "trials"
     trials.mkdir()
@@ -300,31 +263,29 @@ def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
         live("identify", *common, *excite, f"bag:={trials / 'trial_new'}"),
     ):
         listeners = {"/odom": 1, "/cmd_vel": 2}  # recorder and plant
-        operator.spin_until(
-            lambda: all(operator.node.count_subscribers(t) >= n for t, n in listeners.items())
+        bench.spin_until(
+            lambda: all(bench.node.count_subscribers(t) >= n for t, n in listeners.items())
         )
-        operator.call("/excitation/start")
-        operator.hears("excitation", "done")
-        operator.waits(0.5)  # what was said last is on its way to the recorder
+        assert bench.call("/excitation/start").success
+        bench.hears("done", "excitation")
+        bench.waits(0.5)  # what was said last is on its way to the recorder
     with Bag(trials / "trial_new") as recorded:
         assert recorded.count("/odom") > 100
         assert recorded.count("/cmd_vel") > 80
         assert recorded.count("/excitation/experiment") == 2  # its start and its end
 
     models: list[String] = []
-    operator.node.create_subscription(
-        String, "/model_identifier/model", models.append, qos.DOCUMENT
-    )
+    bench.listen(String, "/model_identifier/model", models.append, qos.DOCUMENT)
     with live("identify", *common, f"bag:={tmp_path / 'another'}"):
-        operator.call("/model_identifier/identify")
-        operator.hears("model_identifier", "PROVED")
-        operator.spin_until(lambda: len(models) == 1)
+        assert bench.call("/model_identifier/identify").success
+        bench.hears("PROVED", "model_identifier")
+        bench.spin_until(lambda: len(models) == 1)
     model = DifferenceEquation.from_document(files.parse_document(models[0].data))
     assert len(model) == 4
 
 
 def test_what_is_recorded_and_excited_is_what_the_configuration_names(
-    operator: Operator, tmp_path: Path
+    bench: Bench, tmp_path: Path
 ) -> None:
     """A robot whose topics have other names, and a recording that goes on while it is identified:
     the one that is open and the one without a command are left out.
@@ -342,17 +303,17 @@ def test_what_is_recorded_and_excited_is_what_the_configuration_names(
     given += ["excite:=true", "highest:=0.3", "slew:=1.0", "duration:=1.0"]
     given += [f"bag:={trials / 'trial_new'}"]
     with live("identify", *given):
-        operator.spin_until(lambda: operator.node.count_publishers("/diff/cmd_vel") == 1)
-        operator.spin_until(lambda: operator.node.count_subscribers("/diff/cmd_vel") == 1)
-        assert operator.node.count_publishers("/cmd_vel") == 0
-        operator.call("/model_identifier/identify")
-        operator.hears("model_identifier", "PROVED")
-        left_out = operator.values["model_identifier"]["left out"]
+        bench.spin_until(lambda: bench.node.count_publishers("/diff/cmd_vel") == 1)
+        bench.spin_until(lambda: bench.node.count_subscribers("/diff/cmd_vel") == 1)
+        assert bench.node.count_publishers("/cmd_vel") == 0
+        assert bench.call("/model_identifier/identify").success
+        bench.hears("PROVED", "model_identifier")
+        left_out = bench.said["model_identifier"][-1][1]["left out"]
         assert "trial_new: it is not closed" in left_out
         assert "trial_01: it has nothing on /diff/cmd_vel" in left_out
-        operator.call("/excitation/start")
-        operator.hears("excitation", "done")
-        operator.waits(0.5)
+        assert bench.call("/excitation/start").success
+        bench.hears("done", "excitation")
+        bench.waits(0.5)
     with Bag(trials / "trial_new") as recorded:
         assert recorded.count("/diff/cmd_vel") > 30
         assert "/cmd_vel" not in recorded.topics
@@ -385,3 +346,169 @@ def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     assert done.returncode == 2
     assert "'plants:=true' is not one of the arguments of control.launch.xml" in done.stderr
     assert "stale_after:=0.0" in done.stderr
+
+
+TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
+
+
+@pytest.mark.parametrize(
+    ("push", "simulated"), [(0.05, False), (0.05, True), (0.6, False)], ids=str
+)
+def test_the_loop_is_closed_and_judged_as_in_replay_whether_pushed_gently_or_too_hard(
+    bench: Bench,
+    margins: dict[int, dict[str, float]],
+    funnel: Path,
+    tmp_path: Path,
+    push: float,
+    simulated: bool,
+) -> None:
+    """Pushed 1 s after it started tracking. simulated: /clock ticks once a sample, so that commands
+    have the stamps of samples.
+    """
+    bag, controller = tmp_path / "run", "tracking_controller"
+    clock = bench.node.create_publisher(Clock, "/clock", qos.STREAM)
+    ticks = count(10**18, 25_000_000)
+    if simulated:
+        bench.node.create_timer(0.025, lambda: clock.publish(Clock(clock=stamp_of(next(ticks)))))
+    nodes: dict[str, dict[str, object]] = {
+        "trajectory_recorder": {"topics": TOPICS, "bag": bag, "snapshot": 10.0},
+        "funnel_publisher": {"funnel": funnel},
+        "funnel_monitor": {
+            "nominal": "profile",
+            "controller": controller,
+            "stop_service": "/tracking_controller/stop",
+            "snapshot_service": "/trajectory_recorder/snapshot",
+            "command_wait": 0.5,  # the machine may be busy with other tests
+            "stale_after": 1.0,
+        },
+        controller: {"highest": 0.4, "stale_after": 1.0},
+        "plant": {"model": funnel.with_name(documents.MODEL), "noise": 0.002, "push": push},
+    }
+    running = [bench.start(name, **given, use_sim_time=simulated) for name, given in nodes.items()]
+    bench.hears("idle", controller)
+    counted = bench.node.count_subscribers
+    bench.spin_until(lambda: min(map(counted, ("/cmd_vel", "/odom"))) >= 3)
+    bench.hears("waiting for the controller")
+    bench.waits(1.0)  # the graph knows a recorder before the plant does
+    assert bench.call(f"/{controller}/start").success
+    bench.hears("inside")
+    bench.waits(1.0)
+    assert bench.call("/plant/push").success
+    bench.hears("idle; stopped", controller)
+    over = ("the run has ended", "outside")
+    bench.spin_until(lambda: any(map(bench.has_said, over)))
+    for each in running:
+        stop(each)
+
+    replay = replay_bag(documents.load_proved(funnel), bag, centre=Centre.PROFILE)
+    judged = {
+        stamp_ns: reading.numbers
+        for stamp_ns, reading in zip(replay.stamps_ns, replay.readings, strict=True)
+        if reading.status is not Status.UNKNOWN
+    }
+    live_ns = [stamp for stamp, numbers in margins.items() if not math.isnan(numbers["margin"])]
+    common = judged.keys() & set(live_ns)
+    assert len(common) >= 0.9 * len(live_ns) > 0
+    for stamp in common:
+        heard = {key: margins[stamp][key] for key in judged[stamp]}
+        assert np.array_equal(list(heard.values()), list(judged[stamp].values()), equal_nan=True)
+    least = min(judged[stamp]["margin"] for stamp in common)
+    snapshot = bag.with_name("run_snapshot_1")
+    if push < 0.1:
+        bench.hears("idle; stopped: the plan is over", controller)
+        assert not bench.has_said("outside")
+        assert not bench.has_said("violated")
+        assert bench.has_said("unknown: the run has ended: the plan is over")
+        assert (len(common), least > 0.3, snapshot.exists()) == (117, True, False)
+        return
+    assert bench.has_said("idle; stopped: asked to", controller)
+    assert bench.has_said("above the level")
+    assert bench.has_said("outside the tube")
+    assert least < 0.0
+    with Bag(bag) as source:
+        events = b"".join(m.data for m in source.messages(["/funnel_monitor/events"]))
+    assert b"above the level" in events
+    with Bag(snapshot) as source:
+        assert source.count("/odom") > 40, "what led there was kept"
+
+
+def demonstrated(funnel: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    """The live demonstration on trial 5; it says itself whether all is as it should be."""
+    command = [sys.executable, "-m", "nlsid_ros.demo.live", "--funnel", str(funnel)]
+    options = ["--bag", str(f1tenth()[4]), "--out", str(out)]
+    return subprocess.run(command + options, capture_output=True, text=True, check=False)
+
+
+def test_live_nodes_agree_with_the_offline_replay(funnel: Path, tmp_path: Path) -> None:
+    done = demonstrated(funnel, tmp_path / "live")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "recorder: 241 of 241 messages, equal to what was sent" in done.stdout
+    assert "monitor: 117 of 117 margins, at most 0.0e+00 from the offline" in done.stdout
+    assert "above the level" in done.stdout
+
+
+def test_a_demonstration_whose_fault_would_not_be_flagged_is_refused_by_name(
+    funnel: Path, tmp_path: Path
+) -> None:
+    config = load_config(config_file("f1tenth.yaml"))
+    assert config.funnel is not None
+    wide = config.funnel.model_copy(update={"safety_factor": 100.0})
+    settings = config.model_copy(update={"funnel": wide})
+    design_funnel_files(funnel.with_name(documents.MODEL), settings, tmp_path)
+    done = demonstrated(tmp_path / documents.FUNNEL, tmp_path / "live")
+    assert done.returncode == 1
+    [said] = done.stderr.splitlines()
+    assert "live: trial_05 with its sensor scaled by 0.6 is not flagged: inside" in said
+
+
+def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_replay(
+    tmp_path: Path,
+) -> None:
+    """The F1TENTH car: speed and steering commands to speed and yaw rate, over DDS."""
+    bags, config, out = f1tenth(), tmp_path / "robot.yaml", tmp_path / "two_by_two"
+    chosen: dict[str, Any] = {
+        "responses": [
+            "/odom:twist.twist.linear.x",
+            "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)",
+        ],
+        "excitations": ["/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"],
+    }
+    config.write_text(yaml_text(propose(bags, look(bags), robot="car", **chosen)))
+    settings = load_config(config)
+    identify_bags(bags, settings, out, progress=silent)
+    design_funnel_files(out / documents.MODEL, settings, out)
+    done = demonstrated(out / documents.FUNNEL, tmp_path / "live")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "recorder: 361 of 361 messages, equal to what was sent" in done.stdout
+
+
+def init_live(config: Path, seconds: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "bags.commands.cli", "init", str(config.parent), "--live"]
+    options = ["--yes", "--seconds", seconds]
+    return subprocess.run(command + options, capture_output=True, text=True, check=False)
+
+
+def test_a_running_robot_is_looked_at_for_a_first_configuration(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """A real car's drive, played in real time to whoever listens."""
+    drive = next(bag for bag in dart() if bag.name == "rubbery_20240916_151759")
+    config = tmp_path / "robot.yaml"
+    bench.start("bag_player", bag=drive, topics="['/command', '/motion']", wait_timeout=300.0)
+    done = init_live(config, "12")
+    assert done.returncode == 0, done.stdout + done.stderr
+    settings = load_config(config)
+    assert settings.signals.response[0].path.startswith("/motion:")
+    assert settings.signals.excitation[0].path.startswith("/command:")
+    assert settings.grid.period == pytest.approx(0.05, rel=0.05)
+    assert settings.split.share is not None
+    assert "topics:=[/command, /motion]" in done.stdout
+    assert f"nlsid identify {tmp_path} TRIALS" in done.stdout
+
+
+def test_where_nothing_runs_this_is_said(tmp_path: Path) -> None:
+    config = tmp_path / "robot.yaml"
+    done = init_live(config, "1")
+    assert done.returncode == 2
+    assert "nothing was heard" in done.stderr
+    assert not config.exists()

@@ -74,6 +74,19 @@ class Pieces:
         return replace(self, **kept)
 
 
+@dataclass(frozen=True, eq=False)
+class InputRates:
+    """How fast the policy changes input entry (B,), with a sign (B,), on pieces, at w (B, n_w).
+
+    Pieces that differ in entry and sign only follow each other, in the same frame T.
+    """
+
+    pieces: Pieces
+    w: FloatArray
+    entry: IntArray
+    sign: IntArray
+
+
 def batches(field: VectorField, funnel: ContinuousFunnel, pieces: Pieces) -> Iterator[IntArray]:
     """Indices of pieces that obey the same equations, as many as fit at once."""
     size = max(1, CELLS // (len(pieces.basis) ** 2 * 16))
@@ -127,19 +140,15 @@ def rate_polynomial(
     field: VectorField,
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
-    pieces: Pieces,
-    w: FloatArray,
-    *,
+    of: InputRates,
     room: FloatArray,
-    entry: IntArray,
-    sign: IntArray,
     end: int | None = None,
 ) -> Graded:
     """h room - sign dũ_i/ds - τ(ρ - x̄'Px̄) of every piece, as `closed_loop_polynomial` writes c.
 
-    w: (B, n_w). room: (B,) in input units per s. entry: (B,) i. τ: the first of the piece's. Pieces
-    that differ in entry and sign only follow each other, in the same frame T.
+    room: (B,) in input units per s. τ: the first of the piece's. end: only its value at 0 or at 1.
     """
+    pieces, w, entry = of.pieces, of.w, of.entry
     n, k = field.n, pieces.interval
     loop = _Loop(field, policy, funnel, pieces, w, end)
     case = np.column_stack([k, pieces.level, pieces.index, pieces.vertex, pieces.mode])
@@ -157,7 +166,7 @@ def rate_polynomial(
         here = {q: part[shared] for q, part in rate.items()}
         error = add(here, {0: -x_rate[:, :, j][:, :, None]})
         change = add(change, multiply({0: -along[:, :, j][:, :, None]}, error, n))
-    c: Graded = {q: -sign[:, None, None] * part for q, part in change.items()}
+    c: Graded = {q: -of.sign[:, None, None] * part for q, part in change.items()}
     c = add(c, {0: (np.diff(funnel.t)[k] * room)[:, None, None]})
     return add(c, negative(multiply(loop.squares(0), loop.gap(), n)))
 

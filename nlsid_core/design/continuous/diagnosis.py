@@ -127,14 +127,14 @@ def diagnosed(
         for case, solution in enumerate(found):
             left = solution.upper + growth / rho
             if worst is None or left < worst[0]:
-                worst = (left, section, rho, case, steps.weights(solution))
+                worst = (left, section, rho, case, solution.y)
     if worst is None:  # no program was solved: the mean over the boundary is all there is
         y = np.full(len(steps.program.points), 1 / len(steps.program.points))
         worst = (0.0, sections[0], rhos[0], 0, y)
     _, section, rho, case, y = worst
     linear, parts = _terms(steps, section, rho, case)
     taken = dict.fromkeys(TERMS, 0.0) | {name: -float(p @ y) for name, p in parts.items()}
-    widths = np.sqrt(rho * np.diag(np.linalg.inv(section.P)))
+    widths = np.sqrt(rho * np.diag(np.linalg.inv(section.shape.P)))
     return Diagnosis(
         section.t, float(linear @ y) + growth / rho, taken, tuple(float(w) for w in widths)
     )
@@ -144,12 +144,12 @@ def _terms(
     steps: LSteps, section: Section, rho: float, case: int
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """-Ẇ/ρ of the linear closed loop at the program's points, and of each term beside it."""
-    x_bar = np.sqrt(rho) * steps.program.points @ section.base.T
+    x_bar = np.sqrt(rho) * steps.program.points @ section.shape.base.T
     vertex, *_ = steps.split(case)
     centre = steps.field.uncertain.mean(axis=1)
 
     def falls(rates: FloatArray) -> FloatArray:
-        return np.asarray(-2 * np.einsum("ij,ij->i", x_bar @ section.P, rates) / rho)
+        return np.asarray(-2 * np.einsum("ij,ij->i", x_bar @ section.shape.P, rates) / rho)
 
     def rate(scale: float) -> FloatArray:
         moved = scale * x_bar
@@ -157,7 +157,7 @@ def _terms(
 
     at_motion = rate(0.0)
     slope = (rate(CLOSE) - rate(-CLOSE)) / (2 * CLOSE)
-    turning = np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar) / rho
+    turning = np.einsum("ij,ij->i", x_bar @ section.shape.rate, x_bar) / rho
     whole = rate(1.0)
     parts = {
         "curvature": falls(whole - at_motion - slope),

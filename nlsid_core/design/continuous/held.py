@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.closed_loop import Pieces, rate_polynomial
-from nlsid_core.design.continuous.graded import Graded, monomials_of
+from nlsid_core.design.continuous.closed_loop import InputRates, Pieces, rate_polynomial
+from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import (
     MAX_LEVEL,
@@ -106,8 +106,8 @@ class Hold:
             )
         if self.period and not (policy.u.is_continuous() and policy.K.is_continuous()):
             raise DataError(
-                "a hold needs a policy that does not jump at knots: take gain='linear', and inputs "
-                "of the nominal that are continuous"
+                "a hold needs a policy that does not jump at knots: neither its gain nor its "
+                "motion's inputs"
             )
 
     def widths(self, policy: ContinuousPolicy, rates: FloatArray) -> FloatArray:
@@ -124,45 +124,25 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class _Rates:
-    """Rates of inputs in one time span: pieces of time at vertices, corners and modes.
+    """Rates of inputs in one time span, of pieces of time at vertices, corners and modes.
 
-    w: (B, n_w). entry, sign: (B,) of the input. taken: (B,) what entries of w that only push add to
-    the rate, in input units per s; shoved: (B, m) what a unit of every δ that only pushes adds.
+    taken: (B,) what entries of w that only push add to the rate, in input units per s; shoved:
+    (B, m) what a unit of every δ that only pushes adds.
     """
 
-    pieces: Pieces
-    w: FloatArray
-    entry: IntArray
-    sign: IntArray
+    of: InputRates
     taken: FloatArray
     shoved: FloatArray
 
     def room(self, rates: FloatArray, widths: FloatArray) -> FloatArray:
         """(B,) what R and W (intervals, m) leave to the rest, in input units per s."""
-        k = self.pieces.interval
-        left: FloatArray = rates[k, self.entry] - self.taken - (self.shoved * widths[k]).sum(axis=1)
-        return left
+        k = self.of.pieces.interval
+        pushed = self.taken + (self.shoved * widths[k]).sum(axis=1)
+        return np.asarray(rates[k, self.of.entry] - pushed)
 
-    def polynomial(
-        self,
-        steps: LSteps,
-        policy: ContinuousPolicy,
-        funnel: ContinuousFunnel,
-        room: FloatArray,
-        end: int | None = None,
-    ) -> Graded:
-        """What has to be positive for this room (B,); end: only its value at 0 or at 1."""
-        return rate_polynomial(
-            steps.field,
-            policy,
-            funnel,
-            self.pieces,
-            self.w,
-            room=room,
-            entry=self.entry,
-            sign=self.sign,
-            end=end,
-        )
+    def with_pieces(self, pieces: Pieces) -> "_Rates":
+        """The same rates on pieces that state more."""
+        return replace(self, of=replace(self.of, pieces=pieces))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +154,7 @@ class Changes:
 
     interval, entry, taken, shoved: see `_Rates`. products: per end, by degree in z, (B, corners,
     M_q) coefficients of the products of δ, of -h dũ_i/dt. chosen: (corners, m) 1 where a product
-    has δ_i. signs: (corners, corners) of the products at each corner. h: (intervals,) s.
+    has δ_i. h: (intervals,) s.
     """
 
     interval: IntArray
@@ -183,7 +163,6 @@ class Changes:
     shoved: FloatArray
     products: tuple[list[FloatArray], list[FloatArray]]
     chosen: IntArray
-    signs: FloatArray
     h: FloatArray
     curving: tuple[int, ...]
 
@@ -193,17 +172,17 @@ class Changes:
         field, K = steps.field, len(funnel.t) - 1
         corners = _corners(field)
         chosen, count = (corners > 0).astype(int), len(corners)
-        signs = np.prod(np.where(chosen == 1, corners[:, None], 1.0), axis=2)
+        signs = _signs(chosen)
         unit, curving = np.ones((K, field.m)), curving_states(field)
         found: tuple[list[list[FloatArray]], list[list[FloatArray]]] = ([], [])
         rows = []
         intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
         for batch in _batches(steps, policy, intervals, no_basis, unit, signs=(1,)):
-            pieces = batch.pieces
+            pieces, entry = batch.of.pieces, batch.of.entry
             corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
-            order = np.lexsort((corner, batch.entry, vertex, *pieces.mode.T, pieces.interval))
+            order = np.lexsort((corner, entry, vertex, *pieces.mode.T, pieces.interval))
             first = order[::count]
-            stated = pieces.interval, batch.entry, batch.taken, batch.shoved
+            stated = pieces.interval, entry, batch.taken, batch.shoved
             rows.append(tuple(part[first] for part in stated))
             for end in (0, 1):
                 c, _ = _at_end(steps, policy, funnel, batch, curving, end)
@@ -222,7 +201,6 @@ class Changes:
             shoved,
             (together[0], together[1]),
             chosen,
-            signs,
             np.diff(funnel.t),
             curving,
         )
@@ -232,23 +210,26 @@ class Changes:
 
         size: (K,) at the knots, of a funnel's half-widths over those of the one this is of.
         """
-        result = np.zeros(widths.shape)
+        result, signs = np.zeros(widths.shape), _signs(self.chosen)
         weights = np.prod(np.where(self.chosen == 1, widths[:, None], 1.0), axis=2)[self.interval]
-        place = np.repeat(np.column_stack([self.interval, self.entry]), len(self.signs), axis=0)
+        place = np.repeat(np.column_stack([self.interval, self.entry]), len(signs), axis=0)
         pushed = self.taken + (self.shoved * widths[self.interval]).sum(axis=1)
-        h, taken = self.h[place[:, 0]], np.repeat(pushed, len(self.signs))
+        h, taken = self.h[place[:, 0]], np.repeat(pushed, len(signs))
         sizes = np.broadcast_to(size, len(self.h) + 1)
         for end, products in enumerate(self.products):
             scale = sizes[self.interval + end, None, None]
-            p = [
-                self.signs @ (weights[..., None] * part) * scale**q
-                for q, part in enumerate(products)
-            ]
+            p = [signs @ (weights[..., None] * part) * scale**q for q, part in enumerate(products)]
             for sign in (-1, 1):
                 flat = [sign * part.reshape(len(h), -1) for part in p]
                 least = least_rates(flat, self.curving).least
                 np.maximum.at(result, tuple(place.T), least / h + taken)
         return result
+
+
+def _signs(chosen: IntArray) -> FloatArray:
+    """(corners, corners) of the products at each corner of |δ_i| = 1."""
+    corners = 2.0 * chosen - 1.0
+    return np.asarray(np.prod(np.where(chosen == 1, corners[:, None], 1.0), axis=2))
 
 
 def fastest(
@@ -290,16 +271,13 @@ def prove_rates(
         written: dict[Part, list[Json | None]] = {}
         for batch in _batches(steps, policy, waiting, basis[used], widths):
             batch = _witnessed(steps, policy, funnel, batch, curving, rates)
-            c = batch.polynomial(steps, policy, funnel, batch.room(rates, widths))
-            rows = rate_documents(funnel, batch.pieces, c, basis, used)
-            places = zip(batch.entry.tolist(), batch.sign.tolist(), rows, strict=True)
+            of, room = batch.of, batch.room(rates, widths)
+            c = rate_polynomial(steps.field, policy, funnel, of, room)
+            rows = rate_documents(funnel, of.pieces, c, basis, used)
+            places = zip(of.entry.tolist(), of.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
-                part = Part(
-                    *(
-                        int(e[b])
-                        for e in (batch.pieces.interval, batch.pieces.level, batch.pieces.index)
-                    )
-                )
+                place = of.pieces.interval, of.pieces.level, of.pieces.index
+                part = Part(*(int(e[b]) for e in place))
                 stated = None if row is None else row | {"input": entry, "sign": sign}
                 written.setdefault(part, []).append(stated)
         waiting = []
@@ -374,7 +352,8 @@ def _batches(
             np.abs(gains @ _pushes(field, span, first, found)).max(axis=1)
             for first, found in ((1 + n, _pushing(field, 1 + n, field.m)), (1 + n + field.m, own))
         )
-        yield _Rates(pieces, values[v % len(values)], i, side, own_shoved @ halves, shoved)
+        of = InputRates(pieces, values[v % len(values)], i, side)
+        yield _Rates(of, own_shoved @ halves, shoved)
 
 
 def _grid(sides: Sequence[tuple[float, ...]]) -> FloatArray:
@@ -415,11 +394,11 @@ def _at_end(
     end: int,
 ) -> tuple[list[FloatArray], Frames]:
     """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and the frames of z."""
-    pieces, n = batch.pieces, funnel.n
+    pieces, n = batch.of.pieces, funnel.n
     k, at = pieces.interval, _ends(pieces)[end]
     frames = Frames.of(funnel, k, at, curving)
-    framed = replace(batch, pieces=replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)))
-    c = framed.polynomial(steps, policy, funnel, np.zeros(len(pieces)), end)
+    framed = batch.with_pieces(replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)))
+    c = rate_polynomial(steps.field, policy, funnel, framed.of, np.zeros(len(pieces)), end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
     none = [np.zeros((len(pieces), size)) for size in sizes]
     return [c[q][:, 0] if q in c else none[q] for q in range(4)], frames
@@ -434,7 +413,7 @@ def _witnessed(
     rates: FloatArray,
 ) -> _Rates:
     """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
-    pieces, k = batch.pieces, batch.pieces.interval
+    pieces, k = batch.of.pieces, batch.of.pieces.interval
     tau, gram = pieces.tau.copy(), pieces.gram.copy()
     assert steps.widths is not None  # as in `prove_rates`
     room = np.diff(funnel.t)[k] * batch.room(rates, steps.widths)
@@ -449,14 +428,9 @@ def _witnessed(
         rho = funnel.rho[k] + _ends(pieces)[end] * (funnel.rho[k + 1] - funnel.rho[k])
         tau[:, end, 0, 0, 0] = constant / rho
         tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * (bent.swapaxes(1, 2) @ bent)
-        maps: dict[bytes, FloatArray] = {}  # of a part of time: the same for all of its rates
-        for b, A in enumerate(frames.inverse):
-            key = A.tobytes()
-            if key not in maps:
-                maps[key] = substitution(pieces.basis, A)
-            M = maps[key]
-            gram[b, end] = M.T @ found[b] @ M
-    return replace(batch, pieces=stated_multipliers(replace(pieces, tau=tau, gram=gram)))
+        M = substitution(pieces.basis, frames.inverse)
+        gram[:, end] = M.swapaxes(1, 2) @ found @ M
+    return batch.with_pieces(stated_multipliers(replace(pieces, tau=tau, gram=gram)))
 
 
 def _ends(pieces: Pieces) -> tuple[FloatArray, FloatArray]:

@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, Section, sections
 from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import sweep_rho
+from nlsid_core.design.continuous.sweep import Wanted, sweep_rho
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -137,26 +138,12 @@ def held_sweep(
     margin = setting.margin(rho_final)
     if expansion is not None:
         steps.field = expansion.linear()
-        found = sweep_expanded(
-            expansion,
-            steps,
-            policy,
-            P,
-            margin=margin,
-            rho_final=rho_final,
-            caps=caps,
-            most_back=MOST_BACK,
-            progress=progress,
-        )
+        expanded = replace(setting, steps=steps, expansion=expansion)
+        wanted = Wanted(margin, rho_final, caps)
+        found = sweep_expanded(expanded, wanted, most_back=MOST_BACK, progress=progress)
         return found.rho, field_of(found.cubics, policy.t)
     caps = np.minimum(validity_caps(steps.field, policy, P), caps)
     rho_final = min(rho_final, float(caps[-1]))
-    rho, _ = sweep_rho(
-        steps,
-        sections(steps, policy, P),
-        margin=margin,
-        rho_final=rho_final,
-        caps=caps,
-        progress=progress,
-    )
+    wanted = Wanted(margin, rho_final, caps)
+    rho, _ = sweep_rho(steps, sections(steps, policy, P), wanted, progress)
     return rho, steps.field

@@ -26,8 +26,8 @@ KEEP = 0.9  # of an L-step's margin that a V-step asks for: it stays feasible wh
 class KnotForms:
     """c at both ends of every interval in every case, in the coordinates of the present funnel.
 
-    samples, pairs: c as a function of D at (own, other) knot, see `vstep`. margins: what c keeps.
-    frames: (n, n) per knot, x̄ = Tz. What bounds the pushes of w is taken to first order in D.
+    samples: c less what it keeps as a function of D, see `vstep`. frames: (n, n) per knot, x̄ = Tz.
+    What bounds the pushes of w is taken to first order in D.
     """
 
     def __init__(
@@ -48,8 +48,6 @@ class KnotForms:
         self.h = np.diff(funnel.t)
         self.rho = funnel.rho
         self.samples: list[Affine] = []
-        self.pairs: list[tuple[int, int]] = []
-        self.margins: list[float] = []
         for end in (0, 1):
             solutions = [(pair.start, pair.end)[end] for pair in ends]
             errors, targets = self._at(steps, policy, funnel, solutions, end)
@@ -76,13 +74,11 @@ class KnotForms:
                     m,
                     constant=CONSTANT,
                 )
-                target[0] -= growth
+                target[0] -= growth + min(margin, KEEP * m)
                 form = affine_form(sample)
                 pushed = self._pushed(steps, policy, k, own)
                 form = replace(form, constant=target, own=form.own - pushed)
                 self.samples.append(form.with_multiplier(mu, n))
-                self.pairs.append((own, other))
-                self.margins.append(min(margin, KEEP * m))
 
     def _at(
         self,

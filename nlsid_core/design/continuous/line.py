@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
-from nlsid_core.sos.sphere import SphereSolution
+from nlsid_core.sos.sphere import Iterate, SphereSolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class LineProgram:
         X = abs(b) / 2 * np.array([[1.0, np.sign(b)], [np.sign(b), 1.0]])
         y = np.array([1.0, 0.0]) if high <= low else np.array([0.0, 1.0])
         m = float(a - abs(b))
-        return SphereSolution(m, m, X, y, 0.0, 0, (X, y, m))
+        return SphereSolution(m, m, X, y, 0.0, 0, (Iterate(X, y, m, 0.0),))
 
     def gram(self, solution: SphereSolution) -> FloatArray:
         """(2, 2) Gram matrix of the solution."""

@@ -29,12 +29,20 @@ FINENESS = 64.0  # of κ's digits: few, for the kernel
 
 
 @dataclass(frozen=True, eq=False)
+class Shape:
+    """P and dP/dt (n, n) at an instant, and base (n, n), with x̄ = √ρ·base·z."""
+
+    P: FloatArray
+    rate: FloatArray
+    base: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Section:
     """One side of one knot: what c(s, z) is made of at that instant, except ρ.
 
-    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
-    x̄ = √ρ·base·z.
-    interval: between knots; span: which of the field's pieces holds.
+    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). interval: between knots; span: which of the
+    field's pieces holds.
     """
 
     t: float
@@ -42,9 +50,7 @@ class Section:
     x_rate: FloatArray
     u: FloatArray
     K: FloatArray
-    P: FloatArray
-    P_rate: FloatArray
-    base: FloatArray
+    shape: Shape
     span: int
     interval: int
 
@@ -63,9 +69,7 @@ def section_at(
         x_rate=(len(control) - 1) * bernstein(np.diff(control, axis=0), s) / h,
         u=bernstein(policy.u.control[k], s),
         K=bernstein(policy.K.control[k], s),
-        P=here,
-        P_rate=(P[k + 1] - P[k]) / h,
-        base=coordinates(here, steps.nonlinear),
+        shape=Shape(here, (P[k + 1] - P[k]) / h, coordinates(here, steps.nonlinear)),
         span=steps.field.span(float(t[k])),
         interval=k,
     )
@@ -111,10 +115,8 @@ class LSteps:
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
     field's `is_pushed`). kappa: (intervals, n_w), if it is bounded; tightness: the same over
     1/max|x̄'Pg| (None: 1). local: what the dynamics are on an interval, where a search expands them
-    anew; else they are the field. carries: whether a dual of one section bounds φ at others.
+    anew; else they are the field.
     """
-
-    carries = True
 
     def __init__(
         self,
@@ -191,7 +193,7 @@ class LSteps:
         if self.kappa is None:
             return
         G = self.pushes(section)
-        largest = np.sqrt(rho * np.einsum("ij,ik,kj->j", G, section.P, G))
+        largest = np.sqrt(rho * np.einsum("ij,ik,kj->j", G, section.shape.P, G))
         times = 1.0 if self.tightness is None else self.tightness[section.interval]
         digits, power = np.frexp(times / np.maximum(largest, NO_PUSH))
         self.kappa[section.interval] = np.ldexp(np.round(digits * FINENESS) / FINENESS, power)
@@ -207,10 +209,6 @@ class LSteps:
         """Vertices times corners times modes."""
         return len(self.vertices) * len(self.corners) * len(self.modes)
 
-    def weights(self, solution: SphereSolution) -> FloatArray:
-        """(N,) of the program's points in the dual bound."""
-        return np.asarray(solution.y)
-
     def split(self, case: int) -> tuple[int, int, IntArray]:
         """The vertex, the corner and the mode of a case."""
         rest, vertex = divmod(case, len(self.vertices))
@@ -219,7 +217,7 @@ class LSteps:
 
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
         """(cases, N) -Ẇ/ρ at the program's points, in each mode, from the vector field."""
-        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
         w = np.empty((*u.shape[:2], self.vertices.shape[1]))
         for place, case in enumerate(cases):
@@ -233,9 +231,9 @@ class LSteps:
         X = np.tile(section.x + x_bar, (len(cases), 1))
         W = w.reshape(len(X), w.shape[2])
         rate = self.rate(section, X, u.reshape(len(X), u.shape[2]), W) - section.x_rate
-        along = x_bar @ section.P
+        along = x_bar @ section.shape.P
         W_rate = 2 * np.einsum("ni,cni->cn", along, rate.reshape(len(cases), *x_bar.shape))
-        W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
+        W_rate += np.einsum("ij,ij->i", x_bar @ section.shape.rate, x_bar)
         if self.kappa is not None:
             W_rate += self.from_pushes(section, x_bar).sum(axis=1)
         return np.asarray(-W_rate / rho - self._from_defect(section, rho))
@@ -244,7 +242,7 @@ class LSteps:
         """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""
         assert self.kappa is not None
         kappa = self.kappa[section.interval]
-        along = x_bar @ section.P @ self.pushes(section)
+        along = x_bar @ section.shape.P @ self.pushes(section)
         radius = np.ptp(self.field.uncertain, axis=1) / 2
         return np.asarray((kappa * along**2 + 1 / kappa) * radius)
 
@@ -258,12 +256,12 @@ class LSteps:
             return np.zeros(len(self.program.points))
         centre = self.field.uncertain.mean(axis=1)
         rate = self.rate(section, section.x[None], section.u[None], centre)[0]
-        slope = -2 * section.base.T @ section.P @ (rate - section.x_rate) / np.sqrt(rho)
+        slope = -2 * section.shape.base.T @ section.shape.P @ (rate - section.x_rate) / np.sqrt(rho)
         return np.asarray(self.program.points[:, linear] @ slope[linear])
 
     def in_mode(self, section: Section, rho: float, case: int) -> FloatArray:
         """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
-        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
         demand = section.u - x_bar @ section.K.T
         *_, mode = self.split(case)
         rows = []

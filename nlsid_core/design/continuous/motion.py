@@ -25,7 +25,6 @@ from nlsid_core.options import is_number, numbers
 FIRST_KNOTS = 25
 MORE_KNOTS = 3  # for one interval, at a time, where its cubic misses the dynamics
 MAX_KNOTS = 200
-MOST_GIVEN = 2000  # knots that one may ask for: programs grow with them
 KEPT = 0.9  # of the limits: the rest is there to correct with
 GOOD = 0.5  # of the defect that a funnel accepts
 MAX_STEPS, NEWTON_STEPS = 150, 20
@@ -49,22 +48,20 @@ def plan_motion(
     end: ArrayLike,
     seconds: float,
     u: ArrayLike | None = None,
-    m: int | None = None,
-    uncertain: ArrayLike | None = None,
     limits: ArrayLike | None = None,
-    scale: ArrayLike | None = None,
-    through: ArrayLike | None = None,
-    knots: int | None = None,
 ) -> Nominal:
-    """The motion from `start` to `end` (n,) in `seconds` with small ∫|u(t) - u|² dt.
+    """Plan a motion from `start` to `end` in `seconds` with small ∫|u(t) - u|² dt.
 
-    dynamics: of some of t, x, u, w, named so; w is in the centre of its box, a field's own or
-    `uncertain` (n_w, 2). u: (m,) the input that costs nothing, and that the motion starts and ends
-    with if it keeps both ends at rest (None: zeros, for `m` inputs). limits: rows (input, low,
-    high), or one pair an input, that the motion keeps to nine tenths of. scale: (m,) what is much
-    of each input, by which the cost weighs them (None: half of its range, or |u|, 1 at least).
-    through: (P, n) states to guess the path by, equally spaced in time (None: the straight line).
-    knots: of the cubics (None: as many as they need).
+    Args:
+        dynamics: a VectorField, or a function of some of t, x, u, named so. A field's w is in the
+            centre of its box.
+        start, end: (n,) states.
+        seconds: how long it takes.
+        u: (m,) the input that costs nothing, and that the motion starts and ends with if it keeps
+            both ends at rest (None: zeros, as many as a VectorField has). The cost weighs each
+            input by half of its limits' range, or by |u|, 1 at least.
+        limits: rows (input, low, high), or one pair an input, that the motion keeps to nine tenths
+            of.
 
     Raises DataError on input that makes no sense, Infeasible if no motion was found.
     """
@@ -77,36 +74,22 @@ def plan_motion(
         raise DataError(f"start and end should be finite, are {[e.tolist() for e in ends]}")
     if not is_number(seconds) or not 0 < seconds < np.inf:
         raise DataError(f"seconds should be above 0, is {seconds!r}")
-    for name, count, least, most in (("m", m, 0, np.inf), ("knots", knots, 2, MOST_GIVEN)):
-        if count is not None and (not isinstance(count, int) or not least <= count <= most):
-            to = "on" if most == np.inf else f"to {most}"
-            raise DataError(f"{name} should be a whole number from {least} {to}, is {count!r}")
-    if u is None and m is None and not isinstance(dynamics, VectorField):
-        raise DataError("give u, the input that costs nothing, or m, how many inputs there are")
-    count = dynamics.m if isinstance(dynamics, VectorField) else m
-    rest = np.zeros(count or 0) if u is None else numbers(u, "u").reshape(-1)
-    n, m = len(ends[0]), len(rest)
-    if isinstance(dynamics, VectorField):
-        rates: VectorField | Rates = dynamics
+    if u is not None:
+        rest = numbers(u, "u").reshape(-1)
+    elif isinstance(dynamics, VectorField):
+        rest = np.zeros(dynamics.m)
     else:
-        rates = Rates.numeric(dynamics, n, m, uncertain)
+        raise DataError("give u, the input that costs nothing, such as [0] for one input")
+    n, m = len(ends[0]), len(rest)
+    rates = dynamics if isinstance(dynamics, VectorField) else Rates.numeric(dynamics, n, m)
     box = np.tile([-np.inf, np.inf], (m, 1))
     for i, low, high in [] if limits is None else limits_of(limits, m).tolist():
         middle, half = (low + high) / 2, KEPT * (high - low) / 2
         box[int(i)] = middle - half, middle + half
     much = np.ptp(box, axis=1) / 2
     much = np.where(np.isfinite(much), much, np.maximum(np.abs(rest), 1))
-    if scale is not None:
-        much = np.asarray(scale, dtype=np.float64)
-        if much.shape != (m,) or not (much > 0).all():
-            raise DataError(f"scale should be {m} positive numbers, is {much.tolist()}")
-    path = np.stack(ends) if through is None else numbers(through, "through")
-    if path.ndim != 2 or len(path) < 2 or path.shape[1] != n or not np.isfinite(path).all():
-        raise DataError(f"through should be two or more states ({n},), is {path.tolist()}")
-    t = np.linspace(0.0, seconds, FIRST_KNOTS if knots is None else knots)
-    share = np.linspace(0, seconds, len(path))
-    x = np.stack([np.interp(t, share, column) for column in path.T], axis=1)
-    x[0], x[-1] = ends
+    t = np.linspace(0.0, seconds, FIRST_KNOTS)
+    x = np.linspace(ends[0], ends[1], FIRST_KNOTS)
     straight = np.hstack([x, np.tile(rest, (len(t), 1))])
     spread = np.ptp(x, axis=0)
     way = np.where(spread > 0, spread, np.maximum(np.abs(x).max(axis=0), 1))
@@ -117,15 +100,14 @@ def plan_motion(
         found = mesh.nominal(z)
         gaps = found.gaps(rates)
         wanted = largest_defect(found)
-        if (gaps <= GOOD * wanted).all() or (knots is not None and (gaps <= wanted).all()):
+        if (gaps <= GOOD * wanted).all():
             return found
         worst = int(gaps.argmax())
         more = np.ceil(np.clip((gaps / (GOOD * wanted)) ** (1 / 3), 1, MORE_KNOTS)).astype(int)
-        if knots is not None or len(mesh.t) + (more - 1).sum() > MAX_KNOTS:
+        if len(mesh.t) + (more - 1).sum() > MAX_KNOTS:
             raise Infeasible(
                 f"the motion misses its dynamics by {gaps[worst]:.3g}, more than {wanted:.3g}, at "
-                f"{mesh.t[worst]:.4g} s between {len(mesh.t)} knots: "
-                + ("leave out `knots`, or take more" if knots is not None else "take more seconds")
+                f"{mesh.t[worst]:.4g} s between {len(mesh.t)} knots: take more seconds"
             )
         t = np.concatenate(
             [
@@ -276,8 +258,8 @@ class _Mesh:
             k, i = np.argwhere(~np.isfinite(gaps))[0].tolist()
             raise Infeasible(
                 f"the dynamics are not finite on the path that is guessed: dx{i}/dt between "
-                f"x = {z[k, : self.n].tolist()} and x = {z[k + 1, : self.n].tolist()}. Give "
-                "`through`, states of a path on which they are"
+                f"x = {z[k, : self.n].tolist()} and x = {z[k + 1, : self.n].tolist()}. Plan in "
+                "parts, between states from which they are"
             )
         for _ in range(ROUNDS):
             z = self._descended(z, self.sizes(z))
@@ -389,14 +371,11 @@ class _Mesh:
             k, i = divmod(int(np.abs(d).argmax()), n)
             raise Infeasible(
                 f"no motion was found: dx{i}/dt does not fit by {worst:.3g} of its size near "
-                f"{self.t[k]:.4g} s. Give more seconds, wider limits, or a path to guess by "
-                "(`through`)"
+                f"{self.t[k]:.4g} s. Give more seconds, wider limits, or plan it in parts"
             )
         u, (low, high) = z[:, n:], self.box.T
         reach = (high - low) * (1 / KEPT - 1) / 2
-        if (
-            (u > high + np.where(np.isfinite(reach), reach, 0))
-            | (u < low - np.where(np.isfinite(reach), reach, 0))
-        ).any():
+        reach = np.where(np.isfinite(reach), reach, 0)
+        if ((u > high + reach) | (u < low - reach)).any():
             raise Infeasible("the motion needs more than the limits: give more seconds")
         return z

@@ -142,7 +142,7 @@ def _pieces(
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
             section = section_at(steps, policy, funnel.P, i, s)
-            T += [np.sqrt(rho_here) * section.base] * steps.cases
+            T += [np.sqrt(rho_here) * section.shape.base] * steps.cases
             rho += [rho_here] * steps.cases
             rows += known[i, s]
         blank = draft(steps, parts, np.array(T))
@@ -152,24 +152,23 @@ def _pieces(
         blank = replace(blank, tau=np.stack([tau, tau], axis=1))
         c = closed_loop_polynomial(steps.field, policy, funnel, blank, end)
         at_end = {q: part[:, 0] for q, part in c.items()}
-        mu, gram = [], []
+        mu = np.zeros((len(rows), len(full)))
+        gram = np.zeros((len(rows), len(basis), len(basis)))
         for b, solution in enumerate(rows):
             i = int(blank.interval[b])
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
-            Q, scaled = end_proof(program, solution, target, h * rho[b], solution.m + growth)
-            # From z to y = x̄ in the order in which T is triangular: z = A y.
-            A = np.triu(np.linalg.inv(T[b][order]))
-            M = substitution(basis, A)
-            gram.append(M.T @ Q @ M)
-            mu.append(substitution(full, A).T @ scaled / rho[b])
-            around = np.eye(n + 1)
-            around[1:, 1:] = A
-            tau[b] = around.T @ tau[b] @ around
-        both["mu"].append(np.array(mu))
-        both["gram"].append(np.array(gram))
-        both["tau"].append(tau)
+            gram[b], scaled = end_proof(program, solution, target, h * rho[b], solution.m + growth)
+            mu[b] = scaled / rho[b]
+        # From z to y = x̄ in the order in which T is triangular: z = A y.
+        A = np.triu(np.linalg.inv(np.array(T)[:, order]))
+        M = substitution(basis, A)
+        around = np.tile(np.eye(n + 1), (len(rows), 1, 1))
+        around[:, 1:, 1:] = A
+        both["gram"].append(M.swapaxes(1, 2) @ gram @ M)
+        both["mu"].append(np.einsum("bij,bi->bj", substitution(full, A), mu))
+        both["tau"].append(around.swapaxes(1, 2)[:, None] @ tau @ around[:, None])
     # Entry j of y is x̄ at order[j]: the same numbers, of monomials with their columns exchanged.
     back = np.argsort(order)
     places = positions(full, full[:, back])
@@ -282,35 +281,34 @@ def end_proof(
 
 
 def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
-    """M with v(Az) = M v(z), v the monomials `rows` (k, n).
+    """M (B, k, k) with v(A z) = M v(z) for A (B, n, n), v the monomials `rows` (k, n).
 
     Monomials that are not among the rows are dropped: with A triangular in the order of the
     nonlinear variables their coefficients are zero.
     """
-    n = len(A)
+    count, n, _ = A.shape
     homes = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
-    forms = np.zeros((n, n))
-    forms[:, homes] = A
-    powers: dict[tuple[int, ...], FloatArray] = {(0,) * n: np.ones(1)}
+    forms = np.zeros_like(A)
+    forms[:, :, homes] = A
+    powers: dict[tuple[int, ...], FloatArray] = {(0,) * n: np.ones((count, 1))}
 
     def power(exponent: tuple[int, ...]) -> FloatArray:
         if exponent not in powers:
             last = max(j for j, e in enumerate(exponent) if e)
             lower = power(tuple(e - (j == last) for j, e in enumerate(exponent)))
-            table = product_table(n, 1, sum(exponent) - 1)
-            products = np.outer(forms[last], lower)
-            size = len(monomials_of(n, sum(exponent)))
-            sums = np.bincount(table.ravel(), products.ravel(), size)
-            powers[exponent] = sums.astype(np.float64)
+            result = np.zeros((count, len(monomials_of(n, sum(exponent)))))
+            for i, home in enumerate(product_table(n, 1, sum(exponent) - 1)):
+                result[:, home] += forms[:, last, i, None] * lower
+            powers[exponent] = result
         return powers[exponent]
 
-    M = np.zeros((len(rows), len(rows)))
+    M = np.zeros((count, len(rows), len(rows)))
     degree = rows.sum(axis=1)
     for q in np.unique(degree).tolist():
         among = np.flatnonzero(degree == q)
         columns = positions(rows[among], monomials_of(n, q))
         for i in among.tolist():
-            M[i, among] = power(tuple(rows[i].tolist()))[columns]
+            M[:, i, among] = power(tuple(rows[i].tolist()))[:, columns]
     return M
 
 

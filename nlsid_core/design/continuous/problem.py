@@ -7,7 +7,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray
-from nlsid_core.design.continuous.tvlqr import GAINS
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -42,8 +41,7 @@ class ContinuousTracking:
     (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal` (None: the largest set
     that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
     R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
-    given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
-    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one
+    given policy P(t) solves the Lyapunov equation with Q. limits: rows (input, low, high), or one
     pair (low, high) for each input, at which inputs saturate; the proof then covers every mode.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
@@ -63,7 +61,6 @@ class ContinuousTracking:
     shape: Shape = "rho"
     Q: ArrayLike | None = None
     R: ArrayLike | None = None
-    gain: str = "constant"
     limits: ArrayLike | None = None
     uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None
@@ -75,4 +72,3 @@ class ContinuousTracking:
         if not isinstance(self.policy, ContinuousPolicy | None):
             raise OptionError("policy", self.policy, "a ContinuousPolicy, or None for an LQR")
         require_one_of(self, "shape", get_args(Shape))
-        require_one_of(self, "gain", GAINS)

@@ -13,9 +13,9 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.held_sweep import (
@@ -28,9 +28,9 @@ from nlsid_core.design.continuous.lstep import sections
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import Ends, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
 from nlsid_core.dynamics.taylor import field_of
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
@@ -166,14 +166,8 @@ def _free(setting: Setting, progress: Progress) -> FloatArray:
     steps, policy, P = setting.steps, setting.policy, setting.P
     caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
-    rho, _ = sweep_rho(
-        steps,
-        sections(steps, policy, P),
-        margin=setting.margin(rho_final),
-        rho_final=rho_final,
-        caps=caps,
-        progress=progress,
-    )
+    wanted = Wanted(setting.margin(rho_final), rho_final, caps)
+    rho, _ = sweep_rho(steps, sections(steps, policy, P), wanted, progress)
     return rho
 
 
@@ -182,11 +176,6 @@ def _unheld(setting: Setting, progress: Progress) -> Found:
     if setting.expansion is not None:
         return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
     caps = validity_caps(setting.steps.field, setting.policy, setting.P)
-    cliques = CliqueSteps.of(setting.steps)
-    if cliques is not None:
-        with suppress(Infeasible, SolverError):  # then with every product
-            _, funnel, proved, margin = _swept(replace(setting, steps=cliques), caps, progress)
-            return Found(setting, funnel, proved, margin)
     return _swept(setting, caps, progress)
 
 
@@ -199,33 +188,16 @@ def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
     expected = setting.hold is not None and setting.hold.rates is not None
 
     def search(margin: float) -> Swept:
-        found = sweep_rho(
-            steps,
-            pairs,
-            margin=margin,
-            rho_final=rho_final,
-            caps=caps,
-            expected=expected,
-            progress=progress,
-        )
-        return Swept(setting, *found)
+        wanted = Wanted(margin, rho_final, caps, expected)
+        return Swept(setting, *sweep_rho(steps, pairs, wanted, progress))
 
     return proved_for(setting, rho_final, search)
 
 
 def _expanded(setting: Setting, progress: Progress, margin: float) -> Swept:
     """The sweep that expands the dynamics around what it finds; the setting has their field."""
-    assert setting.expansion is not None
     steps, policy = setting.steps, setting.policy
-    found = sweep_expanded(
-        setting.expansion,
-        steps,
-        policy,
-        setting.P,
-        margin=margin,
-        rho_final=setting.rho_final,
-        progress=progress,
-    )
+    found = sweep_expanded(setting, Wanted(margin, setting.rho_final), progress=progress)
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)

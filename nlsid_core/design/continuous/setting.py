@@ -109,9 +109,8 @@ def prepare(problem: ContinuousTracking) -> Setting:
     R = definite(weights[1] if problem.R is None else problem.R, field.m, "R", strict=True)
     final = _final_shape(field, nominal, wanted, (Q, R))
     if problem.policy is None:
-        jumps = problem.gain == "constant" and problem.hold is not None  # a held one may not
-        gain = "linear" if jumps else problem.gain
-        tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+        linear = problem.hold is not None  # a held input may not jump
+        tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, linear=linear)
     else:
         refuse_other(problem.policy, field, nominal)
         P = lyapunov(field, problem.policy, Q=Q, P_final=final)

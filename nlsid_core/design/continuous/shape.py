@@ -17,7 +17,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_basis, prove_pieces, unsolved
-from nlsid_core.design.continuous.sweep import Ends, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
 from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, Infeasible, SolverError
@@ -98,7 +98,6 @@ def enlarge_shape(
     funnel: ContinuousFunnel,
     *,
     margin: float,
-    iterations: int = MAX_ITERATIONS,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> tuple[ContinuousFunnel, Proved, list[tuple[str, float]]]:
@@ -114,7 +113,7 @@ def enlarge_shape(
     present = _normalised(steps, policy, funnel, ROOM * margin)
     found = [_Kept(present, steps.kappa)]
     ends = solve_ends(steps, policy, present, executor=executor)
-    for iteration in range(iterations):
+    for iteration in range(MAX_ITERATIONS):
         enlarged = _enlarged(steps, policy, present, ends, margin, executor)
         if enlarged is None:
             break
@@ -150,13 +149,8 @@ def _normalised(
     """
     P, final = funnel.P, float(funnel.rho[-1])
     for _ in range(SWEEPS):
-        rho, _ = sweep_rho(
-            steps,
-            sections(steps, policy, P),
-            margin=margin,
-            rho_final=final,
-            caps=INSIDE * validity_caps(steps.field, policy, P),
-        )
+        caps = INSIDE * validity_caps(steps.field, policy, P)
+        rho, _ = sweep_rho(steps, sections(steps, policy, P), Wanted(margin, final, caps))
         P, final = P / rho[:, None, None], 1.0
         if np.abs(rho - 1).max() < NEAR:
             break
@@ -218,11 +212,8 @@ def _enlarged(
     try:
         D = improve(
             forms.samples,
-            forms.pairs,
-            len(weights),
             proof_basis(steps.program),
             weights=weights,
-            margins=forms.margins,
             trust=TRUST,
             bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)],
         )

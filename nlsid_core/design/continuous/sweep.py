@@ -6,7 +6,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -25,6 +25,24 @@ LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the nam
 
 
 @dataclass(frozen=True, eq=False)
+class Wanted:
+    """What ρ(t) keeps to.
+
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. final: ρ(t_f). caps: (K,) that ρ keeps below
+    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first.
+    """
+
+    margin: float
+    final: float
+    caps: FloatArray | None = None
+    expected: bool = False
+
+    def cap(self, k: int) -> float:
+        """The cap at knot k."""
+        return np.inf if self.caps is None else float(self.caps[k])
+
+
+@dataclass(frozen=True, eq=False)
 class Ends:
     """One interval's L-steps: solutions at its start and end per vertex; margins include ρ̇/ρ."""
 
@@ -35,122 +53,125 @@ class Ends:
 def sweep_rho(
     steps: LSteps,
     instants: Sequence[Sequence[Section]],
-    *,
-    margin: float,
-    rho_final: float = 1.0,
-    caps: FloatArray | None = None,
-    expected: bool = False,
+    wanted: Wanted,
     progress: Progress = silent,
 ) -> tuple[FloatArray, list[Ends]]:
-    """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
+    """ρ (K,) and the L-steps at both ends of every interval.
 
     instants: per interval its start, its end and, between them, others where ρ has to hold too.
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below;
-    expected: whether it is likely to be there, and tried there first.
     Raises Infeasible naming the time.
     """
     rho = np.empty(len(instants) + 1)
-    rho[-1] = rho_final
+    rho[-1] = wanted.final
     ends: list[Ends] = []
     duals: list[SphereSolution] | None = None
     for k in range(len(instants) - 1, -1, -1):
         start, *between, end = instants[k]
-        h = end.t - start.t
-        steps.bound_pushes(end, rho[k + 1])
-        wanted = (
-            (caps[k] / rho[k + 1] - 1) / h + margin if expected and caps is not None else np.inf
-        )
-        at_end = steps.solve(end, rho[k + 1], duals, enough=wanted)
+        h, after = end.t - start.t, float(rho[k + 1])
+        steps.bound_pushes(end, after)
+        first = _Instant(steps, start, 0.0, after, h, wanted)
+
+        # The end's program is solved until it allows as much as the start may.
+        cap, near = wanted.cap(k), None
+        if duals is not None and not wanted.expected and not len(steps.limits):
+            near = duals
+            phi = steps.predicted(end, after, duals)
+            cap = first.bound(duals, min(cap, first.allowed(phi)))
+        at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + wanted.margin)
         phi = min(s.m for s in at_end)
-        cap = rho[k + 1] * (1 + h * (phi - margin))
-        if cap <= LOWEST * rho[k + 1]:  # ρ̇ cannot be large enough for this end
-            after = float(rho[k + 1])
-            raise NoFunnel(
-                end.t, partial(diagnosed, steps.as_it_is(), [end], [after], after / h), phi - margin
-            )
-        if caps is not None:
-            cap = min(cap, float(caps[k]))
+        cap = min(cap, first.allowed(phi))
+        if cap <= LOWEST * after:  # ρ̇ cannot be large enough for this end
+            why = partial(diagnosed, steps.as_it_is(), [end], [after], after / h)
+            raise NoFunnel(end.t, why, phi - wanted.margin)
+
         for section in between:
-            share = (section.t - start.t) / h
-            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end, expected)
-        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end, expected)
+            inner = _Instant(steps, section, (section.t - start.t) / h, after, h, wanted)
+            cap, _ = inner.largest(cap, at_end)
+        rho[k], at_start = first.largest(cap, near or at_end)
         ends.append(Ends(at_start, at_end))
         duals = at_start
         progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
     return rho, ends[::-1]
 
 
-def _largest(
-    steps: LSteps,
-    section: Section,
-    share: float,
-    after: float,
-    h: float,
-    cap: float,
-    margin: float,
-    duals: list[SphereSolution],
-    expected: bool,
-) -> tuple[float, list[SphereSolution]]:
-    """The largest ρ_k ≤ cap with which the L-step at s = share leaves the margin, and that L-step.
+@dataclass(frozen=True, eq=False)
+class _Instant:
+    """An instant at s = share of an interval of h s, on which ρ is linear from ρ_k to `after`."""
 
-    ρ is linear from ρ_k to `after`.
-    """
+    steps: LSteps
+    section: Section
+    share: float
+    after: float
+    h: float
+    wanted: Wanted
 
-    def here(rho: float) -> float:
-        return (1 - share) * rho + share * after
+    def here(self, rho: float) -> float:
+        """ρ at the instant, for ρ_k = rho."""
+        return (1 - self.share) * rho + self.share * self.after
 
-    def slack(rho: float, phi: float) -> float:
-        return phi + (after - rho) / here(rho) / h - margin
+    def slack(self, rho: float, phi: float) -> float:
+        """What is left of the margin, in 1/s, for ρ_k = rho and φ at the instant."""
+        growth = (self.after - rho) / self.here(rho) / self.h
+        return phi + growth - self.wanted.margin
 
-    feasible, infeasible = 0.0, np.inf
-    best: list[SphereSolution] | None = None
-    limited, exact = len(steps.limits) > 0, steps.carries
-    for _ in range(MAX_TRIES + steps.cases):  # one that fails is solved for one case
-        if cap <= LOWEST * after:
-            break
-        known = duals
-        if expected and infeasible > cap:
-            rho = cap
-        else:
-            rho = _root(
-                lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
-                LOWEST * after,
-                min(cap, infeasible),
-            )
-        if best is not None and rho <= feasible:
-            break
-        least = -ACCEPT * margin - slack(rho, 0.0)
-        enough = -slack(rho, 0.0) if expected else np.inf
-        found = steps.solve(section, here(rho), duals, least=least, enough=enough)
-        left = slack(rho, min(s.m for s in found))
-        if left >= -ACCEPT * margin:
-            if (exact and not limited) or rho >= cap:  # else `predicted` may be too low
-                return rho, found
-            done = rho <= NEAR * feasible
-            feasible, best = rho, found
-            if done:
+    def allowed(self, phi: float) -> float:
+        """The largest ρ_k that φ at the interval's end leaves the margin for."""
+        return self.after * (1 + self.h * (phi - self.wanted.margin))
+
+    def bound(self, duals: list[SphereSolution], cap: float) -> float:
+        """The largest ρ_k ≤ cap, nearly, at which the bound by dual solutions leaves the margin."""
+
+        def left(rho: float) -> float:
+            return self.slack(rho, self.steps.predicted(self.section, self.here(rho), duals))
+
+        return cap if cap <= LOWEST * self.after else _root(left, LOWEST * self.after, cap)
+
+    def largest(
+        self, cap: float, duals: list[SphereSolution]
+    ) -> tuple[float, list[SphereSolution]]:
+        """The largest ρ_k ≤ cap with which the L-step leaves the margin, and that L-step."""
+        steps, at_cap = self.steps, self.wanted.expected
+        feasible, infeasible = 0.0, np.inf
+        best: list[SphereSolution] | None = None
+        for _ in range(MAX_TRIES + steps.cases):  # one that fails is solved for one case
+            if cap <= LOWEST * self.after:
                 break
-        else:
-            infeasible = min(infeasible, rho)
-        duals, exact = found, True
-    if best is None:
-        kept = steps.as_it_is()
+            rho = cap if at_cap else self.bound(duals, min(cap, infeasible))
+            if best is not None and rho <= feasible:
+                break
+            needed = -self.slack(rho, 0.0)
+            least = needed - ACCEPT * self.wanted.margin
+            found = steps.solve(self.section, self.here(rho), duals, least=least, enough=needed)
+            left = self.slack(rho, min(s.m for s in found))
+            if left >= -ACCEPT * self.wanted.margin:
+                if not len(steps.limits) or rho >= cap:  # else `predicted` may be too low
+                    return rho, found
+                done = rho <= NEAR * feasible
+                feasible, best = rho, found
+                if done:
+                    break
+            else:
+                infeasible, at_cap = min(infeasible, rho), False
+            duals = found
+        if best is None:
+            raise NoFunnel(self.section.t, partial(self.why, steps.as_it_is(), duals))
+        return feasible, best
 
-        def why() -> Diagnosis:
-            levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
-            rho = max(levels, key=lambda r: slack(r, kept.predicted(section, here(r), duals)))
-            return diagnosed(kept, [section], [here(rho)], (after - rho) / h)
-
-        raise NoFunnel(section.t, why)
-    return feasible, best
+    def why(self, kept: LSteps, duals: list[SphereSolution]) -> Diagnosis:
+        """What takes the margin away, at the ρ where least is missing; kept: the L-steps then."""
+        levels = (self.after * np.geomspace(1e-3, 1.0, 12)).tolist()
+        values = [self.slack(r, kept.predicted(self.section, self.here(r), duals)) for r in levels]
+        rho = levels[int(np.argmax(values))]
+        growth = (self.after - rho) / self.h
+        return diagnosed(kept, [self.section], [self.here(rho)], growth)
 
 
 def _root(slack: Callable[[float], float], low: float, high: float) -> float:
     """The largest r in [low, high] with slack(r) ≥ 0, nearly, after a coarse look from above."""
+    slack = cache(slack)  # a search between two values asks for them again
     if slack(high) >= 0:
         return high
-    step = 0.9
-    inside = high
+    step, inside = 0.99, high
     while inside > low and slack(inside) < 0:
         high, inside = inside, inside * step
         step *= step

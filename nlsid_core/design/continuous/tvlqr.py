@@ -32,8 +32,6 @@ EASY, MOST_STEPS = 1e-12, 256  # of the same: then fewer steps are tried next; o
 GAUSS = 15**0.5 / 10  # of a step: from its middle to the outer two of Gauss's three points
 NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
 BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
-DIFFERENCE = 1e-5  # of a knot interval, for the slope of B: errors of 1e-10
-GAINS = ("constant", "linear", "cubic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,20 +49,18 @@ def tvlqr(
     Q: ArrayLike,
     R: ArrayLike,
     S_final: ArrayLike,
-    gain: str = "constant",
+    linear: bool = False,
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
-    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
-    "linear" is continuous.
+    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. linear: whether K is linear between knots, and
+    so continuous; else it is constant.
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
     Q = definite(Q, field.n, "Q", strict=False)
     R = definite(R, field.m, "R", strict=True)
     S_final = definite(S_final, field.n, "S_final", strict=True)
-    if gain not in GAINS:
-        raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
     R_inverse = np.linalg.inv(R)
 
     def hamiltonian(t: float) -> FloatArray:
@@ -79,15 +75,12 @@ def tvlqr(
         return np.asarray(R_inverse @ _linearised(field, nominal, nominal.t[k], side)[1].T @ S[k])
 
     knots = len(nominal.t)
-    before = np.array([gain_at(k, -1.0) for k in range(1, knots)])
     after = np.array([gain_at(k, 1.0) for k in range(knots - 1)])
-    if gain == "constant":
-        K = constant_on(nominal.t, after)
-    elif gain == "linear":
+    K = constant_on(nominal.t, after)
+    if linear:
+        before = np.array([gain_at(k, -1.0) for k in range(1, knots)])
         inner = (before[:-1] + after[1:]) / 2  # the dynamics of two intervals may differ a little
         K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
-    else:
-        K = _cubic_gain(field, nominal, S, R_inverse, hamiltonian)
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
     return Tracking(policy, S)
 
@@ -190,28 +183,6 @@ def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePol
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]
     return PiecewisePolynomial(t, control)
-
-
-def _cubic_gain(
-    field: VectorField,
-    nominal: Nominal,
-    S: FloatArray,
-    R_inverse: FloatArray,
-    hamiltonian: Callable[[float], FloatArray],
-) -> PiecewisePolynomial:
-    """K = R⁻¹B'S with its slopes R⁻¹(B'Ṡ + Ḃ'S), Ṡ from the Riccati equation."""
-    t, n = nominal.t, field.n
-    step = DIFFERENCE * float(np.min(np.diff(t)))
-    B, ahead, behind = (
-        np.array([_linearised(field, nominal, float(s) + shift)[1] for s in t])
-        for shift in (0.0, step, -step)
-    )
-    B_rate = (ahead - behind) / (2 * step)
-    H = np.array([hamiltonian(float(s)) for s in t])
-    S_rate = H[:, n:, :n] + H[:, n:, n:] @ S - S @ H[:, :n, :n] - S @ H[:, :n, n:] @ S
-    values = R_inverse @ B.transpose(0, 2, 1) @ S
-    slopes = R_inverse @ (B.transpose(0, 2, 1) @ S_rate + B_rate.transpose(0, 2, 1) @ S)
-    return cubic_through(t, values, slopes)
 
 
 def _linearised(

@@ -42,9 +42,10 @@ class Sample:
 class Affine:
     """c = constant + own·D_own + others·D_other over monomials, D by its upper triangle.
 
-    mu: (M₂,) of the multiplier in monomials of degree 0..2.
+    knots: the own and the other one. mu: (M₂,) of the multiplier in monomials of degree 0..2.
     """
 
+    knots: tuple[int, int]
     constant: FloatArray
     own: FloatArray
     others: FloatArray
@@ -57,7 +58,7 @@ class Affine:
         own[tables.quadratic, range(own.shape[1])] -= tables.twice * mu[:, None]
         constant += (own - self.own) @ tables.diagonal
         constant[: len(mu)] += mu
-        return Affine(constant, own, self.others, self.mu + mu)
+        return Affine(self.knots, constant, own, self.others, self.mu + mu)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +110,8 @@ def affine_form(sample: Sample) -> Affine:
     product *= twice[:, None] / 2 * twice
     others[tables.square] = -sample.sign * sample.rate * product.T
     none = np.zeros(len(tables.quadratic))
-    return Affine((own + others) @ tables.diagonal, own, others, none)
+    knots = sample.knot, sample.other
+    return Affine(knots, (own + others) @ tables.diagonal, own, others, none)
 
 
 def squares_along(along: FloatArray, scale: FloatArray) -> FloatArray:
@@ -128,23 +130,20 @@ def squares_along(along: FloatArray, scale: FloatArray) -> FloatArray:
 
 def improve(
     samples: list[Affine],
-    knots: list[tuple[int, int]],
-    free: int,
     basis: IntArray,
     *,
     weights: FloatArray,
-    margins: list[float],
     trust: float,
     bounds: Sequence[FloatArray] = (),
 ) -> FloatArray:
-    """D (free, n, n) for the free knots 0..free-1; D = 0 for knots beyond.
+    """D (free, n, n) for the free knots 0..free-1 with c ≥ 0 at each sample; D = 0 beyond.
 
-    samples and knots: c at each sample, and (own, other) knot, neighbours. basis: (k, n) exponents
-    of v. margins: what c keeps above zero at each sample, in 1/s. weights: (free,) of each knot's
-    volume. bounds: per free knot (R, n) rows r: |r'z| ≤ 1 in the set, I + D ⪰ rr'.
-    trust: of |D|; the linearised volume is what is enlarged.
-    Raises SolverError if it ends at no point that keeps the margins.
+    basis: (k, n) exponents of v. weights: (free,) of each knot's volume. bounds: per free knot
+    (R, n) rows r: |r'z| ≤ 1 in the set, I + D ⪰ rr'. trust: of |D|; the linearised volume is what
+    is enlarged.
+    Raises SolverError if it ends at no point with c ≥ 0.
     """
+    free = len(weights)
     n, d = basis.shape[1], samples[0].own.shape[1]
     p, q = np.triu_indices(n)
     units = np.zeros((d, n, n))
@@ -160,10 +159,8 @@ def improve(
     cost = np.tile(np.trace(units, axis1=1, axis2=2), (free, 1))
     x = np.zeros((free, d))
     V, table = _at_points(basis.tobytes(), n)
-    places = np.array(knots)
-    targets = np.array([s.constant for s in samples])
-    targets[:, 0] -= margins
-    g = targets @ table.T
+    places = np.array([s.knots for s in samples])
+    g = np.array([s.constant for s in samples]) @ table.T
     size = np.abs(g).max(axis=1)
     B = np.zeros((len(samples), 2, x.shape[1], len(table)))
     first = places.min(axis=1)

@@ -7,6 +7,7 @@ R_j of low degree in s, with room for rounding. Source: docs/certificate_continu
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import comb, floor, frexp, ldexp
 
 import numpy as np
@@ -260,7 +261,7 @@ def fitted(basis: IntArray, grams: FloatArray) -> FloatArray:
     N = len(grams) - 1
     for J in range(min(N, 1), min(N, MAX_DEGREE) + 1):
         lift = _lift(J, N)
-        points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), grams)
+        points = np.einsum("jk,kab->jab", _nearest(J, N), grams)
         scale = Scale.of(basis, points)
         scaled = points / scale.diagonal[:, None] / scale.diagonal
         room = FIT * float(np.linalg.eigvalsh(scaled)[:, 0].min()) * scale.small**2
@@ -296,6 +297,13 @@ def _sums(Q: FloatArray, of_pairs: IntArray, count: int) -> FloatArray:
     return result
 
 
+@lru_cache(maxsize=256)
+def _nearest(J: int, N: int) -> FloatArray:
+    """(J+1, N+1) control points of degree J from those of degree N, by least squares."""
+    return np.asarray(np.linalg.pinv(_lift(J, N)))
+
+
+@lru_cache(maxsize=256)
 def _lift(J: int, N: int) -> FloatArray:
     """(N+1, J+1) Bernstein control points of degree N from those of degree J."""
     return np.array(

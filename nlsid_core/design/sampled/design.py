@@ -25,7 +25,7 @@ from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress, silent
-from nlsid_core.running.assumption import disturbance_of
+from nlsid_core.running.assumption import DisturbanceMeter, disturbance_of
 
 AIM = 1.0 - 5e-5  # of the next radius: where the search for a radius aims ...
 CLOSE = 1.0 - 4e-4  # ... and from where it is content
@@ -128,11 +128,8 @@ def assume(
     """
     norms = frame(model, policy, feedback)
     gain = _gain(norms, rate) if form in ("energy", "fading") else 1.0
-    options = {"S": norms.S, "A": norms.A, "form": form, "rate": rate, "gain": gain}
-    measured = max(
-        float(np.max(disturbance_of(model, policy, run, **options)))  # type: ignore[arg-type]
-        for run in runs
-    )
+    meter = DisturbanceMeter(norms.S, norms.A, form, rate, gain)
+    measured = max(float(np.max(disturbance_of(model, policy, run, meter))) for run in runs)
     assumption = DisturbanceAssumption(
         form=form,
         bound=float(np.nextafter(safety_factor * measured, np.inf)),

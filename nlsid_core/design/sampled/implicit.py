@@ -24,18 +24,12 @@ REFINEMENTS = 3  # of how far apart two roots are
 
 
 @dataclass(frozen=True, eq=False)
-class Loop:
-    """The step in one choice of coordinates of the next rates, and its bounds; see the kernel."""
+class Bounds:
+    """What the kernel verifies of one step, by its names there."""
 
-    ring: Ring
-    rows: list[Polynomial]
-    h: list[Polynomial]
-    size: Polynomial
-    T_next: FloatArray
     kappa: float
     kappa_next: float
     curvature: list[float]
-    inverse: FloatArray
     state: float
     rates: float
     direct: float
@@ -48,6 +42,19 @@ class Loop:
             gamma * sum(far**i * size ** (m - 1 - i) for i in range(m))
             for m, gamma in enumerate(self.curvature, start=2)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The step in one choice of coordinates of the next rates, and its bounds; see the kernel."""
+
+    ring: Ring
+    rows: list[Polynomial]
+    h: list[Polynomial]
+    size: Polynomial
+    T_next: FloatArray
+    inverse: FloatArray
+    bounds: Bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +96,7 @@ class ImplicitFunnelStep:
         if len(self._loops) > 1:  # the best coordinates for a radius are kept for others
             self._loops = [min(self._loops, key=lambda loop: self._added(loop, radius, roots))]
         (loop,), a = self._loops, self.assumption
-        far, stated = closed_loop.above(Fraction(loop.kappa_next) * Fraction(roots)), {}
+        far, stated = closed_loop.above(Fraction(loop.bounds.kappa_next) * Fraction(roots)), {}
         found = None
         if a.form == "response":
             found = self._spread(loop, radius, roots)
@@ -117,12 +124,11 @@ class ImplicitFunnelStep:
     def stated(self) -> Json:
         """Coordinates and bounds."""
         loop = self._loops[0]
-        keys = ("kappa", "kappa_next", "curvature", "state", "rates", "direct", "through")
         return {
             "T": self._T.tolist(),
             "T_next": loop.T_next.tolist(),
             "inverse": loop.inverse.tolist(),
-            **{key: getattr(loop, key) for key in keys},
+            **vars(loop.bounds),
         }
 
     def bases(self) -> Json:
@@ -131,8 +137,9 @@ class ImplicitFunnelStep:
         step = ImplicitStep(loop.ring, loop.rows, loop.h, loop.size, 1.0, 1.0)
         return {name: basis.tolist() for name, basis in step.bases().items()}
 
-    def _spread(self, loop: Loop, radius: float, roots: float) -> Spread | None:
+    def _spread(self, of: Loop, radius: float, roots: float) -> Spread | None:
         """What the kernel verifies of two roots; None if they may be far apart."""
+        loop = of.bounds
         z, r = loop.kappa * radius, loop.kappa * self.assumption.bound
         spread = 2.0 * (1.0 + loop.state)  # where it is looked for first; then a smaller one
         for attempt in range(1 + REFINEMENTS):
@@ -148,8 +155,9 @@ class ImplicitFunnelStep:
             found, spread = Spread(spread, wide, far), smaller
         return found
 
-    def _after(self, loop: Loop, found: Spread, radius: float, reach: float) -> tuple[float, float]:
+    def _after(self, of: Loop, found: Spread, radius: float, reach: float) -> tuple[float, float]:
         """The second extent, and what the disturbance adds."""
+        loop = of.bounds
         z, r = loop.kappa * radius, loop.kappa * self.assumption.bound
         near = hypot(z, loop.kappa_next * reach) * UP
         mu = loop.stretch(near, (1.0 + found.spread) * r)
@@ -188,18 +196,13 @@ def _loop(
     through = [row[n:] for row in linear_part(rows, ring)]
     left = combined(combined(direct, product(through, B), -1), unit, -1)
     S_rates = [row[d:] for row in sample.S_next[d:]]
-    return Loop(
-        ring=ring,
-        rows=rows,
-        h=h,
-        size=ring.dot(scaled, scaled),
-        T_next=T_next,
+    bounds = Bounds(
         kappa=closed_loop.inverse_bound(ST),
         kappa_next=closed_loop.inverse_bound(product(S_rates, after)),
         curvature=closed_loop.curvature_bounds(normal, ring, 2),
-        inverse=inverse,
         state=closed_loop.norm_bound(B),
         rates=closed_loop.norm_bound(C),
         direct=closed_loop.norm_bound(left),
         through=closed_loop.norm_bound(through),
     )
+    return Loop(ring, rows, h, ring.dot(scaled, scaled), T_next, inverse, bounds)

@@ -426,7 +426,7 @@ def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: P
     local = drive(tmp_path / "d.mcap", image_bytes=30_000, samples=20)
     with McapFile(local) as file:
         block = file.contents.blocks[0]
-        command = next(c.id for c in file.contents.channels.values() if c.topic == CMD)
+        command = next(c.id for c in file.contents.declared.channels.values() if c.topic == CMD)
         record = file._read(*(block.index or {})[command])
         at = block.offset + int(index_entries(record, command, "")[0])
     content = bytearray(local.read_bytes())

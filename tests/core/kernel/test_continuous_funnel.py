@@ -21,10 +21,10 @@ from nlsid_core.design import (
 )
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
-from nlsid_core.kernel import continuous_funnel, held
+from nlsid_core.kernel import closed_loop, continuous_funnel
 from nlsid_core.kernel.exact import inverse_forms
-from nlsid_core.kernel.files import Rejected
 from nlsid_core.kernel.polynomials import Polynomial, Ring
+from tests.core.kernel import refusals
 from tests.core.kernel.oracle_continuous import Oracle
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, copy_of, saved, write
 from tests.marks import slow_among
@@ -266,7 +266,7 @@ def test_the_kernel_rebuilds_exactly_what_the_page_says(
         ring.digits(c)  # a ring that is too narrow is tried again wider
         seen.append((c, ring))
 
-    for module in (continuous_funnel, held):
+    for module in (continuous_funnel, closed_loop):
         monkeypatch.setattr(module, "positive", record)
     verdict = proofs.decide(files[PROOF], files)
     proof = files[PROOF]["proof"]
@@ -299,7 +299,7 @@ def test_the_reach_of_an_ellipsoid_is_exact(n: int) -> None:
                 rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
         assert found == sum((a * row[n] for a, row in zip(g, rows, strict=True)), Fraction(0))
     M[0][0] = Fraction(0)
-    with pytest.raises(Rejected, match="not positive definite"):
+    with refusals.refused("not_definite"):
         inverse_forms(M, vectors, "M")
 
 
@@ -405,7 +405,7 @@ def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_pa
 def refused(files: Files, reason: str) -> None:
     """The kernel refuses the documents, all digests fresh, with this reason."""
     bind(files)
-    with pytest.raises(CertificateRejected, match=reason):
+    with refusals.refused(reason):
         proofs.decide(files[PROOF], files)
 
 
@@ -444,7 +444,7 @@ def test_repeated_monomials_are_refused_not_added_up(files: Files) -> None:
     for extra in (1e16, 1.5, -1e16):
         equation["exponents"].insert(place, [0, 1, 0, 0])
         equation["coefficients"].insert(place, extra)
-    refused(files, "distinct, in increasing order")
+    refused(files, "malformed")
 
 
 def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
@@ -456,7 +456,7 @@ def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
     assert proofs.decide(files[PROOF], files).margin > 0
     equation["coefficients"][place] = f"{9 * 3**41 + 1}/{3**41}"
     assert worst(files) < 0
-    refused(files, "not positive")
+    refused(files, "not_positive")
 
 
 @pytest.mark.parametrize(
@@ -479,7 +479,7 @@ def test_whole_numbers_beyond_2_to_the_53_are_refused(
     for member in members[:-1]:
         place = place[member]
     place[members[-1]] = 2**53 + 1
-    refused(files, "beyond 2\\^53")
+    refused(files, "malformed")
 
 
 def test_a_box_far_away_and_narrow_is_taken_exactly(files: Files) -> None:
@@ -489,14 +489,14 @@ def test_a_box_far_away_and_narrow_is_taken_exactly(files: Files) -> None:
     equation["exponents"].insert(0, [0, 0, 0, 0])
     equation["coefficients"].insert(0, -1000000010 / 8)
     assert worst(files) < 0  # the funnel was made for a w of at most 0.25
-    refused(files, "not positive")
+    refused(files, "not_positive")
 
 
 def test_limits_that_clip_out_of_where_the_dynamics_are_valid_are_refused(files: Files) -> None:
     """ũ is within [-9, 1.5] in the funnel; clipped to [2, 3] the input is 2, outside."""
     files[FIELD]["valid"] = [[1, -9.0, 1.5]]
     files[POLICY]["limits"] = [[0, 2.0, 3.0]]
-    refused(files, "the limits of u0 lie where its dynamics are not valid")
+    refused(files, "not_valid")
 
 
 def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(files: Files) -> None:
@@ -507,7 +507,7 @@ def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(fil
     files[FIELD]["valid"] = [[1, -1.5, 1.0]]
     x = -((files[FUNNEL]["rho"][0] / files[FUNNEL]["P"][0][0][0]) ** 0.5)
     assert -files[POLICY]["K"][0][0][0][0] * x > 1  # what the policy asks for there
-    refused(files, "leaves where its dynamics are valid")
+    refused(files, "not_valid")
 
 
 def member(path: str, new: Any) -> Callable[[Files], None]:
@@ -536,27 +536,27 @@ def exponent(new: int) -> Callable[[Files], None]:
 
 
 HOSTILE: list[tuple[str, Callable[[Files], None], str]] = [
-    ("level -1", member("pieces.0.level", -1), "level should be a whole number from 0 to 16"),
-    ("level 17", member("pieces.0.level", 17), "level should be a whole number from 0 to 16"),
-    ("index", member("pieces.0.index", 2), "index should be a whole number from 0 to"),
-    ("interval", member("pieces.0.interval", 99), "interval 99.*: none"),
-    ("vertex", member("pieces.0.vertex", 2), "vertex 2.*: none"),
-    ("true for one", member("pieces.0.vertex", True), "vertex should be a whole number"),
-    ("column 5000", member("pieces.0.columns.0", 5000), "powers of two beyond"),
-    ("shift 5000", member("pieces.0.mu.shifts.0", 5000), "powers of two beyond"),
-    ("shift -5000", member("pieces.0.mu.shifts.0", -5000), "powers of two beyond"),
-    ("unit 5000", member("pieces.0.squares.unit", 5000), "unit should be a whole number"),
-    ("no factors", member("pieces.0.squares.factors", []), "a list of 1 to 24"),
-    ("no pieces", member("pieces", []), "a list of 1 to 100000"),
-    ("margin 0", member("margin", 0), "the margin should be positive"),
-    ("margin -0.0", member("margin", -0.0), "the margin should be positive"),
-    ("goal", member("goal_multiplier", -1.0), "that the funnel ends in the goal"),
-    ("basis without 1", member("basis", [[1], [2], [3]]), "no product of the basis could"),
-    ("monomials twice", member("multiplier.0", [1]), "distinct"),
-    ("unknown", member("note", "all is well"), "unknown member 'note'"),
-    ("kappa without pushes", member("kappa", [[1.0]] * 4), "vertex 1.*: none"),
-    ("exponent 5000", exponent(5000), "7 together at most"),
-    ("exponent -1", exponent(-1), "7 together at most"),
+    ("level -1", member("pieces.0.level", -1), "malformed"),
+    ("level 17", member("pieces.0.level", 17), "malformed"),
+    ("index", member("pieces.0.index", 2), "malformed"),
+    ("interval", member("pieces.0.interval", 99), "not_covered"),
+    ("vertex", member("pieces.0.vertex", 2), "not_covered"),
+    ("true for one", member("pieces.0.vertex", True), "malformed"),
+    ("column 5000", member("pieces.0.columns.0", 5000), "malformed"),
+    ("shift 5000", member("pieces.0.mu.shifts.0", 5000), "malformed"),
+    ("shift -5000", member("pieces.0.mu.shifts.0", -5000), "malformed"),
+    ("unit 5000", member("pieces.0.squares.unit", 5000), "malformed"),
+    ("no factors", member("pieces.0.squares.factors", []), "malformed"),
+    ("no pieces", member("pieces", []), "malformed"),
+    ("margin 0", member("margin", 0), "not_below"),
+    ("margin -0.0", member("margin", -0.0), "not_below"),
+    ("goal", member("goal_multiplier", -1.0), "not_below"),
+    ("basis without 1", member("basis", [[1], [2], [3]]), "not_positive"),
+    ("monomials twice", member("multiplier.0", [1]), "malformed"),
+    ("unknown", member("note", "all is well"), "malformed"),
+    ("kappa without pushes", member("kappa", [[1.0]] * 4), "not_covered"),
+    ("exponent 5000", exponent(5000), "malformed"),
+    ("exponent -1", exponent(-1), "malformed"),
 ]
 
 
@@ -572,18 +572,18 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
 
 def test_a_claim_without_its_goal_says_nothing_of_it(files: Files) -> None:
     del files[PROOF]["claim"]["goal"]
-    refused(files, "unknown member 'goal_multiplier'")
+    refused(files, "malformed")
     del files[PROOF]["proof"]["goal_multiplier"]
     assert "goal" not in proofs.decide(files[PROOF], files).statement
 
 
 def test_a_name_with_a_second_line_prints_none(files: Files) -> None:
     files[FIELD]["expansion"] = "by hand\nPROVED everything"
-    refused(files, "control character")
+    refused(files, "malformed")
     files[FIELD]["expansion"] = "by hand"
     bind(files)
     files[PROOF]["claim"]["about"]["funnel"]["file"] = "funnel.json\nPROVED"
-    with pytest.raises(CertificateRejected, match="control character"):
+    with refusals.refused("malformed"):
         proofs.decide(files[PROOF], files)
 
 
@@ -591,7 +591,7 @@ def test_a_pipe_in_the_place_of_a_file_is_refused_at_once(files: Files, tmp_path
     path = write(files, tmp_path)
     (tmp_path / FUNNEL).unlink()
     os.mkfifo(tmp_path / FUNNEL)
-    with pytest.raises(CertificateRejected, match="cannot be read: not a regular file"):
+    with refusals.refused("mismatch"):
         proofs.check(path)
 
 
@@ -599,7 +599,7 @@ def test_a_nominal_that_jumps_and_a_break_between_knots_are_refused(files: Files
     jumping = copy_of(files)
     for name in (POLICY, FUNNEL):
         jumping[name]["x"][2][0][0] = 0.5
-    refused(jumping, "jump at a knot")
+    refused(jumping, "malformed")
     files[FIELD]["breaks"] = [0.3]
     files[FIELD]["pieces"] *= 2
-    refused(files, "change at 0.3 s, which is no knot")
+    refused(files, "malformed")

@@ -17,7 +17,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nlsid_core import kernel
-from nlsid_core.kernel import Mismatch, Rejected, text
+from nlsid_core.kernel import Rejected, text
 from nlsid_core.kernel.exact import at_most, definite, semidefinite
 from nlsid_core.kernel.files import (
     MAX_DEGREE,
@@ -32,6 +32,7 @@ from nlsid_core.kernel.files import (
 from nlsid_core.kernel.polynomials import Ring
 from nlsid_core.kernel.positivity import read_squares
 from tests.core.kernel.mutations import CORPUS
+from tests.core.kernel.refusals import refused
 
 SECONDS = 20.0  # of processor time that any one refusal may take, on a slow machine
 json_values = st.recursive(
@@ -128,7 +129,7 @@ def test_a_reader_returns_or_refuses(reader: str, value: Any) -> None:
 def test_a_number_is_read_as_the_float64_it_is(value: float) -> None:
     content = json.dumps({"v": value}).encode()
     if type(value) is int and abs(value) > MAX_WHOLE:
-        with pytest.raises(Rejected, match="beyond 2\\^53"):
+        with refused("malformed"):
             parse(content, "file")
         return
     found = parse(content, "file").members("v")["v"].number()
@@ -176,7 +177,7 @@ BAD_TEXTS = {
 @pytest.mark.parametrize("name", BAD_TEXTS)
 def test_what_is_no_document_is_refused(name: str) -> None:
     started = time.process_time()
-    with pytest.raises(Rejected, match=r"\w"):
+    with refused("malformed"):
         kernel.decide(BAD_TEXTS[name], lambda _: b"")
     assert time.process_time() - started < SECONDS
 
@@ -193,11 +194,11 @@ def test_only_regular_files_beside_the_proof_are_read(tmp_path: Path) -> None:
     for name in ("fifo", ".", "absent"):
         with pytest.raises(OSError, match=r"\w"):
             read_regular(tmp_path / name)
-    with pytest.raises(Rejected, match="bytes"):
+    with refused("too_large"):
         kernel.check(tmp_path / "large")
     about = {"model": {"file": "fifo", "digest": digest(b"{}")}}
     (tmp_path / "b.proof.json").write_bytes(proof({"kind": "stable_set", "about": about}, {}))
-    with pytest.raises(Mismatch, match="cannot be read"):
+    with refused("mismatch"):
         kernel.check(tmp_path / "b.proof.json")
 
 
@@ -214,7 +215,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
     size = len(rows)
     if any(len(row) != size for row in rows):
         for decide in (definite, semidefinite):
-            with pytest.raises(Rejected, match="square"):
+            with refused("too_large"):
                 decide(rows, "M")
         return
     M = [[Fraction(rows[max(i, j)][min(i, j)]) for j in range(size)] for i in range(size)]
@@ -223,7 +224,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
         definite(M, "M")
         semidefinite(M, "M")
         return
-    with pytest.raises(Rejected, match="not positive definite"):
+    with refused("not_definite"):
         definite(M, "M")
     principal = [
         _determinant([[M[i][j] for j in chosen] for i in chosen])
@@ -233,7 +234,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
     if all(minor >= 0 for minor in principal):
         semidefinite(M, "M")
     else:
-        with pytest.raises(Rejected, match="not positive semidefinite"):
+        with refused("not_definite"):
             semidefinite(M, "M")
 
 
@@ -259,15 +260,15 @@ def test_matrices_that_floats_cannot_tell_and_matrices_that_take_too_long() -> N
         semidefinite([[big, big + 1], [big + 1, big]], "M")
     with pytest.raises(Rejected):
         semidefinite([[0, 1], [1, 10]], "M")
-    with pytest.raises(Rejected, match="not symmetric"):
+    with refused("not_definite"):
         definite([[1, 0], [Fraction(1, 10**90), 1]], "M")
     started = time.process_time()
-    with pytest.raises(Rejected, match="denominators"):
+    with refused("too_large"):
         definite(
             [[Fraction(int(i == j), 10**200 + i + 1) for j in range(100)] for i in range(100)], "M"
         )
     assert time.process_time() - started < SECONDS
-    with pytest.raises(Rejected, match="no"):
+    with refused("not_below"):
         at_most(Fraction(1, 3) + Fraction(1, 10**90), Fraction(1, 3), "no")
 
 
@@ -316,18 +317,18 @@ def test_a_message_stays_on_one_line(words: str) -> None:
 
 def test_monomials_whose_exponents_would_run_into_each_other_are_refused() -> None:
     assert ring().key([MAX_DEGREE, 0]) != ring().key([0, 1])
-    for exponents in ([64, 0], [40, 40], [2**40, 0], [-1, 2], [1], [1, 2, 3]):
-        with pytest.raises(Rejected):
-            ring().key(exponents)
+    for exponents in ([40, 40], [2**40, 0], [1], [1, 2, 3]):
+        with refused("malformed"):
+            Node([exponents], "monomials").monomials(2)
     for exponents in ([64, 0], [2**52, 0], [-1, 2]):
         node = Node({"exponents": [exponents], "coefficients": [1]}, "p")
-        with pytest.raises(Rejected, match="exponents should be"):
+        with refused("malformed"):
             node.polynomial(2)
     wide = Ring(2, 64)
     p = wide.variables[0]
     for _ in range(5):
         p = p * p
-    with pytest.raises(Rejected, match="degree 63"):
+    with refused("too_large"):
         p * p
 
 

@@ -5,27 +5,25 @@ import time
 import pytest
 
 from nlsid_core import files, kernel
-from nlsid_core.deciding import Deciding
+from nlsid_core.deciding import Deciding, Limits
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel.polynomials import Ring
 from tests.core.kernel.hostile_claims import Claim, equal_hashes, network
 
 
-def deciding(claim: Claim, **limits: int) -> Deciding:
+def deciding(claim: Claim, limits: Limits) -> Deciding:
     document, about = claim
     contents = {name: files.encode(content) for name, content in about.items()}
-    return Deciding.of(files.encode(document), contents, **limits)
+    return Deciding.of(files.encode(document), contents, limits)
 
 
 @pytest.mark.parametrize(
     ("limits", "reason"),
-    [({"seconds": 1}, "more than 1 s of processor time"), ({"memory": 60}, "memory")],
+    [(Limits(seconds=1), "more than 1 s of processor time"), (Limits(memory=60), "memory")],
 )
-def test_a_claim_that_takes_too_much_is_ended_with_the_reason(
-    limits: dict[str, int], reason: str
-) -> None:
+def test_a_claim_that_takes_too_much_is_ended_with_the_reason(limits: Limits, reason: str) -> None:
     with pytest.raises(CertificateRejected, match=reason):
-        deciding(network(100), **limits).wait()
+        deciding(network(100), limits).wait()
 
 
 def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:

@@ -15,6 +15,7 @@ from nlsid_core.arrays import Json
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from tests.core.kernel import oracle_tube as oracle
+from tests.core.kernel.refusals import refused
 from tests.core.kernel.tube_claims import claim
 
 NAMES = {"model": MODEL, "policy": POLICY, "funnel": FUNNEL}
@@ -162,35 +163,35 @@ def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda f: changing(f, level=first(f)["level"] * 1.03), "half-width"),
-        (lambda f: changing(f, inlet=first(f)["inlet"] + 0.05 * first(f)["level"]), "half-width"),
-        (lambda f: changing(f, inlet=-1.0), "0 or more"),
-        (lambda f: changing(f, level=-1.0), "0 or more"),
-        (lambda f: changing(f, P=(1.01 * np.array(first(f)["P"])).tolist()), "the decrease of V"),
-        (lambda f: changing(f, P=(-np.array(first(f)["P"])).tolist()), "P is not positive"),
-        (lambda f: changing(f, P=[[1.0, 2.0], [0.0, 1.0]]), "not symmetric"),
-        (lambda f: changing(f, P=[[1.0]]), "should have shape"),
-        (lambda f: changing(f, R=[[0.97]]), "the decrease of V|the bound on speed"),
-        (lambda f: changing(f, R=[[-1.0]]), "R is not positive definite"),
-        (lambda f: changing(f, tau=[first(f)["tau"][0] * 1.003]), "the bound on speed"),
-        (lambda f: changing(f, tau=[-first(f)["tau"][0]]), "should be positive"),
-        (lambda f: changing(f, tau=first(f)["tau"] * 2), "should have shape"),
-        (lambda f: changing(f, half_widths=[0.97 * first(f)["half_widths"][0]]), "half-width"),
-        (lambda f: changing(f, half_widths=[-1.0]), "should be positive"),
-        (lambda f: changing(f, rho=0.95 * first(f)["rho"]), "the decrease of V|the bound on"),
-        (lambda f: changing(f, rho=1.5), "rho should be 1"),
-        (lambda f: changing(f, rho=-0.5), "rho should be 1"),
-        (lambda f: changing(f, rho=1), "rho should be 1"),
-        (lambda f: assuming(f, kind="energy"), "for a number of samples"),
-        (lambda f: assuming(f, kind="energy", samples=9), "rho should be 1"),
-        (lambda f: assuming(f, samples=9), "for a number of samples"),
-        (lambda f: lasting(f, 0), "whole number from 1"),
-        (lambda f: lasting(f, 2.5), "whole number"),
-        (lambda f: assuming(f, kind="peak"), "known: fading, energy"),
-        (lambda f: f | {"note": 1}, "unknown member 'note'"),
-        (lambda f: f | {"kind": "sampled"}, "expected 'tube'"),
-        (lambda f: changing(f, level=2**53 + 2), "whole number beyond"),
-        (lambda f: changing(f, L=[[0.0], [0.0]]), "the observer of a tube is not the policy's"),
+        (lambda f: changing(f, level=first(f)["level"] * 1.03), "not_below"),
+        (lambda f: changing(f, inlet=first(f)["inlet"] + 0.05 * first(f)["level"]), "not_below"),
+        (lambda f: changing(f, inlet=-1.0), "not_below"),
+        (lambda f: changing(f, level=-1.0), "not_below"),
+        (lambda f: changing(f, P=(1.01 * np.array(first(f)["P"])).tolist()), "not_definite"),
+        (lambda f: changing(f, P=(-np.array(first(f)["P"])).tolist()), "not_definite"),
+        (lambda f: changing(f, P=[[1.0, 2.0], [0.0, 1.0]]), "not_definite"),
+        (lambda f: changing(f, P=[[1.0]]), "malformed"),
+        (lambda f: changing(f, R=[[0.97]]), "not_definite"),
+        (lambda f: changing(f, R=[[-1.0]]), "not_definite"),
+        (lambda f: changing(f, tau=[first(f)["tau"][0] * 1.003]), "not_definite"),
+        (lambda f: changing(f, tau=[-first(f)["tau"][0]]), "not_below"),
+        (lambda f: changing(f, tau=first(f)["tau"] * 2), "malformed"),
+        (lambda f: changing(f, half_widths=[0.97 * first(f)["half_widths"][0]]), "not_below"),
+        (lambda f: changing(f, half_widths=[-1.0]), "not_below"),
+        (lambda f: changing(f, rho=0.95 * first(f)["rho"]), "not_definite"),
+        (lambda f: changing(f, rho=1.5), "not_below"),
+        (lambda f: changing(f, rho=-0.5), "not_below"),
+        (lambda f: changing(f, rho=1), "not_below"),
+        (lambda f: assuming(f, kind="energy"), "malformed"),
+        (lambda f: assuming(f, kind="energy", samples=9), "not_below"),
+        (lambda f: assuming(f, samples=9), "malformed"),
+        (lambda f: lasting(f, 0), "malformed"),
+        (lambda f: lasting(f, 2.5), "malformed"),
+        (lambda f: assuming(f, kind="peak"), "malformed"),
+        (lambda f: f | {"note": 1}, "malformed"),
+        (lambda f: f | {"kind": "sampled"}, "malformed"),
+        (lambda f: changing(f, level=2**53 + 2), "malformed"),
+        (lambda f: changing(f, L=[[0.0], [0.0]]), "malformed"),
     ],
 )
 def test_a_forged_funnel_with_right_digests_is_rejected(
@@ -198,21 +199,21 @@ def test_a_forged_funnel_with_right_digests_is_rejected(
 ) -> None:
     assert callable(change)
     documents["funnel"] = change(documents["funnel"])
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(documents)
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda p: p | {"K": (9.0 * np.array(p["K"])).tolist()}, ", the policy engaged,"),
-        (lambda p: p | {"L": (3.0 * np.array(p["L"])).tolist()}, "the observer of a tube is not"),
-        (lambda p: p | {"period": 0.0500001}, "period is not the model's"),
-        (lambda p: p | {"u": [[9.0], *p["u"][1:]]}, "outside the model's input range"),
-        (lambda p: p | {"u": []}, "a plan should have 1 to 1000000 samples"),
-        (lambda p: p | {"start": [0.0]}, "should have shape"),
-        (lambda p: p | {"law": "u = 0"}, "unknown member 'law'"),
-        (lambda p: p | {"kind": "linear"}, "expected 'tube'"),
+        (lambda p: p | {"K": (9.0 * np.array(p["K"])).tolist()}, "not_definite"),
+        (lambda p: p | {"L": (3.0 * np.array(p["L"])).tolist()}, "malformed"),
+        (lambda p: p | {"period": 0.0500001}, "malformed"),
+        (lambda p: p | {"u": [[9.0], *p["u"][1:]]}, "not_valid"),
+        (lambda p: p | {"u": []}, "too_large"),
+        (lambda p: p | {"start": [0.0]}, "malformed"),
+        (lambda p: p | {"law": "u = 0"}, "malformed"),
+        (lambda p: p | {"kind": "linear"}, "malformed"),
     ],
 )
 def test_another_policy_with_right_digests_is_rejected(
@@ -220,7 +221,7 @@ def test_another_policy_with_right_digests_is_rejected(
 ) -> None:
     assert callable(change)
     documents["policy"] = change(documents["policy"])
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(bound(documents))
 
 
@@ -231,7 +232,7 @@ def test_a_plan_is_taken_up_to_the_limit_and_no_longer(
     monkeypatch.setattr("nlsid_core.kernel.tube.MAX_PLAN", len(documents["policy"]["u"]))
     decide(documents)
     documents["policy"]["u"].append(documents["policy"]["u"][-1])
-    with pytest.raises(CertificateRejected, match="a plan should have 1 to 70 samples"):
+    with refused("too_large"):
         decide(bound(documents))
 
 
@@ -248,7 +249,7 @@ def test_a_plan_is_for_a_linear_model(documents: dict[str, Json]) -> None:
     found = bound({"model": model, "policy": policy, "funnel": funnel})
     about = {role: proofs.binding(NAMES[role], document) for role, document in found.items()}
     document = proofs.proof_document({"kind": "tube", "about": about}, proof)
-    with pytest.raises(CertificateRejected, match="a plan is decided for a model of kind diff"):
+    with refused("malformed"):
         proofs.decide(document, {NAMES[role]: found[role] for role in NAMES})
 
 
@@ -260,7 +261,7 @@ def test_a_faster_robot_with_right_digests_is_rejected(documents: dict[str, Json
 
 def test_a_funnel_made_for_another_policy_is_rejected(documents: dict[str, Json]) -> None:
     documents["policy"]["K"] = [[0.0, 0.0]]
-    with pytest.raises(CertificateMismatch, match="funnel was made for another policy"):
+    with refused("mismatch"):
         decide(documents)
 
 
@@ -371,5 +372,5 @@ def test_the_smallest_tube_that_is_false_is_refused(documents: dict[str, Json]) 
         false.append(float(1 / reached) * (1 + 1e-9))
         assert Fraction(false[-1]) * reached > 1
     tube["tau"] = [min(false)]
-    with pytest.raises(CertificateRejected, match="the bound on speed"):
+    with refused("not_definite"):
         decide(documents)

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from nlsid_core import files
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.errors import CertificateRejected
 from tests.core.kernel import oracle_sampled as oracle
+from tests.core.kernel.refusals import refused
 from tests.core.kernel.sampled_claims import UP, Scalar, one_step
 from tests.marks import slow_among
 
@@ -26,7 +27,7 @@ def test_random_claims_are_decided_as_the_closed_form_decides(form: str) -> None
         if true:
             assert claim.decide().margin >= 0
         else:
-            with pytest.raises(CertificateRejected, match=r"reach|deviations"):
+            with pytest.raises(CertificateRejected):
                 claim.decide()
         decided[true] += 1
     assert decided == {True: 30, False: 30}
@@ -66,7 +67,7 @@ def test_numbers_that_cancel_in_floats_are_combined_exactly() -> None:
     (after,) = oracle.explicit_next(documents["model"], documents["policy"], 0, [s])
     assert after == s + s**2 / 2  # the counterexample: from the tube's edge to far outside
     assert after > Fraction(false.tube[1])
-    with pytest.raises(CertificateRejected, match="tube, step 0: reach"):
+    with refused("not_positive"):
         false.decide()
 
 
@@ -140,35 +141,38 @@ def test_samples_and_time_are_those_covered() -> None:
 
 
 FALSE: dict[str, tuple[dict[str, Any], str]] = {
-    "next radius below what is reached": ({"tube": [1.0, 0.54]}, "exceed the next radius"),
-    "inlet's goal below what is reached": ({"inlet": [1.0, 0.54]}, "exceed the next radius"),
+    "next radius below what is reached": ({"tube": [1.0, 0.54]}, "not_below"),
+    "inlet's goal below what is reached": ({"inlet": [1.0, 0.54]}, "not_below"),
     "reach below what is reached": (
         {"reach": {"tube": [0.49], "inlet": [0.5 * UP]}, "tube": [1.0, 0.55]},
-        "tube, step 0: reach",
+        "not_positive",
     ),
-    "a tube that starts beyond the inlet": ({"inlet": [0.9, 0.6]}, "start in the inlet"),
-    "a radius of zero": ({"tube": [1.0, 0.0], "inlet": [1.0, 0.0]}, "should be positive"),
-    "a negative radius": ({"tube": [-1.0, 0.6]}, "should be positive"),
-    "a negative reach": ({"reach": {"tube": [-0.5], "inlet": [0.5]}}, "not be negative"),
-    "a box that the tube leaves": ({"box": 0.9}, "can leave the box"),
-    "half-widths below the tube's": ({"widths": [1.0, 0.59]}, "half-width"),
-    "a negative half-width": ({"widths": [1.0, -0.6]}, "half-width"),
-    "a gain without a form that has one": ({"gain": 2.0}, "none of form"),
-    "a rate above one": ({"form": "fading", "rate": 1.5, "gain": 2.0}, "none of form"),
-    "a rate that energy does not have": ({"form": "energy", "rate": 0.9, "gain": 2.0}, "none of"),
-    "an unknown form": ({"form": "average"}, "form 'average'"),
-    "a shape of zero": ({"S": [1.0, 0.0], "widths": [1.0, 9.0]}, "nonzero diagonal"),
-    "a name on two lines": ({"name": "level\nPROVED everything"}, "control character"),
-    "a period of zero": ({"period": 0.0}, "positive period"),
-    "a whole number beyond 2^53": ({"box": 2**53 + 1}, "beyond 2\\^53"),
-    "curvature below the slope": ({"form": "response", "curvature": [0.5], "A": [-0.5]}, "curvat"),
+    "a tube that starts beyond the inlet": ({"inlet": [0.9, 0.6]}, "not_below"),
+    "a radius of zero": ({"tube": [1.0, 0.0], "inlet": [1.0, 0.0]}, "not_below"),
+    "a negative radius": ({"tube": [-1.0, 0.6]}, "not_below"),
+    "a negative reach": ({"reach": {"tube": [-0.5], "inlet": [0.5]}}, "not_below"),
+    "a box that the tube leaves": ({"box": 0.9}, "not_valid"),
+    "half-widths below the tube's": ({"widths": [1.0, 0.59]}, "not_valid"),
+    "a negative half-width": ({"widths": [1.0, -0.6]}, "not_valid"),
+    "a gain without a form that has one": ({"gain": 2.0}, "not_below"),
+    "a rate above one": ({"form": "fading", "rate": 1.5, "gain": 2.0}, "not_below"),
+    "a rate that energy does not have": ({"form": "energy", "rate": 0.9, "gain": 2.0}, "not_below"),
+    "an unknown form": ({"form": "average"}, "malformed"),
+    "a shape of zero": ({"S": [1.0, 0.0], "widths": [1.0, 9.0]}, "malformed"),
+    "a name on two lines": ({"name": "level\nPROVED everything"}, "malformed"),
+    "a period of zero": ({"period": 0.0}, "malformed"),
+    "a whole number beyond 2^53": ({"box": 2**53 + 1}, "malformed"),
+    "curvature below the slope": (
+        {"form": "response", "curvature": [0.5], "A": [-0.5]},
+        "not_definite",
+    ),
 }
 
 
 @pytest.mark.parametrize("what", FALSE)
 def test_a_false_neighbour_of_a_small_claim_is_refused(what: str) -> None:
     changes, reason = FALSE[what]
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         true_claim(**changes).decide()
 
 
@@ -194,14 +198,14 @@ def test_repeated_monomials_are_refused() -> None:
     model = copy.deepcopy(claim.documents()["model"])
     model["exponents"].append([1, 0])
     model["coefficients"].append([0.25])
-    with pytest.raises(CertificateRejected, match="distinct"):
+    with refused("malformed"):
         claim.decide(model=model)
 
 
 def test_a_policy_that_the_funnel_was_not_made_for_is_a_mismatch() -> None:
     claim = true_claim()
     other = claim.documents()["policy"] | {"law": "another"}
-    with pytest.raises(CertificateMismatch, match="the funnel was made for another policy"):
+    with refused("mismatch"):
         claim.decide(policy=other)
 
 

@@ -153,7 +153,7 @@ def test_a_spurious_root_within_the_bound_makes_a_claim_false_and_is_refused() -
     far = float(abs(S[1][1]) * spurious[0]) * 1.001
     assert far > design.funnel.roots[1]  # as designed, the bound keeps it out
     funnel = replace(design.funnel, roots=np.full(3, far))
-    with pytest.raises(CertificateRejected, match="step 0"):
+    with pytest.raises(CertificateRejected):
         decide(replace(design, funnel=funnel))
 
 

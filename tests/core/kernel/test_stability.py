@@ -2,20 +2,23 @@
 
 import json
 import random
+from collections.abc import Callable
 from decimal import Context, Decimal
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.errors import CertificateRejected
 from nlsid_core.identification import prove_stability
 from nlsid_core.kernel.files import parse
 from nlsid_core.kernel.models import read_model
 from tests.core.kernel import oracle_stability as oracle
+from tests.core.kernel.refusals import refused
 from tests.core.kernel.stability_claims import (
     CONSTANT,
     MODELS,
@@ -29,7 +32,7 @@ from tests.marks import slow_among
 
 NAMES = list(MODELS)
 NO_INPUT = ("cascade", "network", "monotone", "straight", "linear")  # in the increments of these
-MATHEMATICS = ("decrease", "P is not")  # what a proof is refused for though its form is right
+MATHEMATICS = ("not_definite", "not_valid")  # a proof is refused though its form is right
 
 
 def where(name: str, model: Json) -> str:
@@ -186,20 +189,6 @@ def test_a_sum_that_floating_point_loses_is_not_lost() -> None:
         decide(model, proof)
 
 
-def test_a_repeated_monomial_is_refused() -> None:
-    model, proof = claim("quadratic")
-    model["G"][0]["exponents"][1] = [0, 0]
-    with pytest.raises(CertificateRejected, match="each once"):
-        decide(model, proof)
-
-
-def test_a_whole_number_beyond_two_to_the_53_is_refused() -> None:
-    model, proof = claim("linear")
-    proof["proof"]["P"][0][0] = 2**53 + 1
-    with pytest.raises(CertificateRejected, match=r"beyond 2\^53"):
-        decide(model, proof)
-
-
 def test_a_box_far_away_keeps_every_digit_of_its_ends() -> None:
     """G_0 = (w - 1e9)² - 2, w in [1e9 + 9, 1e9 + 11]: as exact numbers it is at least 79."""
     G_0 = ([[0, 0], [1, 0], [2, 0]], [1e18 - 2.0, -2e9, 1.0])
@@ -244,23 +233,7 @@ def test_the_slopes_are_those_of_the_spline() -> None:
     nu = [[s * C[j][0]] for j in range(m)]
     after = [[sum((f * z[0] for f, z in zip(row, nu + x, strict=True)), Fraction(0))] for row in F]
     assert _V(P, after) > _V(P, x)
-    with pytest.raises(CertificateRejected, match="decrease"):
-        decide(model, proof)
-
-
-def test_a_flat_place_of_e_has_no_next_output() -> None:
-    """e' = 0 at v = -1: 3 + 6v + 3v²."""
-    model, proof = claim("monotone")
-    model["e"] = [3.0, 3.0, 1.0]
-    with pytest.raises(CertificateRejected, match="decrease"):
-        decide(model, proof)
-
-
-@pytest.mark.parametrize("e", [[1.0, 0.1, 0.0], [3.0, 0.0, -1.0]])
-def test_what_is_no_increasing_cubic_is_refused(e: list[float]) -> None:
-    model, proof = claim("monotone")
-    model["e"] = e
-    with pytest.raises(CertificateRejected, match="not increasing"):
+    with refused("not_definite"):
         decide(model, proof)
 
 
@@ -275,24 +248,8 @@ def test_a_rate_below_the_fastest_is_refused_and_a_slower_one_proved(name: str) 
         if proved:
             decide(model, proof)
         else:
-            with pytest.raises(CertificateRejected, match="decrease"):
+            with refused("not_definite"):
                 decide(model, proof)
-
-
-@pytest.mark.parametrize("rate", [1.0, 1.5, 0.0, -0.9])
-def test_a_rate_that_is_no_decay_is_refused(rate: float) -> None:
-    model, proof = claim("linear")
-    proof["claim"]["rate"] = rate
-    with pytest.raises(CertificateRejected, match="0 < rate < 1"):
-        decide(model, proof)
-
-
-@pytest.mark.parametrize("value", ["1", None, True, [1.0], {"a": 1}])
-def test_a_rate_of_another_type_is_refused(value: object) -> None:
-    model, proof = claim("linear")
-    proof["claim"]["rate"] = value
-    with pytest.raises(CertificateRejected, match="rate should be a number"):
-        decide(model, proof)
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -302,7 +259,7 @@ def test_a_forgery_with_right_digests_is_refused(change: str) -> None:
     made(model, proof["proof"])
     if reason in MATHEMATICS:
         assert not oracle.is_proved(model, proof["claim"], proof["proof"])
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(model, proof)
 
 
@@ -313,6 +270,33 @@ def test_an_endless_tree_is_refused() -> None:
         tree = {"split": 0, "parts": [tree, {"N": [[1.0], [0.0]]}]}
     proof["proof"]["multipliers"] = tree
     with pytest.raises(CertificateRejected):
+        decide(model, proof)
+
+
+ODD: list[tuple[str, Callable[[Json, Json], Any], str]] = [
+    ("quadratic", lambda m, _: m["G"][0]["exponents"].__setitem__(1, [0, 0]), "malformed"),
+    ("linear", lambda _, d: d["proof"]["P"][0].__setitem__(0, 2**53 + 1), "malformed"),
+    ("monotone", lambda m, _: m.update(e=[3.0, 3.0, 1.0]), "not_definite"),  # e' = 0 at v = -1
+    ("monotone", lambda m, _: m.update(e=[1.0, 0.1, 0.0]), "not_valid"),
+    ("monotone", lambda m, _: m.update(e=[3.0, 0.0, -1.0]), "not_valid"),
+    *(
+        ("linear", lambda _, d, rate=rate: d["claim"].update(rate=rate), "not_below")
+        for rate in (1.0, 1.5, 0.0, -0.9)
+    ),
+    *(
+        ("linear", lambda _, d, rate=rate: d["claim"].update(rate=rate), "malformed")
+        for rate in ("1", None, True, [1.0], {"a": 1})
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "reason"), ODD)
+def test_what_is_out_of_range_is_refused_with_the_reason(
+    name: str, change: Callable[[Json, Json], Any], reason: str
+) -> None:
+    model, proof = claim(name)
+    change(model, proof)
+    with refused(reason):
         decide(model, proof)
 
 
@@ -333,7 +317,7 @@ def test_a_changed_digit_in_a_model_is_refused(tmp_path: Path, name: str) -> Non
     digits = [i for i, c in enumerate(original) if c in "12345678"]
     for i in digits[:: max(1, len(digits) // 20)]:
         model.write_text(original[:i] + str(int(original[i]) + 1) + original[i + 1 :])
-        with pytest.raises(CertificateMismatch, match=r"model\.json is not the model"):
+        with refused("mismatch"):
             proofs.check(path)
 
 
@@ -343,7 +327,7 @@ def test_a_file_name_that_leaves_the_folder_is_refused(tmp_path: Path, file: str
     document = json.loads(path.read_text())
     document["claim"]["about"]["model"]["file"] = file
     files.write_document(path, document)
-    with pytest.raises(CertificateRejected, match="not a plain file name"):
+    with refused("malformed"):
         proofs.check(path)
 
 
@@ -356,7 +340,7 @@ def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str,
         inner = inner[key]
     del inner[place[-1]]
     files.write_document(path, document)
-    with pytest.raises(CertificateRejected, match=f"{place[-1]}.*missing|object with a kind"):
+    with refused("malformed"):
         proofs.check(path)
 
 

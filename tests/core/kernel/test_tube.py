@@ -10,8 +10,9 @@ import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.errors import CertificateRejected
 from tests.core.kernel import oracle_tube as oracle
+from tests.core.kernel.refusals import refused
 from tests.core.kernel.tube_claims import (
     FUNNEL,
     LONG,
@@ -90,7 +91,7 @@ def test_one_observer_of_all_tubes_is_called_so() -> None:
 def test_two_outputs_of_one_name_are_refused() -> None:
     model, funnel, proof = claim("two_outputs")
     model["y"][1]["name"] = model["y"][0]["name"]
-    with pytest.raises(CertificateRejected, match="two outputs have the same name"):
+    with refused("malformed"):
         decide(model, funnel, proof)
 
 
@@ -160,7 +161,7 @@ def test_tau_is_proved_up_to_the_oracles_limit_and_refused_a_tenth_of_a_percent_
     tubes(funnel)["tau"][0] = proved
     decide(model, funnel, proof)
     tubes(funnel)["tau"][0] = false
-    with pytest.raises(CertificateRejected, match=r"the bound on .* by V"):
+    with refused("not_definite"):
         decide(model, funnel, proof)
 
 
@@ -171,23 +172,23 @@ def term(funnel: Json, i: int = 0) -> Json:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda f: tubes(f)["follows"]["weights"][0].__setitem__(0, -1e-9), "0 or more"),
+        (lambda f: tubes(f)["follows"]["weights"][0].__setitem__(0, -1e-9), "not_below"),
         (
             lambda f: tubes(f)["follows"].update(
                 weights=[[0.0] * len(tubes(f)["follows"]["terms"])]
             ),
-            "some positive",
+            "not_below",
         ),
-        (lambda f: tubes(f)["follows"].update(weights=[]), "should have shape"),
-        (lambda f: tubes(f)["follows"].update(terms=[]), "list of 1 to 200"),
-        (lambda f: term(f).update(fading=1.0), "fading in"),
-        (lambda f: term(f).update(fading=-0.1), "fading in"),
-        (lambda f: term(f).update(scale=0.0), "scale should be positive"),
-        (lambda f: term(f).update(inputs=[1]), "among the model's 1"),
-        (lambda f: term(f).update(inputs=[-1]), "among the model's 1"),
-        (lambda f: term(f).update(of="square"), "value or change"),
-        (lambda f: term(f).update(future=1), "unknown member 'future'"),
-        (lambda f: tubes(f).update(inlet=1e-12), "without an inlet"),
+        (lambda f: tubes(f)["follows"].update(weights=[]), "malformed"),
+        (lambda f: tubes(f)["follows"].update(terms=[]), "malformed"),
+        (lambda f: term(f).update(fading=1.0), "not_below"),
+        (lambda f: term(f).update(fading=-0.1), "not_below"),
+        (lambda f: term(f).update(scale=0.0), "not_below"),
+        (lambda f: term(f).update(inputs=[1]), "malformed"),
+        (lambda f: term(f).update(inputs=[-1]), "malformed"),
+        (lambda f: term(f).update(of="square"), "malformed"),
+        (lambda f: term(f).update(future=1), "malformed"),
+        (lambda f: tubes(f).update(inlet=1e-12), "malformed"),
     ],
 )
 def test_a_level_by_commands_that_makes_no_sense_is_refused(
@@ -208,7 +209,7 @@ def test_a_level_by_commands_that_makes_no_sense_is_refused(
         ),
         {MODEL: model, FUNNEL: funnel},
     )
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(model, funnel, proof)
 
 
@@ -242,40 +243,40 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "reason"),
     [
-        ("linear", lambda c: c.funnel.update(tubes=[]), "list of 1 to 8"),
-        ("linear", lambda c: c.funnel.update(box={"y": [], "u": []}), "needs no box"),
-        ("linear", lambda c: c.funnel.update(settling=-1), "whole number from 0"),
-        ("linear", lambda c: c.proof.update(multipliers=[{"N": []}] * 2), "no multipliers"),
-        ("linear", lambda c: tubes(c.funnel).update(rho=1.0), "rho should be 1 for"),
-        ("linear", lambda c: tubes(c.funnel).update(rho=0.0), "rho should be"),
-        ("linear", lambda c: c.funnel["tubes"][1].update(rho=0.5), "rho should be 1 for"),
-        ("linear", lambda c: first_assumption(c.funnel).update(kind="peak"), "known: fading"),
-        ("linear", lambda c: first_assumption(c.funnel).update(samples=9), "for a number of"),
-        ("linear", lambda c: tubes(c.funnel).update(inlet=-1e-9), "0 or more"),
-        ("linear", lambda c: tubes(c.funnel).update(tau=[-1.0]), "should be positive"),
-        ("linear", lambda c: scaled(tubes(c.funnel), "P", -1.0), "P is not positive"),
-        ("linear", lambda c: tubes(c.funnel).update(R=[[-1.0]]), "R is not positive definite"),
+        ("linear", lambda c: c.funnel.update(tubes=[]), "malformed"),
+        ("linear", lambda c: c.funnel.update(box={"y": [], "u": []}), "malformed"),
+        ("linear", lambda c: c.funnel.update(settling=-1), "malformed"),
+        ("linear", lambda c: c.proof.update(multipliers=[{"N": []}] * 2), "malformed"),
+        ("linear", lambda c: tubes(c.funnel).update(rho=1.0), "not_below"),
+        ("linear", lambda c: tubes(c.funnel).update(rho=0.0), "not_below"),
+        ("linear", lambda c: c.funnel["tubes"][1].update(rho=0.5), "not_below"),
+        ("linear", lambda c: first_assumption(c.funnel).update(kind="peak"), "malformed"),
+        ("linear", lambda c: first_assumption(c.funnel).update(samples=9), "malformed"),
+        ("linear", lambda c: tubes(c.funnel).update(inlet=-1e-9), "not_below"),
+        ("linear", lambda c: tubes(c.funnel).update(tau=[-1.0]), "not_below"),
+        ("linear", lambda c: scaled(tubes(c.funnel), "P", -1.0), "not_definite"),
+        ("linear", lambda c: tubes(c.funnel).update(R=[[-1.0]]), "not_definite"),
         (
             "monotone",
             lambda c: c.proof["multipliers"][0]["N"][0][1].__setitem__(0, 1e-9),
-            "unbounded slope",
+            "not_below",
         ),
-        ("monotone", lambda c: c.proof["multipliers"][0]["N"].pop(), "should have shape"),
-        ("monotone", lambda c: c.proof["multipliers"].pop(), "list of 1 to 1"),
+        ("monotone", lambda c: c.proof["multipliers"][0]["N"].pop(), "malformed"),
+        ("monotone", lambda c: c.proof["multipliers"].pop(), "malformed"),
         (
             "implicit_ray",
             lambda c: c.funnel.update(box={"y": [[-1.0, 1.0]], "u": [[-1.0, 1.0]]}),
-            "needs no box",
+            "not_valid",
         ),
-        ("implicit_box", lambda c: c.funnel.pop("box"), "known on a box only"),
-        ("implicit_box", lambda c: c.funnel["box"].update(u=[[1.0, 1.0]]), "is empty"),
-        ("implicit_box", lambda c: c.model.pop("window"), "'window' is missing"),
+        ("implicit_box", lambda c: c.funnel.pop("box"), "not_valid"),
+        ("implicit_box", lambda c: c.funnel["box"].update(u=[[1.0, 1.0]]), "not_valid"),
+        ("implicit_box", lambda c: c.model.pop("window"), "malformed"),
     ],
 )
 def test_what_is_no_tube_is_refused_with_the_reason(name: str, change: Change, reason: str) -> None:
     model, funnel, proof = claim(name)
     change(SimpleNamespace(model=model, funnel=funnel, proof=proof))
-    with pytest.raises(CertificateRejected, match=reason):
+    with refused(reason):
         decide(model, funnel, proof)
 
 
@@ -284,7 +285,7 @@ def test_a_funnel_made_for_another_model_is_refused() -> None:
     funnel["model"] = "sha256:" + 64 * "0"
     about = {MODEL: model, FUNNEL: funnel}
     bindings = {"model": proofs.binding(MODEL, model), "funnel": proofs.binding(FUNNEL, funnel)}
-    with pytest.raises(CertificateMismatch, match="made for another model"):
+    with refused("mismatch"):
         proofs.decide(proofs.proof_document({"kind": "tube", "about": bindings}, proof), about)
     assert files.digest(model) != funnel["model"]
 

@@ -2,7 +2,6 @@
 
 import math
 import re
-import time
 
 import pytest
 
@@ -10,29 +9,20 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from geometry_msgs.msg import TwistStamped
 
-from bags.signals.signal import SignalPath
+from bags.recordings.message_types import is_stamped, standard_types
+from bags.signals.sampling import Sampler
+from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
 from nlsid_core.errors import BagError
-from nlsid_ros import qos
+from nlsid_ros.message_classes import _describe, installed_types, message_class
 from nlsid_ros.messages import SignalMessage
-from tests.ros.processes import call, node_here, process, refusal, ros_test
+from tests.ros.processes import ros_test
 
 pytestmark = ros_test
+GOALS = "nav_msgs/msg/Goals"  # a header and poses
 
 TWIST = "geometry_msgs/msg/TwistStamped"
 SPEED = SignalPath.parse("/cmd_vel:twist.linear.x")
-PLAYED: dict[str, object] = {
-    "kind": "steps",
-    "hold": 0.2,
-    "period": 0.02,
-    "duration": 5.0,
-    "pause": 0.0,
-    "lowest": 0.1,
-    "highest": 0.4,
-    "slew": 5.0,
-    "fade": 0.1,
-    "rest": 0.1,
-}
 
 
 def test_the_other_fields_are_as_the_template_says() -> None:
@@ -86,13 +76,6 @@ def test_others_in_lists_are_held_to_their_type_too(others: str, said: str) -> N
     assert (made.name, list(made.velocity), list(made.effort)) == (["a"], [1.0, 2.5], [0.5])
 
 
-@pytest.mark.parametrize("module", ["excitation", "tracking_controller"])
-def test_a_node_refuses_others_that_do_not_fit_when_it_is_configured(module: str) -> None:
-    others = '\'{"twist": {"angular": 1}}\''  # quoted, or ROS reads it itself
-    said = refusal(f"nlsid_ros.{module}", highest=0.4, slew=1.0, others=others)
-    assert "twist: angular: 1 should be an object of its fields" in said
-
-
 def test_fields_on_a_topic_that_are_not_finite_are_not_passed_on() -> None:
     made, message = SignalMessage(SPEED, TWIST, "/teleop"), TwistStamped()
     for z, lacking in ((0.5, ""), (math.nan, "on /teleop, twist.angular.z is nan"), (0.5, "")):
@@ -107,35 +90,30 @@ def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:
     assert whole.make(0, [1, 2, 3, 4, 5, 6]).twist.angular.z == 6.0
 
 
-def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves() -> None:
-    """Steps of speed while another node steers; when that one stops, the robot goes to rest."""
-    sent: list[TwistStamped] = []
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process("nlsid_ros.excitation", others="/teleop", **PLAYED),
-    ):
-        node.create_subscription(TwistStamped, "/cmd_vel", sent.append, qos.STREAM)
-        steering = node.create_publisher(TwistStamped, "/teleop", qos.STREAM)
-        spin_until(lambda: node.count_subscribers("/teleop") == 1)
-        refused = call(node, spin_until, "/excitation/start")
-        assert refused.message == "nothing on /teleop for 1 s, which has the other fields"
-        message = TwistStamped()
-        message.twist.linear.x, message.twist.angular.z = 9.0, 0.7
-        timer = node.create_timer(0.1, lambda: steering.publish(message))
-        settled = time.monotonic() + 0.5
-        spin_until(lambda: time.monotonic() > settled)
-        assert call(node, spin_until, "/excitation/start").success
-        spin_until(lambda: len(sent) > 50)
-        timer.cancel()
-        quiet = [0, time.monotonic()]
+def test_an_installed_type_is_read_and_written_as_a_standard_one_is() -> None:
+    assert GOALS not in standard_types().fielddefs
+    types = installed_types(GOALS)
+    assert is_stamped(GOALS, types)
+    path = SignalPath.parse("/goals:goals[0].pose.position.x")
+    path.check(GOALS, types)
+    Sampler([str(path)], ["/goals:goals[0].pose.position.y"], period=0.1).check(
+        "/goals", GOALS, types
+    )
+    with pytest.raises(BagError, match="Field 'goal' does not exist"):
+        SignalPath.parse("/goals:goal[0].x").check(GOALS, types)
+    header_only = SignalMessage(SignalPath.parse("/goals:header.stamp.sec"), GOALS)
+    assert header_only.kind is message_class(GOALS)
 
-        def ended() -> bool:
-            if len(sent) != quiet[0]:
-                quiet[:] = [len(sent), time.monotonic()]
-            return time.monotonic() - quiet[1] > 1.0
 
-        spin_until(ended)
-    assert {each.twist.angular.z for each in sent} == {0.7}
-    assert max(each.twist.linear.x for each in sent) <= 0.4
-    assert len(sent) < 5.0 / 0.02, "it stopped before its end"
-    assert sent[-1].twist.linear.x == 0.1, "at rest"
+def test_the_installed_definition_of_a_standard_type_is_the_standard_one() -> None:
+    """What is made of rclpy's descriptions against the .msg files that rosbags ships."""
+    for kind in ("sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry", "sensor_msgs/msg/Image"):
+        texts: dict[str, str] = {}
+        _describe(kind, texts)
+        fields = [line.split()[1] for line in texts[kind].splitlines()]
+        assert fields == list(dict.fromkeys(f for f, _ in standard_types().fielddefs[kind][1]))
+    assert installed_types("sensor_msgs/msg/Imu") is standard_types()
+    with pytest.raises(BagError, match="is not installed"):
+        installed_types("no_such/msg/Thing")
+    found = [path for path, *_ in numeric_paths(GOALS, installed_types(GOALS))]
+    assert "goals[*].pose.position.x" in found

@@ -1,0 +1,115 @@
+"""How every node starts and ends: its `main`, the signals that stop it, and its watchdog."""
+
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import try_shutdown
+
+from nlsid_core.errors import NlsidError
+from nlsid_ros import shared_memory, watchdog
+from nlsid_ros.running import ManagedNode, unreadable
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def entry_point(node: type[ManagedNode]) -> Callable[..., None]:
+    """Make the `main` of `ros2 run nlsid NAME`; it ends with status 1 and a line if it fails."""
+
+    def main(args: list[str] | None = None) -> None:
+        try:
+            run_all([node], args)
+        except (NlsidError, OSError) as error:
+            sys.exit(f"{node.name}: {error}")
+
+    return main
+
+
+def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) -> None:
+    """Make the nodes, start each that starts itself, and spin until one is over, or until SIGINT,
+    SIGTERM or SIGHUP (a terminal that is closed, unless `nohup` says that it does not matter).
+
+    The signals are waited for here and not left to rclpy, which would end all communication before
+    the node could send a last command. Raises what made a node fail.
+    """
+    woken = _wake_on_signals()
+    shared_memory.avoid_what_is_stale()
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise unreadable(error) from error
+    nodes: list[ManagedNode] = []
+    try:
+        for make in makes:
+            nodes.append(make())
+            if nodes[-1].autostart:
+                nodes[-1].start_itself()
+        gc.collect()
+        gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
+        with _watched(nodes):
+            _spin(nodes, woken)
+    finally:
+        with ExitStack() as ending:  # each is stopped, also if another cannot be
+            ending.callback(try_shutdown)
+            for node in reversed(nodes):
+                ending.callback(node.destroy_node)
+
+
+@contextmanager
+def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
+    """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
+    if not all(node.is_watched for node in nodes):
+        yield
+        return
+    names = ", ".join(node.get_name() for node in nodes)
+    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
+        try:
+            yield
+        finally:
+            watching.kill()
+
+
+def _spin(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
+    """Spin until a signal came, and what had arrived by then is handed on; or until a node is over.
+
+    By `spin_once` with a timeout: without one the executor hears nothing. Raises what made that
+    node fail.
+    """
+    executor = EventsExecutor()
+    for node in nodes:
+        executor.add_node(node)
+    asked = threading.Event()
+
+    def wait() -> None:
+        woken.recv(1)
+        executor.create_task(asked.set)  # goes to the end of the queue
+
+    threading.Thread(target=wait, daemon=True).start()
+    while not asked.is_set():
+        executor.spin_once(timeout_sec=0.1)
+        for node in nodes:
+            if node.is_over and node.failure is not None:
+                raise node.failure
+            if node.is_over:
+                return
+
+
+def _wake_on_signals() -> socket.socket:
+    """A socket that gets a byte at once when a stop signal comes, whatever Python is waiting in."""
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.detach())
+    for number in STOP_SIGNALS:
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda _number, _frame: None)
+    return receiver
