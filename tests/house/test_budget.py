@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 19_827,
     ("bags",): 13_608,
     ("nlsid_ros",): 2_664,
-    ("tests",): 25_055,
+    ("tests",): 25_044,
     ("benchmarks", "examples"): 3_840,
 }
 ARGUMENTS, FIELDS = 6, 8
