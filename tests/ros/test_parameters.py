@@ -47,6 +47,7 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("funnel_monitor", {"stale_after": -0.1}, "parameter stale_after (s without a response, or"),
     ("funnel_monitor", {"stale_after": "soon"}, "parameter stale_after"),
     ("funnel_monitor", {"allow_old_stamps": 3}, "parameter allow_old_stamps"),
+    ("funnel_monitor", {"check_seconds": 0}, "parameter check_seconds"),
     ("funnel_monitor", {"expected_digest": "abc"}, "it should have 64 hexadecimal digits"),
     ("funnel_monitor", {"source": "a-b"}, "Invalid topic name: topic name must not contain"),
     ("funnel_monitor", {"use_sim_time": "yes please"}, "ROS refuses: Trying to set parameter"),
