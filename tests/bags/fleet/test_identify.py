@@ -238,7 +238,7 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
 def test_two_recordings_with_the_same_samples_are_one(tmp_path: Path, config: Path) -> None:
     """An object and its copy of another storage have other digests."""
     folder = fleet(tmp_path / "fleet", 3)
-    drive(folder / "copied" / "drive.mcap", seed=2, samples=120, chunk_size=2**20)
+    drive(folder / "copied" / "drive.mcap", seed=2, samples=120, writer={"chunk_size": 2**20})
     found = read_fleet(
         named_bags([folder / "*" / "*.mcap"]), load_config(config), tmp_path, workers=Workers()
     )
