@@ -180,20 +180,8 @@ def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: 
     for folder in "bc":
         (tmp_path / folder).mkdir()
     (tmp_path / "b" / "drive.mcap").write_bytes(original.read_bytes())
-<<<<<<< HEAD
     drive(tmp_path / "c" / "drive.mcap", samples=117, writer={"chunk_size": 2**20})
-    found = monitor_fleet(
-        named_bags([tmp_path / "*" / "*.mcap"]),
-        design,
-        documents.load_proved(design),
-        centre=Centre.COMMAND,
-        definitions={},
-        workers=Workers(),
-    )
-=======
-    drive(tmp_path / "c" / "drive.mcap", samples=117, chunk_size=2**20)
     found = held_against(design, named_bags([tmp_path / "*" / "*.mcap"]))
->>>>>>> main
     assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
