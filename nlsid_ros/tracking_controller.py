@@ -243,7 +243,6 @@ class TrackingController(ManagedNode):
                 message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
             topic = self.resolve_topic_name(self.signal_topic(response.topic))
-            self._path = response
             self._responses = Topic(self, topic, self._on_response, qos.SENSOR)
             self._responses.look(values.response_type)
         elif (response, command) != (read_at(self._design), written_at(self._design)):
@@ -285,9 +284,10 @@ class TrackingController(ManagedNode):
 
     def _on_response(self, message: Any, info: dict[str, int]) -> None:
         """Decode, ask the core for the next input, and set it down for when it is due."""
-        controller = self._controller
+        controller, design = self._controller, self._design
         if controller is None:
             return
+        assert design is not None
         stamp_ns = stamp_ns_of(message)
         self._heard = time.monotonic()
         if not self._hears:
@@ -307,7 +307,7 @@ class TrackingController(ManagedNode):
         else:
             waiting = controller.k < 1
             try:
-                value = self._path.value(message)
+                value = read_at(design).value(message)
             except BagError as error:
                 self._halt(str(error))
                 return

@@ -464,12 +464,8 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
     """The F1TENTH car: speed and steering commands to speed and yaw rate, over DDS."""
     bags, config, out = f1tenth(), tmp_path / "robot.yaml", tmp_path / "two_by_two"
     chosen = Chosen(
-        responses=(
-            "/odom:twist.twist.linear.x",
-            "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)",
-        ),
-        excitations=("/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"),
-        robot="car",
+        ("/odom:twist.twist.linear.x", "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"),
+        ("/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"),
     )
     config.write_text(yaml_text(propose(bags, look(bags), chosen)))
     settings = load_config(config)
