@@ -63,7 +63,9 @@ def example(name: str) -> Example:
     """Signals of a structure that use all that it has, with their parameters."""
     rng = np.random.default_rng(1)
     if name in ("loop", "stages"):
-        layout = Layout.of(Feedback(2), [Trial(np.zeros((9, 2)), np.linspace(-1, 1, 9), np.array([]), 0)])
+        layout = Layout.of(
+            Feedback(2), [Trial(np.zeros((9, 2)), np.linspace(-1, 1, 9), np.zeros(0), 0)]
+        )
         a, b, e, phi = (
             np.array([1.2, -0.5]),
             0.1 * rng.normal(size=7),

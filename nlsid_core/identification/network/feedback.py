@@ -206,9 +206,7 @@ def feedback_unrolled(
     for maps in range(1, made.stages + 1):
         begin = np.concatenate([theta, further])
         problem = _stages(first, maps, known, slowest)
-        theta = minimise(
-            problem, begin, steps=task.iterations, tolerance=TOLERANCE
-        ).parameters
+        theta = minimise(problem, begin, steps=task.iterations, tolerance=TOLERANCE).parameters
         further = theta[-len(further) :]
         reached = _stages(first, maps, judges, slowest).mean_square(theta) ** 0.5
         history.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * reached))
