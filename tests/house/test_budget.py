@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_827,
+    ("nlsid_core",): 19_829,
     ("bags",): 12_953,
     ("nlsid_ros",): 2_663,
-    ("tests",): 24_655,
+    ("tests",): 24_643,
     ("benchmarks", "examples"): 3_840,
 }
 ARGUMENTS, FIELDS = 6, 8
