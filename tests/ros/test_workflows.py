@@ -144,9 +144,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    replayed = replay_bag(
-        documents.load_proved(out / documents.FUNNEL), trial, centre=Centre.COMMAND
-    )
+    replayed = replay_bag(documents.load(out / documents.FUNNEL), trial, centre=Centre.COMMAND)
     assert replayed.verdict == "inside"
     expected = [
         (stamp, reading.margin)
@@ -400,7 +398,7 @@ def test_the_loop_is_closed_and_judged_as_in_replay_whether_pushed_gently_or_too
     for each in running:
         stop(each)
 
-    replay = replay_bag(documents.load_proved(funnel), bag, centre=Centre.PROFILE)
+    replay = replay_bag(documents.load(funnel), bag, centre=Centre.PROFILE)
     judged = {
         stamp_ns: reading.numbers
         for stamp_ns, reading in zip(replay.stamps_ns, replay.readings, strict=True)
