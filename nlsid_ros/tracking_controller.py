@@ -307,7 +307,7 @@ class TrackingController(ManagedNode):
         else:
             waiting = controller.k < 1
             try:
-                value = design.response.value(message)
+                value = read_at(design).value(message)
             except BagError as error:
                 self._halt(str(error))
                 return

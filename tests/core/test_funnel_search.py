@@ -18,7 +18,7 @@ from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, i
 from nlsid_core.design.continuous.pieces import proof_basis, prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.vstep import improve
-from nlsid_core.designs import Design
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -78,7 +78,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     }
     goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
     claim = {"kind": "continuous_funnel", "goal": goal}
-    forged = Design(*parts, {"claim": claim, "proof": proof})
+    forged: AnyDesign = Design(*parts, {"claim": claim, "proof": proof})
     with pytest.raises(CertificateRejected, match="pieces should be a list of 1 to"):
         check(forged.save(tmp_path)[-1])
 
