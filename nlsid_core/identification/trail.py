@@ -22,7 +22,7 @@ from nlsid_core.identification.fit import (
     stated_rate,
 )
 from nlsid_core.identification.methods.banded import Rows
-from nlsid_core.identification.methods.options import Method, Rse, Sem
+from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.methods.rse import Iterate, affordable_steps, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.prediction import Model
@@ -52,11 +52,6 @@ class Task:
     transient: int = 0
     executor: Executor | None = None
     progress: Progress = silent
-
-    @property
-    def iterations(self) -> int:
-        """How many the method may take; 0 for one that does not iterate."""
-        return self.method.iterations if isinstance(self.method, Rse | Sem) else 0
 
     @property
     def searched_rate(self) -> float:

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_829,
+    ("nlsid_core",): 19_827,
     ("bags",): 12_953,
     ("nlsid_ros",): 2_663,
-    ("tests",): 24_643,
+    ("tests",): 24_644,
     ("benchmarks", "examples"): 3_840,
 }
 ARGUMENTS, FIELDS = 6, 8
