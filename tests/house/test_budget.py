@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 19_827,
     ("bags",): 12_953,
     ("nlsid_ros",): 2_663,
-    ("tests",): 24_644,
+    ("tests",): 24_643,
     ("benchmarks", "examples"): 3_840,
 }
 ARGUMENTS, FIELDS = 6, 8
