@@ -102,7 +102,7 @@ def bias_removed(train: Dataset, test: Dataset, lags: int) -> dict[str, float | 
 
 def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay], list[Replay]]:
     """Replays of the test trials, and of each with each sensor fault."""
-    proved = documents.load_proved_funnel(out / documents.FUNNEL)
+    proved = documents.load(out / documents.FUNNEL)
     centre = config.monitor.nominal_source
     test = [bag for bag in bags if bag.name in config.split.test]
     clean = [replay_bag(proved, bag, centre=centre) for bag in test]

@@ -7,6 +7,7 @@ from typing import Any
 from bags.chain import tracking_steps
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
+from bags.chain.simulation import simulate_excitations, simulate_runs
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.chain.tracking_config import load_tracking_config
 from bags.designs import documents
@@ -43,9 +44,10 @@ def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
 def _tracked_pendulum(out: Path) -> Path:
     """The sampled funnel of config/pendulum.yaml, from bags of the robot in MuJoCo."""
     config = load_tracking_config(config_file("pendulum.yaml"))
-    bags = tracking_steps.simulate_excitations(config, out / "excitations")
-    tracking_steps.identify_state_bags(bags, config, out)
-    tracking_steps.plan_tracking(out / documents.MODEL, config, out)
-    runs = tracking_steps.simulate_runs(out, config, out / "runs")
+    fit = tracking_steps.identify_state_bags(
+        simulate_excitations(config, out / "excitations"), config, out
+    )
+    tracking_steps.plan_tracking(fit, config, out)
+    runs = simulate_runs(out, config, out / "runs")
     tracking_steps.design_tracking_funnel(out, runs, config, progress=silent)
     return out / documents.FUNNEL_PROOF

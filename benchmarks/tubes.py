@@ -269,13 +269,10 @@ def measure(case: Case) -> dict[str, float | int]:
         )
     keys |= {"update_us": 1e6 * busy, "outside_with_assumption_kept": outside}
     caught = what_it_catches(
-        monitor,
-        model,
-        fading.half_widths.tolist(),
+        replace(made, funnel=lasting),
         held_back=case.judged,
         calibration=case.calibration,
         ranges=ranges,
-        factor=FACTOR,
         remedy="",
     )
     untouched, *faults = caught.rows

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from bags.designs.documents import load
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
     from bags.signals.sampling import Grid
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
         plan_motion,
     )
     from nlsid_core.designs import Design
-    from nlsid_core.designs import load_design as load
     from nlsid_core.dynamics import Nominal, VectorField
     from nlsid_core.dynamics.taylor import taylor_field
     from nlsid_core.errors import NlsidError
@@ -107,7 +107,8 @@ _HOMES: Final = {
     "nlsid_core.models": ("Signal",),
     "nlsid_core.identification": ("identify", "Fit", *_FAMILIES, *_METHODS),
     "nlsid_core.design": ("design", *_PROBLEMS, *_MOTIONS, "compose_funnels"),
-    "nlsid_core.designs": ("Design", "load"),
+    "nlsid_core.designs": ("Design",),
+    "bags.designs.documents": ("load",),
     "nlsid_core.dynamics": ("Nominal", "VectorField"),
     "nlsid_core.dynamics.taylor": ("taylor_field",),
     "nlsid_core.proofs": ("check",),
@@ -115,7 +116,7 @@ _HOMES: Final = {
     "nlsid_core.running.reading": ("Reading", "Status"),
     "nlsid_core.errors": ("NlsidError",),
 }
-_CALLED_THERE: Final = {"read_bags": "read_dataset", "load": "load_design"}
+_CALLED_THERE: Final = {"read_bags": "read_dataset"}
 _HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
 
 

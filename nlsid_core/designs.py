@@ -1,23 +1,27 @@
-"""`Design`: a model, a policy and a funnel that belong together, with their proof: one folder."""
+"""`Design`: what a robot runs and is held against, and what is proved of it: one folder."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
-from nlsid_core.errors import CertificateMismatch, DataError, DocumentError
+from nlsid_core.errors import CertificateRejected, DataError, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import StableModel
+from nlsid_core.models import Signal, StableModel, StateModel, TrapezoidalModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.held import Held
+from nlsid_core.running.monitor import Monitor
 
 # The files in a design's folder; a claim calls each by its name without the ending.
 MODEL = "model.json"
@@ -29,27 +33,44 @@ COMPOSITION = "composition.proof.json"  # of funnels that follow each other, its
 
 D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
 P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)
-F = TypeVar("F", bound=SampledFunnel | ContinuousFunnel | TubeFunnel)
+F = TypeVar("F", bound=SampledFunnel | ContinuousFunnel | TubeFunnel | None)
 S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Where a continuous funnel's state and inputs are, as `topic:field.path`; s between samples.
+
+    A vector field has equations and no signals, so whoever runs its funnel says this.
+    """
+
+    response: tuple[str, ...]
+    command: tuple[str, ...]
+    period: float
 
 
 @dataclass(frozen=True, eq=False)
 class Design(Generic[D, P, F, S]):
-    """What a robot runs and is held against, and the verdict of the kernel about it.
+    """A model, a policy and a funnel that belong together, with their proof.
 
-    model: of the robot, or its vector field in continuous time. policy: None where the funnel is
-    around the model itself, whatever drives it. claim: its kind, and what it states
-    beside these files; proof: the witnesses. found: what the search leaves beside them; nothing of
-    a design that was read from files.
+    model: of the robot, or its vector field in continuous time.
+    policy: None where the funnel is around the model itself, whatever drives it.
+    funnel: None of a policy of which nothing is proved.
+    certificate: the proof's document; empty where nothing is proved.
+    decision: what the kernel said of it; None if it was not asked.
+    found: what the search leaves beside them; None of a design that was read from files.
+    wiring: of a continuous funnel, None until somebody says it.
+    parts: of a composition, its stages. The first one's model, policy and funnel are its own.
     """
 
     model: D
     policy: P
     funnel: F
-    claim: Json
-    proof: Json
-    verdict: Verdict
-    found: S
+    certificate: Json = field(default_factory=dict)
+    decision: Verdict | None = None
+    found: S = None  # type: ignore[assignment]  # the search's own type where there was one
+    wiring: Wiring | None = None
+    parts: "tuple[Design[D, P, F, S], ...]" = ()
 
     @classmethod
     def proved(
@@ -57,11 +78,29 @@ class Design(Generic[D, P, F, S]):
     ) -> "Design[D, P, F, S]":
         """A design whose proof the kernel has decided; CertificateRejected says why it has not."""
         documents = _documents(model, policy, funnel)
-        verdict = proofs.decide(_proof_document(documents, claim, proof), documents)
-        return cls(model, policy, funnel, claim, proof, verdict, found)
+        certificate = _certificate(claim, proof, documents)
+        verdict = proofs.decide(certificate, documents)
+        return cls(model, policy, funnel, certificate, verdict, found)
 
     def __str__(self) -> str:
         return str(self.verdict) if self.found is None else f"{self.verdict}\n{self.found}"
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the kernel said of it; CertificateRejected if it was not asked."""
+        if self.decision is None:
+            raise CertificateRejected("no kernel has decided a proof of this design")
+        return self.decision
+
+    @property
+    def claim(self) -> Json:
+        """What the proof states: its kind, the files that it is about, and its numbers."""
+        return dict(self.certificate.get("claim", {}))
+
+    @property
+    def proof(self) -> Json:
+        """The witnesses."""
+        return dict(self.certificate["proof"])
 
     def decided(self) -> Verdict:
         """What the kernel says of it as it stands; CertificateRejected with the reason."""
@@ -71,7 +110,7 @@ class Design(Generic[D, P, F, S]):
     def documents(self) -> dict[str, Json]:
         """The content of its files by name, the proof last."""
         documents = _documents(self.model, self.policy, self.funnel)
-        return documents | {PROOF: _proof_document(documents, self.claim, self.proof)}
+        return documents | {PROOF: _certificate(self.claim, self.proof, documents)}
 
     def save(self, folder: Path | str) -> tuple[Path, ...]:
         """Write model (or vector field), policy, funnel and proof; the paths, the proof last.
@@ -90,42 +129,129 @@ class Design(Generic[D, P, F, S]):
             files.write_document(folder / name, document)
         return tuple(folder / name for name in documents)
 
+    @property
+    def stages(self) -> "Sequence[Design[D, P, F, S]]":
+        """The stages of a composition, one after another; of others this design."""
+        return self.parts or (self,)
+
+    @property
+    def signals(self) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+        """The model's outputs or states, and its inputs; those of equations are by number."""
+        model: Any = self.model
+        if isinstance(model, VectorField):
+            return tuple(Signal(f"x{i}") for i in range(model.n)), tuple(
+                Signal(f"u{j}") for j in range(model.m)
+            )
+        measured = model.x if isinstance(model, StateModel | TrapezoidalModel) else model.y
+        y, u = ((s,) if isinstance(s, Signal) else s for s in (measured, model.u))
+        return y, u
+
+    @property
+    def name(self) -> str:
+        """What is measured, in words."""
+        return ", ".join(signal.name for signal in self.signals[0])
+
+    @property
+    def is_single(self) -> bool:
+        """One output and one input of an identified model: numbers, not vectors."""
+        measured = isinstance(self.model, StateModel | TrapezoidalModel | VectorField)
+        return not measured and all(len(part) == 1 for part in self.signals)
+
+    @property
+    def wired(self) -> Wiring:
+        """Where the signals of equations are; DataError if nobody said it."""
+        if self.wiring is None:
+            raise DataError(
+                "a vector field names no signals: say where the state and the inputs are "
+                "(response, command) and how often they come (period)"
+            )
+        return self.wiring
+
+    @property
+    def period(self) -> float:
+        """S between samples."""
+        return self.wired.period if isinstance(self.model, VectorField) else self.model.period
+
+    @property
+    def held(self) -> Held:
+        """How the proof lets the policy be applied."""
+        is_continuous = isinstance(self.funnel, ContinuousFunnel)
+        return Held.of_claim(self.claim) if is_continuous else Held()
+
+    @property
+    def has_plan(self) -> bool:
+        """Whether the funnel is always around the policy's plan; a tube may follow commands."""
+        return not isinstance(self.funnel, TubeFunnel)
+
+    @property
+    def digest(self) -> str:
+        """Of the funnel's document, or of a composition's proof: how an announcement names it.
+
+        Without a funnel of the policy's.
+        """
+        if self.parts:
+            return files.digest(self.certificate)
+        named: Any = self.policy if self.funnel is None else self.funnel
+        return files.digest(named.document())
+
+    @property
+    def made_with(self) -> dict[str, str]:
+        """What recordings were used for (training, calibration or both), by their digests."""
+        trained: set[str] = set()
+        calibrated: set[str] = set()
+        for stage in self.stages:
+            trained |= {digest for _, digest in getattr(stage.model, "bags", ())}
+            for tube in stage.funnel.tubes if isinstance(stage.funnel, TubeFunnel) else ():
+                trained |= {digest for _, digest in tube.designed_on}
+                calibrated |= {digest for _, digest in tube.measured_on}
+        parts = {"training": trained, "calibration": calibrated}
+        return {
+            digest: " and ".join(use for use, part in parts.items() if digest in part)
+            for digest in trained | calibrated
+        }
+
+    def monitor(self, centre: Centre) -> Monitor:
+        """A monitor for one run; centre: of a tube with a policy."""
+        if self.funnel is None:
+            raise DocumentError("nothing is proved of this policy: no funnel to hold a robot to")
+        stages: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+        if self.parts:
+            held = [stage.held for stage in self.stages]
+            return Monitor.of_stages(stages, period=self.period, held=held)
+        return Monitor(*stages[0], centre=centre, period=self._pace, held=self.held)
+
+    def controller(self, limits: Limits, settling: float) -> Controller:
+        """A controller for one run; `settling`: s to wait for a state where it may start."""
+        if self.policy is None:
+            raise DocumentError("this tube is around a model's simulation only: no policy to run")
+        if self.funnel is None:
+            return Controller.unproved(self.model, self.policy, limits=limits, period=self._pace)
+        stages: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+        held = self.stages[0].held
+        if self.parts:
+            return Controller.of_stages(
+                stages, limits=limits, settling=settling, period=self.period, held=held
+            )
+        return Controller(
+            *stages[0], limits=limits, settling=settling, period=self._pace, held=held
+        )
+
+    @property
+    def _pace(self) -> float | None:
+        """The period that only somebody's wiring says; None where the model says it."""
+        return self.period if isinstance(self.model, VectorField) else None
+
 
 AnyDesign: TypeAlias = Design[Any, Any, Any, Any]
 
 
-def load_design(folder: Path | str) -> AnyDesign:
-    """The design in a folder that `Design.save` wrote, its proof checked by the kernel.
-
-    Raises CertificateRejected if the proof proves nothing, CertificateMismatch if the files changed
-    while they were read, DocumentError if it is not the proof of one funnel. OS errors for the
-    proof itself pass through.
-    """
-    path = Path(folder) / PROOF
-    several = path.with_name(COMPOSITION)
-    if not path.exists() and several.exists():
-        raise DocumentError(f"{several} is about several funnels, not about one")
-    verdict = proofs.check(path)
-    document = _read(path, verdict.digests["proof"])
-    about = document["claim"]["about"]
-    dynamics = "vector_field" if "vector_field" in about else "model"
-    if set(about) not in ({dynamics, "policy", "funnel"}, {"model", "funnel"}):
-        raise DocumentError(f"{path} is about {', '.join(about)}, not about one funnel")
-    nouns: dict[str, Any] = {"policy": None}
-    for role in about:
-        file = path.with_name(about[role]["file"])
-        nouns[role] = read(_read(file, verdict.digests[role]), source=str(file))
-    model, policy, funnel = nouns[dynamics], nouns["policy"], nouns["funnel"]
-    claim = {key: part for key, part in document["claim"].items() if key != "about"}
-    return Design(model, policy, funnel, claim, document["proof"], verdict, None)
-
-
-def _read(path: Path, digest: str) -> Json:
-    """The document whose bytes the kernel has read."""
-    content = path.read_bytes()
-    if files.digest(content) != digest:
-        raise CertificateMismatch(f"{path} changed while it was read")
-    return files.parse_document(content, source=str(path))
+def _certificate(claim: Json, proof: Json, documents: dict[str, Json]) -> Json:
+    """The proof's document, about these files."""
+    about = {
+        name.removesuffix(".json"): proofs.binding(name, document)
+        for name, document in documents.items()
+    }
+    return proofs.proof_document({"kind": claim["kind"]} | claim | {"about": about}, proof)
 
 
 def _documents(model: Any, policy: Any, funnel: Any) -> dict[str, Json]:
@@ -135,11 +261,3 @@ def _documents(model: Any, policy: Any, funnel: Any) -> dict[str, Json]:
     if policy is not None:
         documents[POLICY] = policy.document()
     return documents | {FUNNEL: funnel.document()}
-
-
-def _proof_document(documents: dict[str, Json], claim: Json, proof: Json) -> Json:
-    about = {
-        name.removesuffix(".json"): proofs.binding(name, document)
-        for name, document in documents.items()
-    }
-    return proofs.proof_document({"kind": claim["kind"], "about": about} | claim, proof)

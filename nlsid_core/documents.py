@@ -78,7 +78,6 @@ def load(path: Path | str) -> Noun:
 def read(document: Json, *, source: str) -> Noun:
     """`load` for a document in memory."""
     name = files.member(document, "format", str, source=source)
-    files.refuse_old_kind(document, source=source)
     kind = document.get("kind")
     reader = READERS.get((name, kind if isinstance(kind, str) else None))
     if reader is None and name == "nlsid/proof":

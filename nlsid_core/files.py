@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -163,23 +163,6 @@ def header(document: Json, name: str, *, source: str, kind: str | None = None) -
         )
     if kind is not None and document.get("kind") != kind:
         raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{kind}'")
-
-
-def of_kind(document: Json, kinds: Mapping[str, T], *, source: str) -> T:
-    """What `kinds` holds for the kind of a funnel or policy; DocumentError if it is not known."""
-    refuse_old_kind(document, source=source)
-    kind = document.get("kind")
-    if not isinstance(kind, str) or kind not in kinds:
-        raise DocumentError(f"{source}: kind is {kind!r}, expected one of {', '.join(kinds)}")
-    return kinds[kind]
-
-
-def refuse_old_kind(document: Json, *, source: str) -> None:
-    """DocumentError for a funnel or a policy of a kind that there is no more."""
-    if document.get("kind") == "linear":
-        raise DocumentError(
-            f"{source}: kind 'linear' is now 'tube'. Make it again with `nlsid funnel`"
-        )
 
 
 def _leaves(nested: list[Any]) -> Iterable[Any]:

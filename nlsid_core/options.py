@@ -36,13 +36,6 @@ def require_ranges(owner: object, key: str) -> None:
         raise OptionError(key, value, "one or more (low, high) with low < high")
 
 
-def require_weights(owner: object, key: str) -> None:
-    """OptionError unless the option is None or some finite numbers above 0."""
-    value = getattr(owner, key)
-    if value is not None and not (value and all(0.0 < weight < float("inf") for weight in value)):
-        raise OptionError(key, value, "one or more finite numbers above 0")
-
-
 def require_positive(owner: object, key: str) -> None:
     """OptionError unless the option is a finite number above 0."""
     value = getattr(owner, key)

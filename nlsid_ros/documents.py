@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 from std_msgs.msg import String
 
+from bags.designs import wiring
 from bags.designs.bundle import MAX_BYTES, Bundle, Check
-from bags.designs.design import AnyDesign, Wiring
 from nlsid_core.deciding import USUAL, Limits
+from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.running import ManagedNode, Parameter
@@ -57,13 +58,11 @@ def wiring_of(values: SimpleNamespace) -> Wiring | None:
 
     Raises BagError if they are no paths.
     """
-    if not (values.response or values.command):
-        return None
-    return Wiring.parse(
-        (path.strip() for path in values.response.split(",")),
-        (path.strip() for path in values.command.split(",")),
-        values.period,
+    y, u = (
+        [path.strip() for path in text.split(",") if path]
+        for text in (values.response, values.command)
     )
+    return wiring.wiring_of(y, u, values.period)
 
 
 def expected_of(values: SimpleNamespace) -> str:

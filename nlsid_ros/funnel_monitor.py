@@ -22,7 +22,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import UNANNOUNCED, Run
 from bags.monitoring.announcement import WAITING as RUN_WAITING
 from bags.monitoring.watch import WAITING, Stamped, Watch
@@ -31,6 +30,7 @@ from bags.signals.grid import seconds
 from bags.signals.sampling import said_filled
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
 from nlsid_core.running.comparison import Centre

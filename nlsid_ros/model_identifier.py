@@ -94,7 +94,7 @@ class ModelIdentifier(ManagedNode):
     def _publish(self, progress: Progress) -> Progress:
         try:
             verdict = check(self._out / documents.MODEL_PROOF)
-            model = documents.load_model(self._out / documents.MODEL)
+            model = documents.load_stable_model(self._out / documents.MODEL)
         except (NlsidError, OSError) as error:
             return replace(progress, what="failed", error=str(error))
         self._model.publish(String(data=json.dumps(model.document())))

@@ -24,12 +24,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.designs.design import AnyDesign
 from bags.designs.documents import load_unproved
+from bags.designs.wiring import read_at, written_at
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from bags.signals.arrivals import Sequence
 from bags.signals.grid import seconds
 from nlsid_core import files
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import graph, qos
@@ -230,7 +231,7 @@ class TrackingController(ManagedNode):
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """Take a design, but never in the middle of a run: stop that first."""
-        values, response, command = self.values, design.response, design.command
+        values, response, command = self.values, read_at(design), written_at(design)
         response.check(values.response_type, installed_types(values.response_type))
         message = SignalMessage(command, values.command_type, values.others)
         if self._is_on:
@@ -244,7 +245,7 @@ class TrackingController(ManagedNode):
             topic = self.resolve_topic_name(self.signal_topic(response.topic))
             self._responses = Topic(self, topic, self._on_response, qos.SENSOR)
             self._responses.look(values.response_type)
-        elif (response, command) != (self._design.response, self._design.command):
+        elif (response, command) != (read_at(self._design), written_at(self._design)):
             raise DataError("it is about other signals; deactivate and activate again")
         self._design, self._digest = design, digest
         self._say_run(Run(0, digest, ended="the controller has another design, or began anew"))
@@ -306,7 +307,7 @@ class TrackingController(ManagedNode):
         else:
             waiting = controller.k < 1
             try:
-                value = design.response.value(message)
+                value = read_at(design).value(message)
             except BagError as error:
                 self._halt(str(error))
                 return

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from bags.chain.joint_bags import JOINTS, _make
-from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, Goal, compose_funnels, design
+from nlsid_core.designs import AnyDesign
 from nlsid_core.dynamics import Nominal, VectorField, constant_on, linear_through
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy

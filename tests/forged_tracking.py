@@ -32,7 +32,8 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
             for chain in ("tube", "inlet"):
                 entry[chain]["reach"] *= 0.98
         tube = funnel.tube * np.r_[1.0, np.full(len(funnel.tube) - 1, 0.98)]
-        return resigned(design, funnel=replace(funnel, tube=tube), proof=proof)
+        forged = replace(design, certificate=design.certificate | {"proof": proof})
+        return resigned(forged, funnel=replace(funnel, tube=tube))
     if what == "assumption made smaller":
         smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
         return resigned(design, funnel=replace(funnel, assumption=smaller))
@@ -95,7 +96,7 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         taken["more"] = 1
     else:
         raise ValueError(what)
-    return replace(design, proof=proof)
+    return replace(design, certificate=design.certificate | {"proof": proof})
 
 
 # What contradicts what was measured: true claims, under assumptions that nobody should make.

@@ -1,6 +1,6 @@
 """Which model to take: orders and bases tried on validation bags, methods scored on test bags."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,26 +32,22 @@ def select_bags(
     config: Config,
     out: Path,
     *,
-    options: Mapping[str, Sequence[object]] | None = None,
     progress: Progress,
 ) -> Selected:
     """`select_trials` of bags; BagError for one that cannot be used."""
-    sections_to_try(config, options)
+    sections_to_try(config)
     trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
-    return select_trials(trials, config, out, options=options, progress=progress)
+    return select_trials(trials, config, out, progress=progress)
 
 
-def sections_to_try(
-    config: Config, options: Mapping[str, Sequence[object]] | None
-) -> list[IdentificationConfig]:
-    """Every combination of the options (None: the configuration's `select`); DataError if none."""
-    options = config.select if options is None else options
-    if not options:
+def sections_to_try(config: Config) -> list[IdentificationConfig]:
+    """Every combination of the options in `select`; DataError if there is none."""
+    if not config.select:
         raise DataError(
             "nothing to select from: give the configuration a section `select`, such as "
             "`select: {lags: [1, 2, 3, 4]}`"
         )
-    return config.identification.each(options)
+    return config.identification.each(config.select)
 
 
 def select_trials(
@@ -59,18 +55,15 @@ def select_trials(
     config: Config,
     out: Path,
     *,
-    options: Mapping[str, Sequence[object]] | None = None,
     executor: Executor | None = None,
     progress: Progress,
 ) -> Selected:
     """Every combination of the options; the files of the best by validation error, and select.png.
 
-    options: values by name (None: the configuration's `select`). executor: shares them; the files
-    are the same to the last bit. Raises DataError before anything is written, Infeasible if no
-    combination has a model.
+    executor: shares them; the files are the same to the last bit. Raises DataError before anything
+    is written, Infeasible if no combination has a model.
     """
-    tried = config.select if options is None else options
-    sections = sections_to_try(config, tried)
+    sections = sections_to_try(config)
     if trials.validation is None:
         raise DataError(
             "a selection needs validation trials: name bags in split.validation that are neither "
@@ -95,7 +88,7 @@ def select_trials(
     identified = write_identified(selection.fit, trials, config, out, progress=progress)
     if report_available():
         picture = out / documents.SELECTION_PLOT
-        write_atomically(picture, draw_selection(selection, tried or {}))
+        write_atomically(picture, draw_selection(selection, config.select or {}))
         identified = Identified(identified.fit, trials, (*identified.files, picture))
     return Selected(selection, identified)
 
@@ -118,16 +111,13 @@ def compare_bags(
     bags: Sequence[Path],
     config: Config,
     *,
-    lags: Sequence[int] = (),
     progress: Progress,
 ) -> Compared:
     """Every method of every configured model class, scored on the same samples of the test trials.
 
-    lags: instead of the configured ones. Writes nothing. Raises DataError as `identify_bags` does.
+    Writes nothing. Raises DataError as `identify_bags` does.
     """
     sections: list[IdentificationConfig] = list(config.compare or (config.identification,))
-    if lags:
-        sections = [one for section in sections for one in section.each({"lags": lags})]
     trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
     found, refusals = [], []
     for number, section in enumerate(sections):

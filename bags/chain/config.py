@@ -47,6 +47,11 @@ class SignalsConfig(Section):
     excitation: Annotated[Signals, Key("what drives the robot")]
 
     @property
+    def roles(self) -> tuple[tuple[SignalConfig, ...], tuple[SignalConfig, ...]]:
+        """Responses and excitations."""
+        return self.response, self.excitation
+
+    @property
     def topics(self) -> tuple[str, ...]:
         """What the signals are read from, each topic once."""
         return tuple(

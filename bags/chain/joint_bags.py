@@ -9,7 +9,6 @@ import numpy as np
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import REPEAT_GROUP
-from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 
 JOINTS: Final = "sensor_msgs/msg/JointState"
@@ -30,29 +29,17 @@ def write_joint_bag(
     information = dict(custom or {})
     if trajectory.group:
         information[REPEAT_GROUP] = trajectory.group
-    empty = np.zeros(0)
     with BagWriter(path, custom=information) as writer:
         for t, y, u in zip(trajectory.t.tolist(), trajectory.y, trajectory.u, strict=True):
             stamp_ns = FIRST_NS + round(t * 1e9)
-            _write(writer, COMMANDS, stamp_ns, names, empty, empty, u)
-            _write(writer, STATES, stamp_ns, names, y[:n], y[n:], empty)
+            none = np.zeros(0)
+            for topic, values in ((COMMANDS, (none, none, u)), (STATES, (y[:n], y[n:], none))):
+                stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
+                header = _make("std_msgs/msg/Header", stamp, "")
+                message = _make(JOINTS, header, names, *(part.copy() for part in values))
+                data = bytes(standard_types().serialize_cdr(message, JOINTS, little_endian=True))
+                writer.write(topic, JOINTS, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
     return path
-
-
-def _write(
-    writer: BagWriter,
-    topic: str,
-    stamp_ns: int,
-    names: list[str],
-    position: FloatArray,
-    velocity: FloatArray,
-    effort: FloatArray,
-) -> None:
-    stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
-    header = _make("std_msgs/msg/Header", stamp, "")
-    message = _make(JOINTS, header, names, position.copy(), velocity.copy(), effort.copy())
-    data = bytes(standard_types().serialize_cdr(message, JOINTS, little_endian=True))
-    writer.write(topic, JOINTS, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
 
 
 def _make(msgtype: str, /, *fields: Any) -> object:

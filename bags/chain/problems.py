@@ -15,6 +15,7 @@ from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
+from nlsid_core.designs import Wiring
 from nlsid_core.dynamics import (
     MeasuredPush,
     Nominal,
@@ -143,22 +144,20 @@ class FunnelProblem:
 def measured(
     path: Path,
     bags: Sequence[Path],
+    wiring: Wiring,
     *,
-    responses: Sequence[str],
-    excitations: Sequence[str],
-    period: float | None,
     seconds: float | None,
     safety_factor: float,
     resample: str = "none",
 ) -> tuple[FunnelProblem, Breaking]:
     """The problem of a file with what its equations leave out of bags; and what would break that.
 
-    responses, excitations: its states and inputs as signals. For the rest see `measured_push` and
-    `read_dataset`, whose errors pass through.
+    wiring: where its states and inputs are; period 0: as the samples come. For the rest see
+    `measured_push` and `read_dataset`, whose errors pass through.
     """
     problem = FunnelProblem.load(path)
-    grid = Grid(period=period, resample=resample)
-    trials = read_dataset(bags, responses=responses, excitations=excitations, grid=grid)
+    grid = Grid(period=wiring.period or None, resample=resample)
+    trials = read_dataset(bags, responses=wiring.response, excitations=wiring.command, grid=grid)
     push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
     found = breaking(trials, lambda trial: push.used(problem.field, trial))
     return dataclasses.replace(problem, push=push), found

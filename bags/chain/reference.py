@@ -209,10 +209,5 @@ def _type(annotation: Any) -> str:
     return text.replace("typing.", "")
 
 
-def _first_sentence(kind: Any) -> str:
-    text = re.sub(r"\s+", " ", kind.__doc__ or "")
-    return text.partition(". ")[0].rstrip(".") + "."
-
-
 if __name__ == "__main__":
     print(page(), end="")

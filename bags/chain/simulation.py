@@ -1,13 +1,20 @@
 """Recordings of simulated robots: repeats of an excitation, and runs of a tracking policy."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from bags.chain.plants import PERIOD, Plant, Robot
+from bags.chain.joint_bags import write_joint_bag
+from bags.chain.plants import PERIOD, ROBOTS, Plant, Robot
+from bags.chain.tracking_config import SimulationConfig, TrackingConfig
+from bags.chain.tracking_steps import feedback_of
+from bags.designs import documents
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.sampled.design import frame
+from nlsid_core.errors import DataError
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.running.observer import StateObserver
@@ -16,18 +23,37 @@ TONES = 40  # sines of an excitation
 LOWEST, HIGHEST = 0.05, 1.5  # Hz: slower than the robots swing, and faster
 
 
-@dataclass(frozen=True, eq=False)
-class Push:
-    """An outside torque (n,) in N·m on the joints, from sample `start` on for `samples`."""
+def simulate_excitations(config: TrackingConfig, out: Path) -> list[Path]:
+    """Bags of the configured simulated robot under repeated excitations, in `out`."""
+    robot, options = _simulated(config)
+    data = record_repeats(
+        robot,
+        peak=np.array(options.peak),
+        groups=options.groups,
+        repeats=options.repeats,
+        seconds=options.seconds,
+        seed=options.seed,
+    )
+    return [write_joint_bag(out, trial, custom={"source": "MuJoCo"}) for trial in data]
 
-    torque: FloatArray
-    start: int
-    samples: int
 
-    def at(self, k: int) -> FloatArray:
-        """The torque at sample k."""
-        acts = self.start <= k < self.start + self.samples
-        return np.asarray(self.torque * float(acts))
+def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]:
+    """Commissioning bags: the policy of the folder `design` on the simulated robot, in `out`."""
+    robot, options = _simulated(config)
+    given = documents.load_unproved(design)
+    model, policy = given.model, given.policy
+    norms = frame(model, policy, feedback_of(model, policy.x, policy.u, config))
+    rng = np.random.default_rng([options.seed, 1])
+    written = []
+    for index in range(options.runs):
+        z = rng.standard_normal(len(model))
+        radius = options.spread * norms.cap[0] * rng.uniform() / np.linalg.norm(z)
+        start = policy.x[0] + np.linalg.solve(norms.S[0], radius * z)
+        seed = int(rng.integers(2**31))
+        run = run_policy(robot, model, policy, seed=seed, start=start)
+        run = replace(run, name=f"{robot.name}_run_{index}")
+        written.append(write_joint_bag(out, run, custom={"source": "MuJoCo"}))
+    return written
 
 
 def multisine(rng: np.random.Generator, samples: int, peak: FloatArray) -> FloatArray:
@@ -66,15 +92,13 @@ def run_policy(
     *,
     seed: int,
     start: FloatArray | None = None,
-    push: Push | None = None,
-    mass_scale: float = 1.0,
 ) -> Trajectory:
     """One run of the policy on the robot; N + 1 samples.
 
     The estimate starts at `start` (default: the nominal), the robot a measurement error from it.
     """
     rng = np.random.default_rng(seed)
-    plant = Plant(robot, rng, mass_scale=mass_scale)
+    plant = Plant(robot, rng)
     first = policy.x[0] if start is None else start
     plant.reset(first)
     plant.reset(2 * first - plant.measure())
@@ -85,7 +109,7 @@ def run_policy(
         x = observer.update(y[k], u[k - 1] if k else None)
         if k < len(policy):
             u[k] = policy(k, x)
-            plant.step(u[k], 0.0 if push is None else push.at(k))
+            plant.step(u[k])
     return _trajectory(robot, y, u, f"{robot.name}_run_{seed}", "")
 
 
@@ -104,3 +128,15 @@ def _trajectory(robot: Robot, y: FloatArray, u: FloatArray, name: str, group: st
         group=group,
         digest=f"sha256:{content}",
     )
+
+
+def _simulated(config: TrackingConfig) -> tuple[Robot, SimulationConfig]:
+    options = config.simulation
+    if options is None:
+        raise DataError(f"{config.robot} is not simulated: its configuration has no 'simulation'")
+    if options.robot not in ROBOTS:
+        raise DataError(f"no simulated robot '{options.robot}'; there are: {', '.join(ROBOTS)}")
+    robot = ROBOTS[options.robot]
+    if len(options.peak) != robot.joints:
+        raise DataError(f"peak: {robot.name} has {robot.joints} joints, not {len(options.peak)}")
+    return robot, options

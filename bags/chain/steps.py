@@ -11,6 +11,7 @@ import numpy as np
 
 from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
+from bags.chain.tracking_config import TrackingConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
@@ -30,8 +31,6 @@ from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
 from nlsid_core.models.signal import Signal, signals_of
 from nlsid_core.progress import Progress, part, silent
-from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import Monitor
 
 USES: Final = ("test", "validation", "calibration")  # that the split names bags for
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
@@ -53,10 +52,20 @@ class Trials:
     filled: int = 0
 
     @property
+    def by_use(self) -> dict[str, Dataset]:
+        """Those there are, by what they are for."""
+        parts = {
+            "training": self.train,
+            "validation": self.validation,
+            "calibration": self.calibration,
+            "test": self.test,
+        }
+        return {use: data for use, data in parts.items() if data is not None}
+
+    @property
     def every(self) -> Dataset:
         """All of them, by name."""
-        parts = (self.train, self.test, self.validation, self.calibration)
-        trials = (trial for part in parts if part is not None for trial in part)
+        trials = (trial for part in self.by_use.values() for trial in part)
         return Dataset(tuple(sorted(trials, key=lambda trial: trial.name)))
 
     @property
@@ -155,15 +164,7 @@ def write_identified(
     progress("drawing the report", 0.9)
     if report_available():
         written.append(out / documents.REPORT)
-        write_report(
-            written[-1],
-            fit,
-            trials.train,
-            trials.test,
-            validation=trials.validation,
-            calibration=trials.calibration,
-            robot=config.robot,
-        )
+        write_report(written[-1], fit, trials.by_use, robot=config.robot)
     progress("done", 1.0)
     return Identified(fit, trials, tuple(written))
 
@@ -175,13 +176,18 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
 
 
 def read_signals_of(
-    bags: Sequence[Path] | Mapping[str, Path], config: Config, *, progress: Progress = silent
+    bags: Sequence[Path] | Mapping[str, Path],
+    config: Config | TrackingConfig,
+    *,
+    progress: Progress = silent,
 ) -> Dataset:
     """The configured signals of bags on the configured grid, with the configured names and units.
 
+    Of a measured state the states are the responses.
+
     bags: by what the trials are called, which else is as their bags are.
     """
-    responses, excitations = config.signals.response, config.signals.excitation
+    responses, excitations = config.signals.roles
     dataset = read_dataset(
         bags,
         responses=[signal.path for signal in responses],
@@ -299,8 +305,8 @@ def check_split(names: Sequence[str], config: Config) -> None:
     if split.share is None:
         named = {"test": split.test, **named}
     possible = with_parts(names, config)
-    _held_out(possible, named)
     refuse_absent(possible, config)
+    _held_out(possible, named)
 
 
 def absent_from(names: Sequence[str], config: Config) -> list[str]:
@@ -310,7 +316,8 @@ def absent_from(names: Sequence[str], config: Config) -> list[str]:
         absent = [name for name in getattr(config.split, use) if not _of_bags(names, [name])]
         if absent:
             near = did_you_mean(absent[0], names)
-            reasons.append(f"split.{use} names {listed(absent)}, and no bag is called so{near}")
+            there = listed(names)
+            reasons.append(f"split.{use} names {listed(absent)}; the bags are {there}{near}")
     return reasons
 
 
@@ -320,7 +327,7 @@ def refuse_absent(names: Sequence[str], config: Config) -> None:
     Its trial would be trained on without a word.
     """
     if absent := absent_from(names, config):
-        raise DataError(f"{absent[0]}; the bags are {listed(names)}")
+        raise DataError(absent[0])
 
 
 def with_parts(names: Sequence[str], config: Config) -> list[str]:
@@ -425,13 +432,10 @@ def what_a_funnel_catches(
         return None
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
     return what_it_catches(
-        Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
-        model,
-        design.funnel.half_widths.tolist(),
+        design,
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        factor=design.funnel.tubes[0].safety_factor,
         remedy="another funnel.reaction_time, or a model that leaves less in its residual",
     )
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from bags.chain.config import Clock, GridConfig
 from bags.chain.sections import (
@@ -30,6 +30,11 @@ class StateSignals(Section):
     inputs: Annotated[
         tuple[SignalConfig, ...], Field(min_length=1, strict=False), Key("what drives the robot")
     ]
+
+    @property
+    def roles(self) -> tuple[tuple[SignalConfig, ...], tuple[SignalConfig, ...]]:
+        """States and inputs."""
+        return self.states, self.inputs
 
 
 class StateIdentification(Section):
@@ -60,38 +65,17 @@ class StateIdentification(Section):
 
 
 class MotionConfig(Section):
-    """The motion to follow: from `start` to `goal` in `duration`, or near given `samples`."""
+    """The motion to follow: from `start` to `goal` in `duration`."""
 
-    start: Annotated[
-        Numbers | None, Key("states at the start", "the states' units", [0.0, 0.0])
-    ] = None
-    goal: Annotated[Numbers | None, Key("states at the end", "the states' units", [0.2, 0.0])] = (
-        None
-    )
-    duration: Annotated[Positive | None, Key("of the motion", "s", 1.0)] = None
-    samples: Annotated[
-        Annotated[Path, Field(strict=False)] | None,
-        Key(
-            "instead, a CSV file headed by the states' names in their order, one row a period, "
-            "seen from the configuration",
-            example="motion.csv",
-        ),
-    ] = None
+    start: Annotated[Numbers, Key("states at the start", "the states' units", [0.0, 0.0])]
+    goal: Annotated[Numbers, Key("states at the end", "the states' units", [0.2, 0.0])]
+    duration: Annotated[Positive, Key("of the motion", "s", 1.0)]
     state_weight: Annotated[
         Positive, Key("of the states' squared error, relative to the box of the data", "", 1.0)
     ] = 1.0
     input_weight: Annotated[
         Positive, Key("of the inputs' square, relative to the box of the data", "", 0.3)
     ] = 0.3
-
-    @model_validator(mode="after")
-    def _one_of_two(self) -> "MotionConfig":
-        ends = (self.start, self.goal, self.duration)
-        if self.samples is not None and any(part is not None for part in ends):
-            raise ValueError("give samples, or start, goal and duration, not both")
-        if self.samples is None and any(part is None for part in ends):
-            raise ValueError("give start, goal and duration, or samples")
-        return self
 
 
 class DisturbanceConfig(Section):
@@ -142,6 +126,11 @@ class TrackingConfig(Section):
     )
     simulation: Annotated[SimulationConfig | None, Key("only for a robot that is simulated")] = None
 
+    @property
+    def definitions(self) -> tuple[Path, ...]:
+        """Message types are those of the bags."""
+        return ()
+
 
 def is_tracking(path: Path | str) -> bool:
     """Whether a configuration is of a measured state and a motion; DataError if it is no YAML."""
@@ -150,9 +139,4 @@ def is_tracking(path: Path | str) -> bool:
 
 def load_tracking_config(path: Path | str) -> TrackingConfig:
     """Read and check a configuration; DataError lists every wrong key with where it stands."""
-    config = read_yaml(path, TrackingConfig)
-    given = config.motion.samples
-    if given is None:
-        return config
-    motion = config.motion.model_copy(update={"samples": Path(path).parent / given})
-    return config.model_copy(update={"motion": motion})
+    return read_yaml(path, TrackingConfig)

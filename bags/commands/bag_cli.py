@@ -3,6 +3,7 @@
 A command imports what it runs when it is called.
 """
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,9 +17,9 @@ from bags.commands.options import (
     Clock,
     ClockOption,
     DefinitionsOption,
-    ExcitationOption,
     JsonOption,
-    ResponseOption,
+    Signals,
+    flat,
 )
 from bags.commands.progress import progress_bar
 from nlsid_core.errors import BagError, DataError
@@ -26,6 +27,7 @@ from nlsid_core.errors import BagError, DataError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from bags.recordings.bag import Bag
     from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
@@ -58,9 +60,23 @@ SignalsOption = Annotated[
         help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
-UnfinishedOption = Annotated[
-    bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
-]
+
+
+@dataclass(frozen=True)
+class Source:
+    """How a recording is read."""
+
+    definitions: DefinitionsOption = None
+    unfinished: Annotated[
+        bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
+    ] = False
+
+
+@dataclass(frozen=True)
+class Timed(Source):
+    """The same, by which stamps."""
+
+    clock: ClockOption = Clock.HEADER
 
 
 @bag_app.command()
@@ -105,17 +121,15 @@ def signals(
 
 
 @bag_app.command()
+@flat
 def plot(
     bag: BagArgument,
+    source: Timed,
     signals: SignalsOption = None,
     picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")] = PICTURE,
-    clock: ClockOption = Clock.HEADER,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
-    from bags.recordings.bag import Bag
     from bags.signals.reader import read_signals
     from bags.signals.sampling import Grid
 
@@ -123,22 +137,22 @@ def plot(
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
-    drawn = signals or [signal for part in _likeliest([bag], definitions) for signal in part]
-    texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
+    drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
+    texts = [Grid(clock=source.clock.value).path(text, response=True) for text in drawn]
     with (
-        Bag(bag, unfinished=unfinished, definitions=_definitions(definitions)) as source,
+        _opened(bag, source) as opened,
         progress_bar("reading", after=PROGRESS_AFTER) as progress,
     ):
-        samples = read_signals(source, texts, progress=progress)
+        samples = read_signals(opened, texts, progress=progress)
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
 
 
 @bag_app.command()
+@flat
 def check(
     bags: BagsArgument,
-    responses: ResponseOption = None,
-    excitations: ExcitationOption = None,
+    signals: Signals,
     clock: ClockOption = Clock.HEADER,
     definitions: DefinitionsOption = None,
     as_json: JsonOption = False,
@@ -152,8 +166,8 @@ def check(
     from bags.tools.fitness import Level, check_fitness
 
     folders = expand_bags(bags)
-    y, u = _likeliest(folders, definitions, responses or (), excitations or ())
-    if not (responses and excitations) and not as_json:
+    y, u = _likeliest(folders, definitions, signals.response or (), signals.excitation or ())
+    if not (signals.response and signals.excitation) and not as_json:
         out.print(f"of {', '.join(y)} under {', '.join(u)}", soft_wrap=True, markup=False)
     results = check_fitness(
         folders,
@@ -201,42 +215,47 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
         raise typer.Exit(1)
 
 
+@dataclass(frozen=True)
+class CommonGrid:
+    """One table for all signals."""
+
+    period: Annotated[
+        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
+    ] = None
+    hold: Annotated[
+        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
+    ] = None
+    max_gap: Annotated[
+        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
+    ] = None
+
+
 @bag_app.command("export")
+@flat
 def export_command(
     bag: BagArgument,
+    grid: CommonGrid,
+    source: Timed,
     target: OutOption = None,
     form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
     signals: Annotated[
         list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
     ] = None,
-    period: Annotated[
-        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
-    ] = None,
-    hold: Annotated[
-        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
-    ] = None,
-    max_gap: Annotated[
-        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
-    ] = None,
-    clock: ClockOption = Clock.HEADER,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
 ) -> None:
     """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid.
 
     By default in the folder BAG_tables, or as the file BAG.csv.
     """
-    from bags.recordings.bag import Bag
     from bags.signals.sampling import Grid
     from bags.tools import export
 
-    named = Path(f"{bag.stem}.{form.value}") if period is not None else _beside(bag, "tables")
+    named = Path(f"{bag.stem}.{form.value}") if grid.period is not None else _beside(bag, "tables")
     target = target or named
-    with Bag(bag, unfinished=unfinished, definitions=_definitions(definitions)) as source:
-        if period is None:
+    with _opened(bag, source) as opened:
+        if grid.period is None:
             with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
                 rows = export.export_topics(
-                    source, target, form=form.value, signals=signals or (), progress=progress
+                    opened, target, form=form.value, signals=signals or (), progress=progress
                 )
             for file, count in rows.counts.items():
                 out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
@@ -247,33 +266,47 @@ def export_command(
         if not signals:
             raise BagError("a common grid needs to know which signals: --signal")
         did = export.export_grid(
-            source,
+            opened,
             target,
             form=form.value,
             signals=signals,
-            hold=hold or (),
-            grid=Grid(period=period, max_gap=max_gap, clock=clock.value),
+            hold=grid.hold or (),
+            grid=Grid(period=grid.period, max_gap=grid.max_gap, clock=source.clock.value),
         )
     for what in did:
         out.print(what, soft_wrap=True, markup=False)
     out.print(f"wrote {target}", soft_wrap=True, markup=False)
 
 
-@bag_app.command()
-def convert(
-    bags: BagsArgument,
-    bag_out: OutOption = None,
-    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0,
-    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None,
-    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None,
+@dataclass(frozen=True)
+class Stretch:
+    """Which part of a bag is copied."""
+
+    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0
+    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None
+    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Into what a bag is cut."""
+
     every: Annotated[
         float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
-    ] = None,
+    ] = None
     repeats: Annotated[
         str | None, typer.Option(help="A signal whose repetitions become the parts.")
-    ] = None,
-    definitions: DefinitionsOption = None,
-    unfinished: UnfinishedOption = False,
+    ] = None
+
+
+@bag_app.command()
+@flat
+def convert(
+    bags: BagsArgument,
+    stretch: Stretch,
+    cuts: Parts,
+    source: Source,
+    bag_out: OutOption = None,
 ) -> None:
     """Copy bags into a new MCAP bag: a stretch of time, some topics, several as one, or in parts.
 
@@ -282,39 +315,51 @@ def convert(
     """
     from contextlib import ExitStack
 
-    from bags.recordings.bag import Bag
     from bags.recordings.folders import expand_bags
     from bags.tools import edit
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
+    every, repeats = cuts.every, cuts.repeats
     if every is not None and repeats is not None:
         raise DataError("parts begin every so many seconds or at repeats: --every or --repeats")
-    if (every is not None or repeats is not None) and (start or end is not None):
+    if (every is not None or repeats is not None) and (stretch.start or stretch.end is not None):
         raise DataError("take the stretch first (--start, --end), then cut that into parts")
-    given = _definitions(definitions)
     with ExitStack() as stack:
-        opened = [
-            stack.enter_context(Bag(folder, unfinished=unfinished, definitions=given))
-            for folder in folders
-        ]
+        opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
         if every is not None:
             parts = edit.parts_every(opened, target, every)
         elif repeats is not None:
             parts = edit.parts_at_repeats(opened[0], target, repeats)
         else:
-            parts = [edit.stretch(opened, target, start, end)]
+            parts = [edit.stretch(opened, target, stretch.start, stretch.end)]
         progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
-        copied = edit.convert(opened, parts, topics=topics or (), progress=progress)
+        copied = edit.convert(opened, parts, topics=stretch.topics or (), progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
     out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
     _say_notes(copied.notes)
 
 
+@dataclass(frozen=True)
+class TableRows:
+    """When the rows of tables were."""
+
+    period: Annotated[float | None, typer.Option(help="s between rows.")] = None
+    time_column: Annotated[
+        str | None, typer.Option("--time", help="The column with the rows' times in s.")
+    ] = None
+    drop_repeats: Annotated[
+        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
+    ] = False
+    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0
+
+
 @bag_app.command("import")
+@flat
 def import_command(
     table: Annotated[Path, typer.Argument(help="A CSV file.")],
+    given: TableRows,
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
@@ -329,15 +374,6 @@ def import_command(
         list[str] | None,
         typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState"),
     ] = None,
-    period: Annotated[float | None, typer.Option(help="s between rows.")] = None,
-    time_column: Annotated[
-        str | None,
-        typer.Option("--time", help="The column with the rows' times, with its unit: t|unit(ms)."),
-    ] = None,
-    drop_repeats: Annotated[
-        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
-    ] = False,
-    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0,
     custom: Annotated[
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
@@ -347,7 +383,7 @@ def import_command(
 
     kinds = _pairs(types or (), "--type")
     bag_out = bag_out or Path(table.stem)
-    rows = Rows(period, time_column, drop_repeats, round(start * 1e9))
+    rows = Rows(given.period, given.time_column, given.drop_repeats, round(given.start * 1e9))
     if not assignments:
         rows, assignments, numbers = every_column(table, rows)
         kinds = numbers | kinds
@@ -394,6 +430,13 @@ def _likeliest(
     from bags.setup.proposing import choose
 
     return choose(look(bags, definitions=_definitions(definitions)), responses, excitations)
+
+
+def _opened(bag: Path, source: Source) -> "Bag":
+    """The recording, to be read as the options say."""
+    from bags.recordings.bag import Bag
+
+    return Bag(bag, unfinished=source.unfinished, definitions=_definitions(source.definitions))
 
 
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":

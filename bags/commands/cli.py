@@ -15,7 +15,7 @@ from rich.markup import escape
 from bags.commands import designs_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
 from bags.commands.fleet_cli import fleet_app
-from bags.commands.options import err
+from bags.commands.options import err, flat
 from nlsid_core.errors import NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -42,7 +42,7 @@ GROUPS = {
 }
 for group, verbs in GROUPS.items():
     for verb in verbs:
-        app.command(rich_help_panel=group)(verb)
+        app.command(verb.__name__, rich_help_panel=group)(flat(verb))
 app.add_typer(bag_app, rich_help_panel="More")
 app.add_typer(fleet_app, rich_help_panel="More")
 

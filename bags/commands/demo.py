@@ -18,19 +18,20 @@ from bags import samples
 from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags, what_a_funnel_catches
-from bags.commands import show
+from bags.chain.simulation import simulate_excitations, simulate_runs
+from bags.chain.tracking_config import is_tracking, load_tracking_config
+from bags.commands import designs_cli, models_cli, show, states
 from bags.commands.options import CONFIG
 from bags.commands.progress import progress_bar
 from bags.designs import documents
-from bags.monitoring.replay import Replay, replay_bag
-from bags.pictures.report import report_available, write_catching, write_margins
+from bags.pictures.report import drawable, write_margins
 from nlsid_core.errors import DataError
 from nlsid_core.proofs import check
 from nlsid_core.running.reading import Status
 
 LIVE_MODULE = "nlsid_ros.demo.live"  # started as a process: bags knows nothing of ROS
 OTHERS_PLOT = "others.png"
+EXCITATIONS, RUNS = "excitations", "runs"  # folders of bags of simulated robots
 
 
 @dataclass(frozen=True)
@@ -65,148 +66,123 @@ DEMOS: Final = {
 
 
 def run_demo(out: Path, console: Console, robot: str) -> bool:
-    """Run every step into `out`, saying what happens; True if all came out as it should."""
+    """Run every step into `out`, saying what happens; True if all came out as it should.
+
+    robot: one of DEMOS, or a simulated one, by the name of a shipped configuration or by its file.
+    """
     if robot not in DEMOS:
-        raise DataError(f"no demo of '{robot}'; there are: {', '.join(DEMOS)}")
-    started = time.perf_counter()
-    demo = _Demo(out, console, DEMOS[robot]())
-    demo.identify()
-    demo.funnel()
-    demo.check()
-    monitored = demo.monitor()
-    live = demo.live()
-    demo.where_to_look()
-    console.print(f"{time.perf_counter() - started:.0f} s in all")
+        config = Path(robot) if robot.endswith(".yaml") else config_file(f"{robot}.yaml")
+        return _simulated(config, out, console)
+
+    started, shown = time.perf_counter(), DEMOS[robot]()
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.copy(config_file(shown.config), out / CONFIG)
+    settings = load_config(out / CONFIG)
+    bags = shown.bags[0].parent
+    _step(console, "1  identify a model from the recordings", f"identify {out} {bags}")
+    models_cli.identify_here(shown.bags, settings, out, select=False)
+    _step(console, "2  design a tube, and see what it would catch", f"funnel {out}")
+    designs_cli.tube(out, settings)
+    _step(console, "3  check both proofs, exactly and without a solver", f"check {out}")
+    for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
+        _say(console, str(check(out / name)))
+    _step(console, "4  hold unseen recordings against the tube", f"monitor {out} BAG...")
+    monitored = _monitor(console, shown, settings, out)
+    _step(console, "5  the same live, over ROS 2")
+    live = _live(console, shown, out)
+    _say(console, f"{time.perf_counter() - started:.0f} s in all")
     return monitored and live
 
 
-class _Demo:
-    """The steps, each under its own heading with the command that does the same."""
+def _simulated(config: Path, out: Path, console: Console) -> bool:
+    """All steps on a simulated robot; whether its runs are inside."""
+    if not is_tracking(config):
+        raise DataError(f"{config}: no motion and no simulation; demos are of simulated robots")
+    settings = load_tracking_config(config)
+    excited = simulate_excitations(settings, out / EXCITATIONS)
+    console.print(f"wrote {len(excited)} bags of excitations in {out / EXCITATIONS}")
+    states.identify(excited, settings, out)
+    runs = simulate_runs(out, settings, out / RUNS)
+    console.print(f"wrote {len(runs)} bags of runs in {out / RUNS}")
+    design = states.funnel(runs, settings, out)
+    console.print(str(check(out / documents.FUNNEL_PROOF)), soft_wrap=True)
+    replays = show.replayed(design, runs, None)
+    show.say_replays(console, replays)
+    inside = sum(replay.verdict == Status.INSIDE.value for replay in replays)
+    console.print(f"{inside} of {len(runs)} bags are inside from first to last sample")
+    return inside == len(runs)
 
-    def __init__(self, out: Path, console: Console, shown: Shown) -> None:
-        self.out, self.console, self.shown = out, console, shown
-        self.config_path = config_file(shown.config)
-        self.config: Config = load_config(self.config_path)
-        self.bags = shown.bags
 
-    def identify(self) -> None:
-        self._heading("1  identify a model from the recordings")
-        self._command(f"identify {self.out} {self.bags[0].parent}")
-        self.out.mkdir(parents=True, exist_ok=True)
-        shutil.copy(self.config_path, self.out / CONFIG)
-        with progress_bar("identifying") as progress:
-            result = identify_bags(self.bags, self.config, self.out, progress=progress)
-        self.console.print(show.methods_table(result.fit, result.test))
-        if not report_available():
-            self._say("no report and no pictures: install matplotlib (pip install 'nlsid[report]')")
+def _monitor(console: Console, shown: Shown, settings: Config, out: Path) -> bool:
+    """Hold the test trials against the tube, and what should be flagged; whether all are right."""
+    design = documents.load(out)
+    test = [bag for bag in shown.bags if bag.name in settings.split.test]
+    replays = show.replayed(design, test, settings)
+    if drawable(replays):
+        write_margins(out / documents.MARGIN_PLOT, replays)
+    console.print(show.replay_table(replays))
+    inside = sum(replay.verdict == Status.INSIDE.value for replay in replays)
+    _say(console, f"{inside} of {len(replays)} test trials inside")
 
-    def funnel(self) -> None:
-        self._heading("2  design a tube, and see what it would catch")
-        model = self.out / documents.MODEL
-        self._command(f"funnel {self.out}")
-        with progress_bar("designing policy, observer and tube"):
-            design = design_funnel_files(model, self.config, self.out)
-            catching = what_a_funnel_catches(model, self.config, design)
-        self.console.print(show.funnel_table(design))
-        if catching is not None:
-            show.say_catching(self.console, catching, None)
-            write_catching(self.out, catching)
+    right, every = inside == len(replays), []
+    with tempfile.TemporaryDirectory() as folder:
+        for what, bags in _others(shown, test, settings, Path(folder)).items():
+            others = show.replayed(design, bags, settings)
+            console.print(show.replay_table(others))
+            flagged = sum(replay.first_bad is not None for replay in others)
+            _say(console, f"{what}: {flagged} of {len(others)} flagged")
+            right = right and (shown.floors.get(what, False) or flagged == len(others))
+            every += others
+    if drawable(every):
+        write_margins(out / OTHERS_PLOT, every)
+    _say(console, shown.said)
+    return right
 
-    def check(self) -> None:
-        self._heading("3  check both proofs, exactly and without a solver")
-        self._command(f"check {self.out}")
-        for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
-            self._say(str(check(self.out / name)))
 
-    def monitor(self) -> bool:
-        self._heading("4  hold unseen recordings against the tube")
-        test = [bag for bag in self.bags if bag.name in self.config.split.test]
-        self._command(f"monitor {self.out} BAG... ({len(test)} trials)")
-        with progress_bar("replaying"):
-            replays = self._replay(test)
-            if report_available():
-                write_margins(self.out / documents.MARGIN_PLOT, replays)
-        self.console.print(show.replay_table(replays))
-        inside = sum(r.verdict == Status.INSIDE.value for r in replays)
-        self._say(f"{inside} of {len(replays)} test trials inside")
-        others = self._floors() if self.shown.floors else self._sabotaged(test)
-        return others and inside == len(replays)
+def _others(
+    shown: Shown, test: Sequence[Path], settings: Config, folder: Path
+) -> dict[str, list[Path]]:
+    """Drives on other floors, or copies of the test trials with a broken sensor, in `folder`."""
+    beside = shown.bags[0].parent
+    if shown.floors:
+        return {floor: sorted(beside.glob(f"{floor}_*")) for floor in shown.floors}
+    signal = settings.signals.response[0].path
+    copies: dict[str, list[Path]] = {}
+    for what, fault in FAULTS.items():
+        copies[what] = [folder / f"{bag.name}, {what}" for bag in test]
+        for bag, copy in zip(test, copies[what], strict=True):
+            write_faulty_copy(bag, copy, signal, fault)
+    return copies
 
-    def _sabotaged(self, test: Sequence[Path]) -> bool:
-        """Copies of the test trials with a broken sensor; whether each is caught."""
-        sabotaged: list[Replay] = []
-        with progress_bar("replaying") as progress, tempfile.TemporaryDirectory() as folder:
-            pairs = [(bag, fault) for bag in test for fault in FAULTS]
-            for done, (bag, fault) in enumerate(pairs):
-                copy = Path(folder) / f"{bag.name}, {fault}"
-                progress(f"sabotaging {copy.name}", done / len(pairs))
-                write_faulty_copy(bag, copy, self.config.signals.response[0].path, FAULTS[fault])
-                sabotaged += self._replay([copy])
-            if report_available():
-                write_margins(self.out / OTHERS_PLOT, sabotaged)
-        self.console.print(show.caught_table(sabotaged))
-        caught = sum(r.first_bad is not None for r in sabotaged)
-        self._say(f"{caught} of {len(sabotaged)} sabotaged trials caught")
-        return caught == len(sabotaged)
 
-    def _floors(self) -> bool:
-        """Drives on other floors; whether every one that is to be flagged is."""
-        folder, right, every = self.bags[0].parent, True, []
-        for floor, is_inside in self.shown.floors.items():
-            replays = self._replay(sorted(folder.glob(f"{floor}_*")))
-            self.console.print(show.replay_table(replays))
-            flagged = [replay for replay in replays if replay.first_bad is not None]
-            self._say(f"{floor}: {len(flagged)} of {len(replays)} flagged")
-            for replay in flagged:
-                self._say(f"  {replay.name}: {replay.reason}")
-            right = right and (is_inside or len(flagged) == len(replays))
-            every += replays
-        if report_available():
-            write_margins(self.out / OTHERS_PLOT, every)
-        self._say(self.shown.said)
-        return right
+def _live(console: Console, shown: Shown, out: Path) -> bool:
+    """Run the live part in processes of its own; True where ROS is not there to run it."""
+    if importlib.util.find_spec("rclpy") is None:
+        _say(console, "skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
+        return True
+    _say(console, "recorder, publisher, monitor and player as processes; two trials in real time")
+    recording = out / "live"
+    shutil.rmtree(recording, ignore_errors=True)
+    trial = next(bag for bag in shown.bags if bag.name == shown.live)
+    command = [
+        *(sys.executable, "-m", LIVE_MODULE, "--funnel", str(out / documents.FUNNEL)),
+        *("--bag", str(trial), "--out", str(recording)),
+    ]
+    with progress_bar("playing"):
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+    _say(console, (done.stdout + done.stderr).strip())
+    if done.returncode:
+        _say(console, f"to repeat this step alone: {shlex.join(['python', *command[1:]])}")
+    return done.returncode == 0
 
-    def live(self) -> bool:
-        """The live part in processes of its own; True where ROS is not there to run it."""
-        self._heading("5  the same live, over ROS 2")
-        if importlib.util.find_spec("rclpy") is None:
-            self._say("skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
-            return True
-        self._say("recorder, publisher, monitor and player as processes; two trials in real time")
-        recording = self.out / "live"
-        shutil.rmtree(recording, ignore_errors=True)
-        trial = next(bag for bag in self.bags if bag.name == self.shown.live)
-        command = [
-            *(sys.executable, "-m", LIVE_MODULE, "--funnel", str(self.out / documents.FUNNEL)),
-            *("--bag", str(trial), "--out", str(recording)),
-        ]
-        with progress_bar("playing"):
-            done = subprocess.run(command, check=False, capture_output=True, text=True)
-        self._say((done.stdout + done.stderr).strip())
-        if done.returncode:
-            self._say("to repeat this step alone:")
-            self._say(shlex.join(["python", *command[1:]]))
-        return done.returncode == 0
 
-    def where_to_look(self) -> None:
-        self._heading("where to look")
-        if report_available():
-            self._say(f"report    {self.out / documents.REPORT}")
-            self._say(f"pictures  {self.out / documents.MARGIN_PLOT}, {self.out / OTHERS_PLOT}")
-        self._say(f"proofs    {self.out / documents.MODEL_PROOF}")
-        self._say(f"          {self.out / documents.FUNNEL_PROOF}")
+def _step(console: Console, title: str, command: str = "") -> None:
+    """A heading, and the command that does the same."""
+    console.print()
+    console.rule(title, align="left")
+    if command:
+        _say(console, f"$ nlsid {command}")
 
-    def _replay(self, bags: Sequence[Path]) -> list[Replay]:
-        proved = documents.load_proved(self.out / documents.FUNNEL)
-        centre = self.config.monitor.nominal_source
-        return [replay_bag(proved, bag, centre=centre) for bag in bags]
 
-    def _heading(self, text: str) -> None:
-        self.console.print()
-        self.console.rule(text, align="left")
-
-    def _command(self, text: str) -> None:
-        self.console.print(f"$ nlsid {text}", soft_wrap=True, highlight=False, markup=False)
-
-    def _say(self, text: str) -> None:
-        self.console.print(text, soft_wrap=True, highlight=False, markup=False)
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -5,6 +5,7 @@ A command imports what it runs when it is called.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,12 +14,9 @@ import typer
 from bags.commands.options import (
     ConfigOption,
     DesignArgument,
-    ExcitationOption,
-    PeriodOption,
-    ResponseOption,
-    SchedulerOption,
+    Sharing,
     SomeBagsArgument,
-    WorkersOption,
+    Wired,
     config_of,
     out,
     settings_if_any,
@@ -29,39 +27,38 @@ from nlsid_core import second as second_kernel
 from nlsid_core.errors import CertificateRejected
 
 if TYPE_CHECKING:
+    from bags.chain.config import Config
     from bags.chain.problems import FunnelProblem
     from bags.fleet.workers import Workers
 
 
-def funnel(
-    folder: DesignArgument,
-    bags: SomeBagsArgument = None,
-    config: ConfigOption = None,
-    require: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
-        ),
-    ] = None,
+@dataclass(frozen=True)
+class Given:
+    """What a funnel is designed for in the place of a model."""
+
     problem: Annotated[
         Path | None,
         typer.Option(help="Dynamics, nominal and goal in a file, in the place of a model."),
-    ] = None,
-    response: ResponseOption = None,
-    excitation: ExcitationOption = None,
-    period: PeriodOption = 0.0,
+    ] = None
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
-    ] = 0.0,
+    ] = 0.0
     safety_factor: Annotated[
         float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
-    ] = 1.5,
+    ] = 1.5
     compose: Annotated[
         list[Path] | None,
         typer.Option(help="Bind the funnels of these folders, in the order of time; repeat."),
-    ] = None,
-    workers: WorkersOption = 0,
-    scheduler: SchedulerOption = "",
+    ] = None
+
+
+def funnel(
+    folder: DesignArgument,
+    given: Given,
+    wired: Wired,
+    sharing: Sharing,
+    bags: SomeBagsArgument = None,
+    config: ConfigOption = None,
 ) -> None:
     """Design a proved funnel in DIR: funnel.json, funnel.proof.json, policy.json if it has one.
 
@@ -70,50 +67,34 @@ def funnel(
     (--problem), which BAG... with -y and -u show to be off by a push; or of funnels that follow
     each other (--compose). Of an identified model it says what the funnel catches.
     """
-    from bags.chain.tracking_config import is_tracking
-    from bags.fleet.workers import Workers
+    from bags.chain.config import load_config
+    from bags.chain.tracking_config import is_tracking, load_tracking_config
+    from bags.recordings.folders import expand_bags
 
-    if compose:
+    if given.compose:
         from nlsid_core.design import compose_funnels
 
-        path = compose_funnels([_proof_in(stage) for stage in compose], folder)
-        out.print(f"wrote {path} and {4 * len(compose)} files of its stages", soft_wrap=True)
+        path = compose_funnels([_proof_in(stage) for stage in given.compose], folder)
+        out.print(f"wrote {path} and {4 * len(given.compose)} files of its stages", soft_wrap=True)
         return
-    if problem is not None:
-        from bags.chain.problems import FunnelProblem
-
-        if config is not None or require is not None:
-            raise typer.BadParameter("--problem takes no --config and no --require")
-        given = FunnelProblem.load(problem)
-        if bags:
-            from bags.chain.problems import measured
-            from bags.commands import show
-            from bags.recordings.folders import expand_bags
-
-            given, broken = measured(
-                problem,
-                expand_bags(bags),
-                responses=response or (),
-                excitations=excitation or (),
-                period=period or None,
-                seconds=seconds or None,
-                safety_factor=safety_factor,
-            )
-            out.print(show.breaking_table(broken))
-        _funnel_around_trajectory(given, folder, Workers(workers, scheduler))
+    if given.problem is not None:
+        if config is not None:
+            raise typer.BadParameter("--problem takes no --config")
+        problem = _problem(given.problem, given, wired, expand_bags(bags) if bags else [])
+        _funnel_around_trajectory(problem, folder, sharing.workers())
         return
-    if workers or scheduler:
+    if sharing != Sharing():
         raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
 
     path = config_of(folder, config)
-    if is_tracking(path):
-        from bags.commands import track
+    if not is_tracking(path):
+        tube(folder, load_config(path))
+        return
+    if not bags:
+        raise typer.BadParameter("give the bags on which the disturbance is measured")
+    from bags.commands import states
 
-        if not bags:
-            raise typer.BadParameter("give the bags on which the disturbance is measured")
-        track.funnel(bags, folder, path)
-    else:
-        _tube(folder, path, require)
+    states.funnel(expand_bags(bags), load_tracking_config(path), folder)
 
 
 def _proof_in(path: Path) -> Path:
@@ -123,9 +104,8 @@ def _proof_in(path: Path) -> Path:
     return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
-def _tube(folder: Path, config: Path, require: float | None) -> None:
-    """A tube around the model in a folder, and what it catches."""
-    from bags.chain.config import load_config
+def tube(folder: Path, settings: Config) -> None:
+    """Design a tube around the model in a folder, and what it catches."""
     from bags.chain.steps import (
         design_funnel_files,
         what_a_funnel_catches,
@@ -135,7 +115,7 @@ def _tube(folder: Path, config: Path, require: float | None) -> None:
     from bags.designs import documents
     from bags.pictures.report import write_catching
 
-    settings, model = load_config(config), folder / documents.MODEL
+    model = folder / documents.MODEL
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, folder)
@@ -143,39 +123,44 @@ def _tube(folder: Path, config: Path, require: float | None) -> None:
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
     out.print(show.funnel_table(design))
+    written = [folder / name for name in design.documents()]
     if catching is None:
         out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
-        if require is not None:
-            raise typer.Exit(2)
     else:
-        show.say_catching(out, catching, require)
+        show.say_catching(out, catching)
+        written += write_catching(folder, catching)
     for line in what_a_monitor_would_not_judge(model, settings, design):
         show.warn(out, line)
-    for path in (
-        *(folder / name for name in design.documents()),
-        *([] if catching is None else write_catching(folder, catching)),
-    ):
+    for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
-    if catching is not None and require is not None and not catching.widest.share <= require:
-        raise typer.Exit(1)
+
+
+def _problem(path: Path, given: Given, wired: Wired, bags: list[Path]) -> FunnelProblem:
+    """The problem of a file, with what its equations leave out of bags if there are any."""
+    from bags.chain.problems import FunnelProblem, measured
+    from bags.commands import show
+    from nlsid_core.designs import Wiring
+
+    if not bags:
+        return FunnelProblem.load(path)
+    wiring = Wiring(tuple(wired.response or ()), tuple(wired.excitation or ()), wired.period)
+    problem, broken = measured(
+        path, bags, wiring, seconds=given.seconds or None, safety_factor=given.safety_factor
+    )
+    out.print(show.breaking_table(broken))
+    return problem
 
 
 def _funnel_around_trajectory(given: FunnelProblem, folder: Path, workers: Workers) -> None:
     """A funnel for given equations, and the push that was measured beside it."""
+    from bags.commands import show
     from bags.designs import documents
-    from bags.pictures.report import report_available
     from nlsid_core import files
 
     with progress_bar("designing") as progress, workers.sharing() as executor:
         design = given.design(progress, executor=executor)
-    for path in design.save(folder):
+    for path in (*design.save(folder), *show.draw_tube(folder, design)):
         out.print(f"wrote {path}", soft_wrap=True)
-    if report_available():
-        from bags.pictures.funnel_plots import write_funnel_picture
-
-        picture = folder / documents.FUNNEL_PLOT
-        write_funnel_picture(picture, design)
-        out.print(f"wrote {picture}", soft_wrap=True)
     out.print(str(design), soft_wrap=True)
     if given.push is not None:
         path = folder / documents.PUSH
@@ -247,9 +232,6 @@ def report(
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
     ] = None,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Also as PDF beside the page; needs Chromium or Chrome.")
-    ] = False,
 ) -> None:
     """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
 
@@ -258,47 +240,30 @@ def report(
     """
     from bags.commands import show
     from bags.designs import documents
-    from bags.monitoring.replay import replay_bag, to_judge
-    from bags.monitoring.watch import Watch
-    from bags.pictures.folder_report import print_page, write_folder_report
-    from bags.pictures.report import report_available
+    from bags.designs.wiring import sampler_of
+    from bags.pictures.folder_report import Held, write_folder_report
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
 
-    settings = settings_if_any(folder, config)
     target = page or folder / documents.DESIGN_REPORT
-    recordings, replays, drawn = [], [], ""
-    used: list[str] = []
+    held = Held()
     if bags:
-        proved = documents.load_proved(documents.funnel_of(folder))
-        folders = expand_bags(bags)
-        topics = Watch(proved.design, centre=show.centre_of(settings)).pairing.topics
+        settings = settings_if_any(folder, config)
+        design, folders = documents.load(folder), expand_bags(bags)
+        topics = sampler_of(design).topics
         with progress_bar("reading") as progress:
+            recordings = []
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
                 recordings.append(bag_info(bag, topics=topics))
-        validation = settings.split.validation if settings is not None else ()
-        chosen = to_judge(proved.design, folders, validation=validation)
-        with progress_bar("replaying") as progress:
-            for done, bag in enumerate(chosen.judged):
-                progress(bag.name, done / len(chosen.judged))
-                replays.append(replay_bag(proved, bag, centre=show.centre_of(settings)))
-        used = chosen.said
+        chosen = show.chosen_bags(design, folders, settings)
+        replays = show.replayed(design, chosen.judged, settings)
+        held = Held(recordings, replays, chosen.said)
         out.print(show.replay_table(replays))
-        for line in used:
+        for line in chosen.said:
             out.print(line, soft_wrap=True, markup=False, highlight=False)
-        is_judged = any(entry.judged for entry in replays)
-        if is_judged and report_available() and all(entry.half_width for entry in replays):
-            from bags.pictures import plots
-
-            drawn = plots.svg(plots.margins(replays))
-    write_folder_report(
-        folder, target, recordings=recordings, replays=replays, used=used, drawn=drawn
-    )
+    write_folder_report(folder, target, held)
     out.print(f"wrote {target}", soft_wrap=True)
-    if pdf:
-        print_page(target, target.with_suffix(".pdf"))
-        out.print(f"wrote {target.with_suffix('.pdf')}", soft_wrap=True)
 
 
 def export(
@@ -310,7 +275,8 @@ def export(
     """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
 
     Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
-    of Autoware's validators for speeds and distances, and a table of all signals.
+    of Autoware's validators for speeds and distances, and a table of all signals. The tube has to
+    be as wide always: `funnel: {level: constant}` in the configuration.
     """
     from bags.designs import tolerances as proved
 

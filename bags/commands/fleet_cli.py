@@ -1,4 +1,4 @@
-"""The command line `nlsid fleet`, and what `nlsid identify` does with many bags.
+"""The command line `nlsid fleet`, and what `nlsid identify` says of many bags.
 
 A command imports what it runs when it is called.
 """
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -22,20 +21,20 @@ from bags.commands.options import (
     ConfigOption,
     DesignArgument,
     PatienceOption,
-    SchedulerOption,
-    WorkersOption,
+    Sharing,
     config_of,
+    flat,
+    out,
     settings_if_any,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from bags.chain.config import Config
     from bags.fleet.check import Checked
     from bags.fleet.monitor import FleetVerdict, Judged
     from bags.fleet.trials import FleetTrials
-    from bags.fleet.workers import Workers
 
 LISTED = 20  # bags of a kind, by name
 ROWS = 30  # of a table on the screen
@@ -46,34 +45,29 @@ fleet_app = typer.Typer(
     help="Many bags at once, on this machine or in object storage: are they fit, are they inside.",
     no_args_is_help=True,
 )
-console = Console()
 
-ManifestOption = Annotated[
-    Path | None,
-    typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
-]
-RobotOption = Annotated[
-    int | None,
-    typer.Option(
-        help="Which folder of a bag's name says whose it is, 1 the first, -1 the last; default: "
-        "the first that is no date and not the same for all."
-    ),
-]
+
+@dataclass(frozen=True)
+class Fleet(Sharing):
+    """Who reads the bags, how patiently, and what is kept of them."""
+
+    patience: PatienceOption = 60.0
+    manifest: Annotated[
+        Path | None,
+        typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
+    ] = None
 
 
 @fleet_app.command()
+@flat
 def check(
     folder: DesignArgument,
     bags: BagsArgument,
+    fleet: Fleet,
     config: ConfigOption = None,
     table: Annotated[
         Path | None, typer.Option("--out", help="A .parquet file for all rows and findings.")
     ] = None,
-    manifest: ManifestOption = None,
-    robot: RobotOption = None,
-    workers: WorkersOption = 0,
-    scheduler: SchedulerOption = "",
-    patience: PatienceOption = 60.0,
 ) -> None:
     """Say of every bag what its fitness, its clocks and its losses are, as one table.
 
@@ -84,39 +78,43 @@ def check(
     from bags.commands.progress import progress_bar
     from bags.fleet.bags import UNREAD, named_bags
     from bags.fleet.check import BAD, SERIOUS, check_fleet, write_parquet
-    from bags.fleet.workers import Workers
 
     settings = load_config(config_of(folder, config))
-    named = named_bags(bags, patience=patience)
+    named = named_bags(bags, patience=fleet.patience)
+    _say_misspelt(named, settings)
     with progress_bar("checking") as progress:
         found = check_fleet(
-            named,
-            settings,
-            workers=Workers(workers, scheduler),
-            manifest=manifest,
-            folder=robot,
-            progress=progress,
+            named, settings, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
         )
     if table is not None:
         write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
-    _say_counts(len(found.rows), found.known, manifest, [(counts[v], v) for v in SERIOUS])
+    _say_counts(len(found.rows), found.known, fleet.manifest, [(counts[v], v) for v in SERIOUS])
     wrong = [row for verdict in SERIOUS[:-1] for row in found.rows if row.verdict == verdict]
     if wrong:
-        console.print(_checked_table(wrong[:ROWS]))
+        out.print(_checked_table(wrong[:ROWS]))
     if more := wrong[ROWS:]:
         left = Counter(row.verdict for row in more)
         said = ", ".join(f"{count} {verdict}" for verdict, count in left.items())
-        console.print(f"and {len(more)} more ({said}); --out writes all of them")
+        out.print(f"and {len(more)} more ({said}); --out writes all of them")
     if found.still:
-        console.print(
+        out.print(
             "no command moves in any bag that can be used: there is little to identify from",
             soft_wrap=True,
         )
     if table is not None:
-        console.print(f"wrote {table}", soft_wrap=True)
+        out.print(f"wrote {table}", soft_wrap=True)
     if counts[BAD] or counts[UNREAD]:
         raise typer.Exit(1 if counts[BAD] else 2)
+
+
+def _say_misspelt(names: Iterable[str], settings: Config) -> None:
+    """Mind names in the split that are near a bag's: others may be of bags that lie elsewhere."""
+    from bags.chain.steps import absent_from, with_parts
+
+    for line in absent_from(with_parts(list(names), settings), settings):
+        if line.endswith("?"):  # it asks whether another was meant
+            out.print(f"mind: {line}", soft_wrap=True, markup=False, style="dark_orange3")
 
 
 def _checked_table(rows: Sequence[Checked]) -> Table:
@@ -135,18 +133,15 @@ def _checked_table(rows: Sequence[Checked]) -> Table:
 
 
 @fleet_app.command()
+@flat
 def monitor(
     folder: DesignArgument,
     bags: BagsArgument,
+    fleet: Fleet,
     config: ConfigOption = None,
     table: Annotated[
         Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
     ] = None,
-    manifest: ManifestOption = None,
-    robot: RobotOption = None,
-    workers: WorkersOption = 0,
-    scheduler: SchedulerOption = "",
-    patience: PatienceOption = 60.0,
 ) -> None:
     """Hold every bag against one proved design: which robots, which days, which assumption.
 
@@ -159,40 +154,40 @@ def monitor(
     from bags.designs import documents
     from bags.fleet.bags import COPY, named_bags
     from bags.fleet.check import write_parquet
-    from bags.fleet.monitor import monitor_fleet
-    from bags.fleet.workers import Workers
+    from bags.fleet.monitor import JudgeBag, calibration_spent, monitor_fleet
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
 
-    settings, funnel = settings_if_any(folder, config), documents.funnel_of(folder)
-    proved = documents.load_proved(funnel)
-    named = named_bags(bags, patience=patience)
+    settings = settings_if_any(folder, config)
+    design = documents.load(folder)
+    definitions = read_definitions(settings.definitions if settings else ())
+    task = JudgeBag(design, show.centre_of(settings), definitions)
+    named = named_bags(bags, patience=fleet.patience)
+    if settings is not None:
+        _say_misspelt(named, settings)
     with progress_bar("judging") as progress:
         found = monitor_fleet(
             named,
-            funnel,
-            proved,
-            centre=show.centre_of(settings),
-            definitions=read_definitions(settings.definitions if settings else ()),
-            workers=Workers(workers, scheduler),
-            manifest=manifest,
-            folder=robot,
+            task,
+            calibration_spent(folder, design),
+            workers=fleet.workers(),
+            manifest=fleet.manifest,
             progress=progress,
         )
     if table is not None:
         write_parquet(found.rows, table)
-    _say_verdicts(found, manifest, table)
+    _say_verdicts(found, fleet.manifest, table)
     if found.worst:
         worst = named[found.worst[0].bag]
         centre = f" --config {config}" if config else ""
-        console.print(
+        out.print(
             f"look at the first: nlsid view {folder} {worst}{centre}",
             soft_wrap=True,
             markup=False,
             highlight=False,
         )
     if table is not None:
-        console.print(f"wrote {table}", soft_wrap=True)
+        out.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows} - {COPY}
     if verdicts & {Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value} or any(
         row.alarm for row in found.rows
@@ -209,43 +204,40 @@ def _say_verdicts(found: FleetVerdict, manifest: Path | None, table: Path | None
     words = [word for word in _VERDICTS if counts[word]]
     _say_counts(len(found.rows), found.known, manifest, [(counts[word], word) for word in words])
     if own := found.own:
-        console.print(
-            f"{own} of them made the design: a verdict on these says little", soft_wrap=True
-        )
+        out.print(f"{own} of them made the design: a verdict on these says little", soft_wrap=True)
     for key, title in (("robot", "robots"), ("day", "days")):
         _say_groups(title, found.by(key), words, table)
     for what, count in Counter(r.assumption for r in found.rows if r.assumption).most_common():
-        console.print(f"broken in {_bags(count)}: {what}", soft_wrap=True, markup=False)
+        out.print(f"broken in {_bags(count)}: {what}", soft_wrap=True, markup=False)
     if most := max(found.histogram):
-        console.print("bags by how much of what is assumed they spent:")
+        out.print("bags by how much of what is assumed they spent:")
         for k, count in enumerate(found.histogram):
             label = f"{10 * k} to {10 * k + 10} %" if k < 10 else "over 100 %"
-            console.print(f"{label:>12} {count:6d} {'#' * math.ceil(40 * count / most)}".rstrip())
+            out.print(f"{label:>12} {count:6d} {'#' * math.ceil(40 * count / most)}".rstrip())
     if found.worst:
         _say_worst(found.worst)
     for line in found.ranks:
-        console.print(line, soft_wrap=True, highlight=False)
+        out.print(line, soft_wrap=True, highlight=False)
     if found.ranks and found.unrecognised:
-        console.print(
+        out.print(
             "none of these is known to be a bag that the design was made with. Those count above "
             "if they are here, read from elsewhere than for the design",
             soft_wrap=True,
         )
     drift = found.drift
     said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
-    console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
-    say_bags(
-        console,
+    out.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
+    _say_bags(
         "outside, or what is assumed broken",
         {r.bag: _since(r) for r in found.rows if r.verdict in BROKEN},
     )
-    say_bags(console, "not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
-    say_bags(console, "clock", {r.bag: r.clock for r in found.rows if r.clock})
+    _say_bags("not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
+    _say_bags("clock", {r.bag: r.clock for r in found.rows if r.clock})
     alarms = {r.bag: r.alarm for r in found.rows if r.alarm and r.verdict not in BROKEN}
-    say_bags(console, "only the second alarm", alarms)
+    _say_bags("only the second alarm", alarms)
     for verdict, title in ((UNREAD, UNREAD), (COPY, "copies")):
         said_of = {row.bag: row.reason for row in found.rows if row.verdict == verdict}
-        say_bags(console, title, said_of)
+        _say_bags(title, said_of)
 
 
 BROKEN = ("outside", "assumption violated")
@@ -269,7 +261,7 @@ def _say_groups(
         return  # the bags' names have no folders
     troubled = {name: rows for name, rows in groups.items() if trouble_in(rows)}
     named = [name for name in troubled if name]  # the others are listed as not read
-    console.print(f"{title} with trouble: {len(named)} of {len(set(groups) - {''})}")
+    out.print(f"{title} with trouble: {len(named)} of {len(set(groups) - {''})}")
     if not named:
         return
     shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
@@ -281,17 +273,17 @@ def _say_groups(
         counts = Counter(row.verdict for row in rows)
         cells = (str(counts[word] or "") for word in words)
         shown.add_row(_plain(name), str(len(rows)), *cells)
-    console.print(shown)
+    out.print(shown)
     if (more := len(named) - ROWS) > 0:
         rest = "--out writes every bag" if table is None else f"every bag is in {table}"
-        console.print(f"and {more} more {title} with trouble, none with more; {rest}")
+        out.print(f"and {more} more {title} with trouble, none with more; {rest}")
 
 
 def _say_worst(worst: Sequence[Judged]) -> None:
     from bags.fleet.monitor import in_percent
 
     count = f"the {len(worst)} bags that" if len(worst) > 1 else "the bag that"
-    console.print(f"{count} spent the most, and when:")
+    out.print(f"{count} spent the most, and when:")
     shown = _table(worst)
     for column, justify in (
         ("spent", "right"),
@@ -312,7 +304,7 @@ def _say_worst(worst: Sequence[Judged]) -> None:
             f"{row.bad_at:.3f} s" if row.bad_from else "-",
             "-" if row.margin is None else f"{row.margin:.3f}",
         )
-    console.print(shown)
+    out.print(shown)
 
 
 def _table(rows: Sequence[Checked | Judged]) -> Table:
@@ -342,9 +334,9 @@ def _say_counts(
 ) -> None:
     """How many there are of each verdict, and how many were known from a run before."""
     said = ", ".join(f"{n} {'copies' if word == 'copy' and n != 1 else word}" for n, word in counts)
-    console.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
+    out.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
     if manifest is not None:
-        console.print(
+        out.print(
             f"{known} of them known from {manifest}, {count - known} asked of now",
             soft_wrap=True,
             markup=False,
@@ -352,76 +344,8 @@ def _say_counts(
         )
 
 
-def identify(
-    out: Console, bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading
-) -> None:
-    """Read by workers, identify at home, say what was left out and why."""
-    from bags.chain.steps import identify_trials
-    from bags.commands import show
-    from bags.commands.progress import progress_bar
-
-    found = _read(out, bags, config, out_dir, reading)
-    with progress_bar("identifying") as progress:
-        identified = identify_trials(found.trials, config, out_dir, progress=progress)
-    show.say_identified(out, identified)
-
-
-def select(
-    out: Console,
-    bags: Sequence[Path],
-    config: Config,
-    out_dir: Path,
-    reading: Reading,
-) -> None:
-    """Read by workers, which then try the combinations; say what was left out and why."""
-    from bags.chain.choosing import sections_to_try, select_trials
-    from bags.commands import show
-    from bags.commands.progress import progress_bar
-
-    sections_to_try(config, None)
-    found = _read(out, bags, config, out_dir, reading)
-    with progress_bar("selecting") as progress, reading.workers.sharing() as executor:
-        result = select_trials(
-            found.trials,
-            config,
-            out_dir,
-            executor=executor,
-            progress=progress,
-        )
-    show.say_selected(out, result)
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Who reads the bags, and how patiently."""
-
-    workers: Workers
-    strict: bool
-    patience: float
-
-
-def _read(
-    out: Console, bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading
-) -> FleetTrials:
-    """Read, and said what was: before anything is made of it, which may fail."""
-    from bags.commands.progress import progress_bar
-    from bags.fleet.bags import named_bags
-    from bags.fleet.trials import MANIFEST, read_fleet
-
-    with progress_bar("reading") as progress:
-        found = read_fleet(
-            named_bags(bags, patience=reading.patience),
-            config,
-            out_dir,
-            workers=reading.workers,
-            strict=reading.strict,
-            progress=progress,
-        )
-    _say_read(out, found, out_dir / MANIFEST)
-    return found
-
-
-def _say_read(out: Console, found: FleetTrials, manifest: Path) -> None:
+def say_read(found: FleetTrials, manifest: Path) -> None:
+    """How many bags are used, and which are not and why."""
     count, left_out = len(found.answers), len(found.left_out)
     out.print(
         f"{_bags(count)}: {count - left_out} used, {len(found.unread)} not read, "
@@ -436,7 +360,7 @@ def _say_read(out: Console, found: FleetTrials, manifest: Path) -> None:
         ("left out, not usable as configured", found.unusable),
         ("left out, copies", found.copies),
     ):
-        say_bags(out, title, bags)
+        _say_bags(title, bags)
 
 
 def _plain(text: str) -> str:
@@ -446,7 +370,7 @@ def _plain(text: str) -> str:
     )
 
 
-def say_bags(out: Console, title: str, said: Mapping[str, str]) -> None:
+def _say_bags(title: str, said: Mapping[str, str]) -> None:
     """Each of these bags, with what is said of it."""
     if said:
         out.print(f"{title}: {_bags(len(said))}")

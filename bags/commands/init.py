@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 
@@ -16,9 +17,8 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
 from bags.setup.candidates import Candidate, Found, look
 from bags.setup.proposal import Proposal
-from bags.setup.proposing import choose, propose
+from bags.setup.proposing import Chosen, choose, propose
 from bags.setup.written import yaml_text
-from bags.signals.expressions import parse_factors
 from bags.signals.reader import expanded
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.files import write_atomically
@@ -29,36 +29,21 @@ MANY = "BAGS"
 
 
 def run_init(
-    console: Console,
-    bags: Sequence[Path],
-    target: Path,
-    *,
-    responses: Sequence[str],
-    excitations: Sequence[str],
-    definitions: Sequence[Path],
-    robot: str,
-    yes: bool,
-    live: bool = False,
+    console: Console, bags: Sequence[Path], target: Path, given: Chosen, *, yes: bool
 ) -> Proposal:
     """Look, ask what is not said, try it on the bags, write the YAML; DataError if `target` exists.
 
-    Without a terminal what is not said has to be accepted by `yes`. live: the bag is a look at a
-    running robot and no trial.
+    Without a terminal what is not said has to be accepted by `yes`.
     """
     if target.exists():
-        raise DataError(f"{target} exists already; give another name, or remove it")
+        raise DataError(f"{target} exists already; give another folder, or remove it")
     folders = expand_bags(bags)
-    types = read_definitions(definitions)
+    types = read_definitions(given.definitions)
     console.print(f"looking into {len(folders)} bag{'s' * (len(folders) != 1)}", soft_wrap=True)
     found = look(folders, definitions=types)
     with Bag(folders[0], definitions=types) as bag:
         responses, excitations = (
-            [
-                element
-                for text in texts
-                for element in (expanded(bag, [text]) if "[*]" in text else [text])
-            ]
-            for texts in (responses, excitations)
+            _expanded(bag, texts) for texts in (given.responses, given.excitations)
         )
     asked = not yes and not (responses and excitations)
     if asked and not sys.stdin.isatty():
@@ -66,33 +51,45 @@ def run_init(
             "nobody is at a terminal to choose signals: name them with --response and "
             "--excitation, or take the likeliest ones with --yes"
         )
-    chosen_u = list(excitations)
-    chosen_y = list(responses)
+    chosen_u, chosen_y = excitations, responses
     if asked and not chosen_u:
         chosen_u = _ask(console, "What drives the robot?", found.commands(), found, ())
     if asked and not chosen_y:
         chosen_y = _ask(console, "What answers?", found.responses(chosen_u), found, chosen_u)
     chosen_y, chosen_u = choose(found, chosen_y, chosen_u)
+    chosen = replace(
+        given,
+        responses=tuple(chosen_y),
+        excitations=tuple(chosen_u),
+        named=(*responses, *excitations),
+    )
     proposal = propose(
         folders,
         found,
-        responses=chosen_y,
-        excitations=chosen_u,
-        robot=robot,
-        definitions=definitions,
-        types=types,
-        named=[*responses, *excitations],
+        chosen,
         widen=not excitations and not asked,
         alone=not (responses or asked),
     )
     if not yes:
         _settle(console, proposal)
-    if definitions:  # a configuration's paths are seen from where it is
+    if given.definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
-            os.path.relpath(path, target.parent) for path in definitions
+            os.path.relpath(path, target.parent) for path in given.definitions
         ]
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, yaml_text(proposal).encode())
+    _say(console, proposal, target, bags)
+    return proposal
+
+
+def _expanded(bag: Bag, texts: Sequence[str]) -> list[str]:
+    """The signals, one for each element where `[*]` means several."""
+    expand = [expanded(bag, [text]) if "[*]" in text else [text] for text in texts]
+    return [element for elements in expand for element in elements]
+
+
+def _say(console: Console, proposal: Proposal, target: Path, bags: Sequence[Path]) -> None:
+    """What was chosen and why, what to mind, and which commands come next."""
     roles = ("excitation", "response")
     taken = [signal["path"] for role in roles for signal in proposal.content["signals"][role]]
     for text in taken:
@@ -101,37 +98,16 @@ def run_init(
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
-    given = "TRIALS" if live else said_briefly(bags)
+    given, folder = said_briefly(bags), shlex.quote(str(target.parent))
     if given == MANY:
         console.print(f"  {MANY} stands for the {len(bags)} bags that you gave to init")
-    if live:
-        topics = dict.fromkeys(
-            factor.path.topic for text in taken for factor in parse_factors(text)
-        )
-        console.print(
-            "this was a look at the running robot: record trials of it (folder TRIALS), then run "
-            "init on them for their split, lags and ranges, or go on with these",
-            soft_wrap=True,
-            markup=False,
-        )
-        said = ", ".join(topics)
-        console.print(
-            f'  nlsid run record "topics:=[{said}]" bag:=TRIALS/trial_1',
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-    folder = shlex.quote(str(target.parent))
-    steps = [f"nlsid identify {folder} {given}"]
-    if "funnel" in proposal.content:
-        steps += [
-            f"nlsid funnel {folder}",
-            f"nlsid check {folder}",
-            f"nlsid monitor {folder} {given}",
-        ]
-    for step in steps:
+    for step in (
+        f"nlsid identify {folder} {given}",
+        f"nlsid funnel {folder}",
+        f"nlsid check {folder}",
+        f"nlsid monitor {folder} {given}",
+    ):
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
-    return proposal
 
 
 def _settle(console: Console, proposal: Proposal) -> None:

@@ -1,10 +1,18 @@
-"""Arguments, options and consoles that the verbs of `nlsid` share: each is written here once."""
+"""Arguments, options and consoles that the verbs of `nlsid` share: each is written here once.
+
+Options that belong together are a dataclass; `flat` gives a verb that takes one its fields as
+options of the command line.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
@@ -13,7 +21,8 @@ from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
-    from bags.designs.design import Wiring
+    from bags.fleet.workers import Workers
+    from nlsid_core.designs import Wiring
 
 CONFIG = "robot.yaml"  # of a design's folder
 
@@ -50,15 +59,6 @@ BagArgument = Annotated[
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="The robot's YAML; default robot.yaml in DIR.")
 ]
-ResponseOption = Annotated[
-    list[str] | None,
-    typer.Option("--response", "-y", help="topic:field of what is measured; repeat."),
-]
-ExcitationOption = Annotated[
-    list[str] | None,
-    typer.Option("--excitation", "-u", help="topic:field of what drives the robot; repeat."),
-]
-PeriodOption = Annotated[float, typer.Option("--period", min=0.0, help="s between samples.")]
 ClockOption = Annotated[
     Clock, typer.Option("--clock", help="The signals' stamps: their header's, or of logging.")
 ]
@@ -70,15 +70,55 @@ DefinitionsOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
-WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Processes that share the work; 0: this one.")
-]
-SchedulerOption = Annotated[
-    str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
-]
-StrictOption = Annotated[
-    bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
-]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Which numbers are measured, and which drive the robot."""
+
+    response: Annotated[
+        list[str] | None,
+        typer.Option("--response", "-y", help="topic:field of what is measured; repeat."),
+    ] = None
+    excitation: Annotated[
+        list[str] | None,
+        typer.Option("--excitation", "-u", help="topic:field of what drives the robot; repeat."),
+    ] = None
+
+
+@dataclass(frozen=True)
+class Wired(Signals):
+    """Where state and inputs of given equations are."""
+
+    period: Annotated[
+        float, typer.Option("--period", min=0.0, help="s between samples, of given equations.")
+    ] = 0.0
+
+    def wiring(self) -> Wiring | None:
+        """The same as a design takes it; None if nothing was given."""
+        from bags.designs.wiring import wiring_of
+
+        return wiring_of(self.response, self.excitation, self.period)
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """Who shares the work."""
+
+    count: Annotated[
+        int, typer.Option("--workers", min=0, help="Processes that share the work; 0: this one.")
+    ] = 0
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
+    ] = ""
+
+    def workers(self) -> Workers:
+        """The same as the fleet takes it."""
+        from bags.fleet.workers import Workers
+
+        return Workers(self.count, self.scheduler)
+
+
 PatienceOption = Annotated[
     float,
     typer.Option(
@@ -87,6 +127,32 @@ PatienceOption = Annotated[
         help="Seconds that a bag may lose with failing requests before it is left out.",
     ),
 ]
+
+
+def flat(verb: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a verb: each field of a dataclass that it takes is an option of its own."""
+    hints = get_type_hints(verb, include_extras=True)
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    parameters: list[Parameter] = []
+    for given in signature(verb).parameters.values():
+        kind = groups.get(given.name)
+        types = hints if kind is None else get_type_hints(kind, include_extras=True)
+        inside = [given] if kind is None else signature(kind).parameters.values()
+        parameters += [
+            each.replace(annotation=types[each.name], kind=Parameter.KEYWORD_ONLY)
+            for each in inside
+        ]
+
+    @wraps(verb)
+    def command(**values: Any) -> None:
+        for name, kind in groups.items():
+            own = {field.name: values.pop(field.name) for field in fields(kind)}
+            values[name] = kind(**own)
+        verb(**values)
+
+    command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    return command
 
 
 def config_of(folder: Path, given: Path | None) -> Path:
@@ -111,12 +177,3 @@ def settings_if_any(folder: Path, given: Path | None) -> Config | None:
     if (given is None and not path.is_file()) or is_tracking(path):
         return None
     return load_config(path)
-
-
-def wiring_of(
-    responses: list[str] | None, excitations: list[str] | None, period: float
-) -> Wiring | None:
-    """Where the state and the input of a continuous funnel are; None if nothing was given."""
-    from bags.designs.design import Wiring
-
-    return Wiring.parse_if_any(responses or [], excitations or [], period)

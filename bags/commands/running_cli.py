@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,36 +18,34 @@ from bags.commands.options import (
     ConfigOption,
     DefinitionsOption,
     DesignArgument,
-    ExcitationOption,
     JsonOption,
-    PeriodOption,
-    ResponseOption,
+    Wired,
     err,
     out,
     settings_if_any,
-    wiring_of,
 )
-from bags.commands.progress import progress_bar
+
+
+@dataclass(frozen=True)
+class Judging:
+    """Which bags are judged, and where it is written."""
+
+    every: Annotated[
+        bool, typer.Option("--all", help="Judge the bags too that the design was made with.")
+    ] = False
+    definitions: DefinitionsOption = None
+    picture: Annotated[
+        Path | None, typer.Option("--out", help="The picture; default DIR/monitor.png.")
+    ] = None
+    as_json: JsonOption = False
 
 
 def monitor(
     folder: DesignArgument,
     bags: BagsArgument,
+    judging: Judging,
+    wired: Wired,
     config: ConfigOption = None,
-    every: Annotated[
-        bool, typer.Option("--all", help="Judge the bags too that the design was made with.")
-    ] = False,
-    definitions: DefinitionsOption = None,
-    picture: Annotated[
-        Path | None, typer.Option("--out", help="The picture; default DIR/monitor.png.")
-    ] = None,
-    forecast: Annotated[
-        float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
-    ] = 0.0,
-    response: ResponseOption = None,
-    excitation: ExcitationOption = None,
-    period: PeriodOption = 0.0,
-    as_json: JsonOption = False,
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
@@ -59,48 +57,28 @@ def monitor(
     from bags.commands import show
     from bags.designs import documents
     from bags.fleet.monitor import judged_of
-    from bags.monitoring.replay import replay_bag, to_judge
-    from bags.pictures.report import report_available, write_margins
-    from bags.recordings.definitions import read_definitions
+    from bags.pictures.report import drawable, write_margins
     from bags.recordings.folders import expand_bags
 
     settings = settings_if_any(folder, config)
-    wiring = wiring_of(response, excitation, period)
-    proved = documents.load_proved(documents.funnel_of(folder), wiring=wiring)
+    design = documents.load(folder, wiring=wired.wiring())
     folders = expand_bags(bags)
-    if settings is not None and not every:
-        chosen = to_judge(proved.design, folders, validation=settings.split.validation)
+    if settings is not None and not judging.every:
+        chosen = show.chosen_bags(design, folders, settings)
         folders = list(chosen.judged)
         for line in chosen.said:
             err.print(f"{line}; with --all these are judged too", soft_wrap=True, markup=False)
-    types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
-    centre = show.centre_of(settings)
-    with progress_bar("replaying") as progress:
-        replays = []
-        for done, bag in enumerate(folders):
-            progress(bag.name, done / len(folders))
-            replays.append(
-                replay_bag(proved, bag, centre=centre, definitions=types, forecast=forecast)
-            )
-        progress("drawing", 1.0)
-        target = picture or folder / documents.MARGIN_PLOT
-        is_judged = any(entry.judged for entry in replays)
-        drawn = report_available() and is_judged and all(entry.half_width for entry in replays)
-        if drawn:
-            write_margins(target, replays)
-    if as_json:
+    replays = show.replayed(design, folders, settings, judging.definitions or ())
+    target = judging.picture or folder / documents.MARGIN_PLOT
+    if drawable(replays):
+        write_margins(target, replays)
+    if judging.as_json:
         pairs = zip(replays, folders, strict=True)
         typer.echo(json.dumps([asdict(judged_of(entry, bag, entry.name)) for entry, bag in pairs]))
     else:
-        out.print(show.replay_table(replays))
-    for entry in [] if as_json else replays:
-        seen = show.forecasts(entry, proved.design) if forecast else ()
-        for line in (*seen, *show.replay_lines(entry)):
-            out.print(line, soft_wrap=True, markup=False, highlight=False)
-    for line in () if as_json else show.paced_lines(replays):
-        out.print(line, soft_wrap=True, markup=False, highlight=False)
-    if drawn and not as_json:
-        out.print(f"wrote {target}", soft_wrap=True)
+        show.say_replays(out, replays)
+        if drawable(replays):
+            out.print(f"wrote {target}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)
     if any(entry.unjudged or not entry.judged for entry in replays):
@@ -154,31 +132,36 @@ def _refuse_without_rclpy() -> None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
 
 
+@dataclass(frozen=True)
+class Serving:
+    """Where the page is served, and what is on it."""
+
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
+    ] = "127.0.0.1"
+    port: Annotated[int, typer.Option(help="Port; 0: one that is free.", min=0, max=65535)] = 8080
+    monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor"
+    rate: Annotated[
+        float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
+    ] = 1.0
+
+
 def view(
+    serving: Serving,
+    wired: Wired,
     folder: Annotated[
         Path | None,
         typer.Argument(metavar="[DIR]", help="A recording's design; none: the live robot."),
     ] = None,
     bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="What is replayed.")] = None,
     config: ConfigOption = None,
-    host: Annotated[
-        str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port; 0: one that is free.", min=0, max=65535)] = 8080,
-    monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
-    rate: Annotated[
-        float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
-    ] = 1.0,
-    response: ResponseOption = None,
-    excitation: ExcitationOption = None,
-    period: PeriodOption = 0.0,
 ) -> None:
     """Serve a page of tube, signals, margin and events, live or of a recording, until Ctrl-C."""
     from bags.commands.viewing import view_live, view_recording
 
     if folder is None:
         _refuse_without_rclpy()
-        raise typer.Exit(view_live(monitor, host=host, port=port))
+        raise typer.Exit(view_live(serving.monitor, host=serving.host, port=serving.port))
     if bag is None:
         raise typer.BadParameter("give a recording that is held against the design, or neither")
     from bags.commands import show
@@ -186,9 +169,9 @@ def view(
     from bags.viewing.replay import Recording
 
     centre = show.centre_of(settings_if_any(folder, config))
-    wiring = wiring_of(response, excitation, period)
-    proved = documents.load_proved(documents.funnel_of(folder), wiring=wiring)
-    view_recording(Recording(proved, bag, centre=centre), rate, host=host, port=port)
+    design = documents.load(folder, wiring=wired.wiring())
+    recording = Recording(design, bag, centre=centre)
+    view_recording(recording, serving.rate, host=serving.host, port=serving.port)
 
 
 def demo(
@@ -207,13 +190,7 @@ def demo(
 
     Of a simulated robot: bags, model, policy, runs that measure the disturbance, funnel, monitor.
     """
-    from bags.commands.demo import DEMOS, run_demo
+    from bags.commands.demo import run_demo
 
-    if robot in DEMOS:
-        came_out = run_demo(out_dir, out, robot)
-    else:
-        from bags.commands import track
-
-        came_out = track.demo(robot, out_dir)
-    if not came_out:
+    if not run_demo(out_dir, out, robot):
         raise typer.Exit(1)

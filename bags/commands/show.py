@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
@@ -13,19 +14,20 @@ from rich.text import Text
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
+from bags.commands.progress import progress_bar
 from bags.designs import documents
-from bags.designs.design import AnyDesign
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
-from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
-from bags.monitoring.replay import Replay
+from bags.monitoring.catching import Breaking, Catching, Caught
+from bags.monitoring.replay import Replay, ToJudge, replay_bag, to_judge
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.recordings.definitions import read_definitions
 from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
-from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import DataError, duration, percent
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.kernel import text
@@ -276,10 +278,11 @@ def warn(console: Console, line: str) -> None:
     )
 
 
-def say_catching(console: Console, catching: Catching, require: float | None) -> None:
+def say_catching(console: Console, catching: Catching) -> None:
     """The widths, the table, and what is to be known of a tube that is too wide."""
-    for line in width_lines(catching):
-        console.print(line, soft_wrap=True, highlight=False)
+    for width in catching.widths:
+        said = f"half-width of {width.name}: {width.said}, {width.part}"
+        console.print(said, soft_wrap=True, highlight=False)
     console.print(catching_table(catching))
     for row in catching.rows:
         if row.refused:
@@ -296,11 +299,8 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
         )
     for line in (*catching.beyond, *catching.still):
         warn(console, line)
-    wide = catching.warnings(WIDE if require is None else require)
-    for line in wide:
-        word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
-        said = f"{word}{line}"
-        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+    for line in catching.warnings():
+        warn(console, line)
 
 
 def breaking_table(found: Breaking) -> Table:
@@ -313,28 +313,45 @@ def breaking_table(found: Breaking) -> Table:
     return table
 
 
-def width_lines(catching: Catching) -> list[str]:
-    """Every output's half-width beside its range."""
-    return [f"half-width of {width.name}: {width.said}, {width.part}" for width in catching.widths]
+def chosen_bags(design: AnyDesign, bags: Sequence[Path], settings: Config | None) -> ToJudge:
+    """Those of the bags that the design was not made with, else all of them."""
+    return to_judge(design, bags, validation=settings.split.validation if settings else ())
 
 
-def forecasts(replay: Replay, design: AnyDesign) -> Iterator[str]:
-    """How many outputs were as forecast, and how wide the forecasts are at their ends."""
-    ends = [fan[-1] for fan in replay.fans if len(fan) > 1]
-    if not ends:
-        yield f"{replay.name}: no forecast was made"
-        return
-    kept = [entry.kept for entry in replay.forecasts if entry.ahead]
-    longest = max(entry.ahead for entry in ends)
-    whole = [entry for entry in ends if entry.ahead == longest]
-    yield (
-        f"{replay.name}: {len(ends)} forecasts, under the commands that came, hold "
-        f"{sum(kept)} of {len(kept)} samples that they reach, of {len(replay.readings)} in all; "
-        f"half-width after {longest:.3g} s:"
-    )
-    for i, name in enumerate(signal_names(design)):
-        halves = [(entry.high[i] - entry.low[i]) / 2.0 for entry in whole]
-        yield f"  {name}: {sum(halves) / len(halves):.3g} on average, at most {max(halves):.3g}"
+def replayed(
+    design: AnyDesign,
+    bags: Sequence[Path],
+    settings: Config | None,
+    definitions: Sequence[Path] = (),
+) -> list[Replay]:
+    """Each bag held against the design, as the configuration says."""
+    configured = settings.definitions if settings else ()
+    types = read_definitions([*definitions, *configured])
+    replays = []
+    with progress_bar("replaying") as progress:
+        for done, bag in enumerate(bags):
+            progress(bag.name, done / len(bags))
+            replays.append(replay_bag(design, bag, centre=centre_of(settings), definitions=types))
+    return replays
+
+
+def say_replays(console: Console, replays: Sequence[Replay]) -> None:
+    """The table, and what is to be known of each bag."""
+    console.print(replay_table(replays))
+    lines = [line for replay in replays for line in replay_lines(replay)]
+    for line in (*lines, *paced_lines(replays)):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def draw_tube(folder: Path, design: AnyDesign) -> list[Path]:
+    """Draw the tube around a motion into the design's folder; the files written."""
+    if not report_available():
+        return []
+    from bags.pictures.tubes import write_tube
+
+    picture = folder / documents.FUNNEL_PLOT
+    write_tube(picture, design)
+    return [picture]
 
 
 def replay_lines(replay: Replay) -> Iterator[str]:
@@ -383,7 +400,8 @@ def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
 def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample.
 
-    COLUMNS wide or less: where a row is longer, its words go on in the next line, numbers never.
+    COLUMNS wide or less: where a row is longer it goes on in the next line between words; numbers
+    never do.
     """
     table = Table(
         title="held against the funnel",
@@ -401,7 +419,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     widths = [max(len(Text.from_markup(cell)) for cell in column) for column in cells]
     kept = dict(zip(names, widths, strict=True))
     if sum(widths) + len(widths) > COLUMNS:
-        kept |= {"verdict": 10, "axis": min(kept["axis"], 10), "judged": 8}
+        words = [word for row in rows for word in row[names.index("axis")].split()]
+        kept |= {"verdict": 10, "axis": max(4, *map(len, words)), "judged": 8}
         kept["bag"] = max(COLUMNS + kept["bag"] - sum(kept.values()) - len(kept), 8)
     for name in names:
         left = name in ("bag", "verdict", "axis")
@@ -434,25 +453,6 @@ def _percent(part: float) -> str:
     if math.isnan(part):
         return "not measured"
     return f"{100 * part:.0f} %" if part < MOST_SAID else f"> {100 * MOST_SAID:.0f} %"
-
-
-def caught_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag that should be caught: verdict, first bad sample, assumption used."""
-    table = Table(title="the same trials with a broken sensor", title_justify="left")
-    table.add_column("bag", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    table.add_column("bad from", justify="right", no_wrap=True)
-    table.add_column("assumption", justify="right", no_wrap=True)
-    for replay in replays:
-        bad = replay.first_bad
-        colour = COLOURS[replay.verdict]
-        table.add_row(
-            replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]",
-            "-" if bad is None else f"{bad.t:.3f} s",
-            _percent(replay.assumption),
-        )
-    return table
 
 
 def centre_of(settings: Config | None) -> Centre:

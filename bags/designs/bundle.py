@@ -9,16 +9,27 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from bags.designs.design import AnyDesign, Wiring, read_design
 from bags.designs.provenance import of_funnel
 from nlsid_core import designs, files
 from nlsid_core.arrays import Json
 from nlsid_core.deciding import USUAL, Deciding, Limits
+from nlsid_core.designs import AnyDesign, Design, Wiring
+from nlsid_core.documents import read
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.files import read_regular
+from nlsid_core.models import StableModel
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.running.monitor import refuse_mismatch
 
 FORMAT: Final = "nlsid/bundle"
 PROOF: Final = "proof"  # the role of the file that names the others
@@ -120,17 +131,18 @@ class Bundle:
                 f"{', '.join(sorted(found))}"
             )
 
-    def design(self, wiring: Wiring | None = None) -> AnyDesign:
+    def design(self, wiring: Wiring | None = None, decision: Verdict | None = None) -> AnyDesign:
         """The files as what a robot runs; decides nothing.
 
-        Raises DocumentError or CertificateMismatch if they are not a design.
+        wiring: of a continuous funnel.
+        decision: what the kernel said of these files, if it was asked.
+
+        Raises DocumentError or CertificateMismatch if they are not a design, DataError if samples
+        come less often than is proved, CertificateRejected if what was measured contradicts it.
         """
+        proof = files.parse_document(self.contents.get(PROOF, b"{}"), source=PROOF)
         if not self._stages:
-            return _design(
-                {r: c for r, c in self.contents.items() if r != PROOF},
-                self.contents.get(PROOF, b"{}"),
-                wiring,
-            )
+            return _design(self.contents, proof, wiring, decision)
         stages = []
         for stage in self._stages:
             parts = {
@@ -138,10 +150,9 @@ class Bundle:
                 for role, content in self.contents.items()
                 if role.startswith(f"{stage}.")
             }
-            stages.append(_design(parts, self.contents[stage], wiring))
-        first: Any = stages[0]
-        made: AnyDesign = replace(first, later=tuple(stages[1:]), composition=self.digest)
-        return made
+            own = files.parse_document(self.contents[stage], source=stage)
+            stages.append(_design(parts, own, wiring, None))
+        return replace(stages[0], certificate=proof, decision=decision, parts=tuple(stages))
 
 
 class Check:
@@ -184,14 +195,34 @@ class Check:
             self._deciding.close()
 
 
-def _design(parts: Mapping[str, bytes], proof: bytes, wiring: Wiring | None) -> AnyDesign:
-    documents = {
-        "model" if role == "vector_field" else role: files.parse_document(content, source=role)
-        for role, content in parts.items()
+# What goes with a funnel of each kind: a policy of which type (None: or none), and which models.
+KINDS: Final[Mapping[type, tuple[tuple[type, ...], tuple[type, ...]]]] = {
+    TubeFunnel: ((TubePolicy, type(None)), get_args(StableModel)),
+    SampledFunnel: ((SampledPolicy,), get_args(MeasuredState)),
+    ContinuousFunnel: ((ContinuousPolicy,), (VectorField,)),
+}
+
+
+def _design(
+    contents: Mapping[str, bytes], proof: Json, wiring: Wiring | None, decision: Verdict | None
+) -> AnyDesign:
+    """The design of these files by role."""
+    parts = {
+        role: files.parse_document(content, source=role)
+        for role, content in contents.items()
+        if role != PROOF
     }
-    claim = files.parse_document(proof, source=PROOF).get("claim")
-    design = read_design(documents, wiring=wiring, claim=claim)
-    if wrong := of_funnel(documents["model"], documents["funnel"]).wrong:
+    nouns: dict[str, Any] = {role: read(part, source=role) for role, part in parts.items()}
+    model = nouns.pop("vector_field" if "vector_field" in nouns else "model", None)
+    policy, funnel = nouns.pop("policy", None), nouns.pop("funnel", None)
+    policies, models = KINDS.get(type(funnel), ((), ()))
+    if nouns or type(policy) not in policies or type(model) not in models:
+        raise DocumentError(f"{', '.join(parts)}: these files are no design of one funnel")
+    refuse_mismatch(model, policy, funnel)
+    design = Design(model, policy, funnel, proof, decision, None, wiring)
+    if wiring is not None:
+        design.held.refuse(wiring.period)
+    if wrong := of_funnel(model.document(), funnel.document()).wrong:
         raise CertificateRejected(f"what was measured contradicts the design: {'; '.join(wrong)}")
     return design
 

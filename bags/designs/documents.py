@@ -1,20 +1,15 @@
-"""The files of one design folder, by name, and reading them back as nouns."""
+"""The files of one design folder, by name, and reading them back."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast, get_args
+from typing import Any, get_args
 
 from bags.designs.bundle import Bundle
-from bags.designs.design import AnyDesign, SampledDesign, WiredDesign, WiredTube, Wiring
 from nlsid_core import designs, files
-from nlsid_core.documents import load
+from nlsid_core.designs import AnyDesign, Design, Wiring
+from nlsid_core.documents import load as load_noun
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
-from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.protocol import AnyPolicy, read_policy
 from nlsid_core.running.monitor import refuse_mismatch
 
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
@@ -31,79 +26,51 @@ MARGIN_PLOT = "monitor.png"
 FUNNEL_PLOT = "funnel.png"
 CATCHING_PLOT = "catching.png"
 FREE_RUN_PLOT = "free_run.png"
-MOTION_PLOT = "motion.png"
 PUSH = "push.json"  # what recordings differ from given equations by
 
 
-def load_stable_model(path: Path | str) -> StableModel:
-    """Read a model file of any class that tubes are proved for; DocumentError if it is none."""
-    model = load(path)
-    if not isinstance(model, get_args(StableModel)):
-        raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
-    found: StableModel = model
-    return found
+def load(path: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:
+    """The design in a folder, or that of a funnel's or a composition's file; its proof is decided.
 
+    wiring: of a continuous funnel, where its signals are.
 
-D_co = TypeVar("D_co", covariant=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Proved(Generic[D_co]):
-    """A design whose proof was checked when it was loaded."""
-
-    design: D_co
-    verdict: Verdict
-
-
-def load_model(path: Path | str) -> DifferenceEquation:
-    """Read a model file; DocumentError says what is wrong with it."""
+    Raises CertificateRejected if the proof proves nothing or what was measured contradicts it,
+    CertificateMismatch if a file is another than the proof is about, DocumentError if it is not the
+    proof of a funnel. OS errors for funnel and proof pass through.
+    """
     path = Path(path)
-    return DifferenceEquation.from_document(files.load_document(path), source=str(path))
+    bundle = Bundle.load(funnel_of(path) if path.is_dir() else path)
+    return bundle.design(wiring, bundle.decided())
 
 
 def funnel_of(folder: Path) -> Path:
-    """What `load_proved` reads in a design folder: a proof of several funnels, or its funnel."""
+    """What `load` reads in a design folder: a proof of several funnels, or its funnel."""
     several = folder / designs.COMPOSITION
     return several if several.is_file() else folder / FUNNEL
 
 
-def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:
-    """Read a funnel with the model, policy and proof beside it, and check the proof.
-
-    Of a continuous funnel the vector field is read in the place of the model. Raises
-    CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
-    """
-    bundle = Bundle.load(path)
-    verdict = bundle.decided()
-    return Proved(bundle.design(wiring), verdict)
-
-
-def load_unproved(
-    folder: Path | str, *, wiring: Wiring | None = None
-) -> WiredDesign[Any, AnyPolicy, None]:
+def load_unproved(folder: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:
     """policy.json in `folder` with its model or vector field: nothing is proved of it.
 
     Raises DocumentError if they are none, CertificateMismatch if they do not belong together.
     """
     folder = Path(folder)
-    policy = read_policy(files.load_document(folder / POLICY))
-    continuous = isinstance(policy, ContinuousPolicy)
-    model: Any = load(folder / (VECTOR_FIELD if continuous else MODEL))
+    policy: Any = load_noun(folder / POLICY)
+    is_continuous = isinstance(policy, ContinuousPolicy)
+    model: Any = load_noun(folder / (VECTOR_FIELD if is_continuous else MODEL))
     refuse_mismatch(model, policy, None)
-    return WiredDesign(model, policy, None, wiring)
+    return Design(model, policy, None, wiring=wiring)
 
 
-def load_proved_funnel(path: Path | str) -> Proved[WiredTube]:
-    """`load_proved` for a tube; DocumentError if it is another."""
-    proved: Proved[Any] = load_proved(path)
-    if not isinstance(proved.design.funnel, TubeFunnel):
-        raise DocumentError(f"{path}: not a tube; this reads tubes only")
-    return cast(Proved[WiredTube], proved)
+def load_model(path: Path | str) -> DifferenceEquation:
+    """Read the model of one linear equation; DocumentError says what is wrong with the file."""
+    return DifferenceEquation.from_document(files.load_document(Path(path)), source=str(path))
 
 
-def load_proved_tracking(path: Path | str) -> Proved[SampledDesign]:
-    """`load_proved` for a sampled funnel; DocumentError if it is another."""
-    proved: Proved[Any] = load_proved(path)
-    if not isinstance(proved.design.funnel, SampledFunnel):
-        raise DocumentError(f"{path}: not a sampled funnel; `nlsid monitor` reads tubes")
-    return cast(Proved[SampledDesign], proved)
+def load_stable_model(path: Path | str) -> StableModel:
+    """Read a model of any class that tubes are proved for; DocumentError if the file has none."""
+    model = load_noun(path)
+    if not isinstance(model, get_args(StableModel)):
+        raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
+    found: StableModel = model
+    return found

@@ -12,7 +12,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from nlsid_core import designs, files
+from bags.designs import documents
+from nlsid_core import files
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
@@ -165,7 +166,7 @@ def tolerances(folder: Path | str) -> Tolerances:
 
     Raises CertificateRejected if nothing is proved, DataError if its claim bounds no signal.
     """
-    design = designs.load_design(folder)
+    design = documents.load(folder)
     funnel: Any = design.funnel
     before_use = ""
     if isinstance(funnel, ContinuousFunnel):

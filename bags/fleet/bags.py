@@ -37,21 +37,15 @@ def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[
     return dict(sorted(found.items()))
 
 
-def robots_of(names: Iterable[str], folder: int | None = None) -> dict[str, str]:
+def robots_of(names: Iterable[str]) -> dict[str, str]:
     """Whose bag each is, by the folders in its name; `-` where there is no such folder.
 
-    folder: which of them, 1 the first, -1 the last. None: the first that is no date and not the
-    same for all bags, else the last that is no date. Raises DataError for folder 0.
+    It is the first folder that is no date and not the same for all bags, else the last no date.
     """
-    if folder == 0:
-        raise DataError("folders of a bag's name are counted from 1, or from the last: -1; not 0")
     parts = {name: name.split("/")[:-1] for name in names}
-    if folder is None:
-        named = [depth for depth, is_date in enumerate(_dates(parts)) if not is_date]
-        told = (d for d in named if len({_at(own, d) for own in parts.values()}) > 1)
-        at = next(told, named[-1] if named else None)
-    else:
-        at = folder - 1 if folder > 0 else folder
+    named = [depth for depth, is_date in enumerate(_dates(parts)) if not is_date]
+    told = (d for d in named if len({_at(own, d) for own in parts.values()}) > 1)
+    at = next(told, named[-1] if named else None)
     return {name: "-" if at is None else _at(own, at) for name, own in parts.items()}
 
 
@@ -66,7 +60,7 @@ def _dates(parts: Mapping[str, Sequence[str]]) -> list[bool]:
 
 
 def _at(folders: Sequence[str], depth: int) -> str:
-    return folders[depth] if -len(folders) <= depth < len(folders) else "-"
+    return folders[depth] if depth < len(folders) else "-"
 
 
 class Recordings:

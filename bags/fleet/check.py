@@ -163,14 +163,10 @@ def check_fleet(
     *,
     workers: Workers,
     manifest: Path | None = None,
-    folder: int | None = None,
     progress: Progress = silent,
 ) -> FleetCheck:
-    """A row a bag, in the order of `bags`; one that cannot be read is `not read`.
-
-    folder: of a bag's name, that says whose it is (`robots_of`).
-    """
-    robots, recordings = robots_of(bags, folder), Recordings()
+    """A row a bag, in the order of `bags`; one that cannot be read is `not read`."""
+    robots, recordings = robots_of(bags), Recordings()
     rows: list[Checked] = []
     known = 0
     with Manifest(manifest) as kept:

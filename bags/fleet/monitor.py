@@ -9,14 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from scipy.stats import mannwhitneyu
 
 from bags.chain.training import load_held_back, load_training
 from bags.designs import documents
-from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved
 from bags.fleet.bags import COPY, UNREAD, Recordings, robots_of, same_as
 from bags.fleet.check import iso
 from bags.fleet.manifest import Manifest
@@ -28,6 +25,7 @@ from bags.signals.reader import bag_origin
 from nlsid_core import files
 from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.progress import Progress, silent
 from nlsid_core.running.comparison import Centre
@@ -88,7 +86,7 @@ class Judged:
 class JudgeBag:
     """What `nlsid monitor` says of a bag, in a few numbers. The design was decided at home."""
 
-    proved: Proved[AnyDesign]
+    design: AnyDesign
     centre: Centre
     definitions: Definitions
 
@@ -96,13 +94,13 @@ class JudgeBag:
     def asked(self) -> str:
         """The design and what it is around."""
         types = texts_of(self.definitions)
-        wiring = hashlib.sha256(pickle.dumps(self.proved.design.wiring)).hexdigest()
-        digest = self.proved.design.digest
+        wiring = hashlib.sha256(pickle.dumps(self.design.wiring)).hexdigest()
+        digest = self.design.digest
         return f"judge {version('nlsid')} {digest} {self.centre} {wiring} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """A Judged, as JSON."""
-        replay = replay_bag(self.proved, bag, centre=self.centre, definitions=self.definitions)
+        replay = replay_bag(self.design, bag, centre=self.centre, definitions=self.definitions)
         return files.canonical(asdict(judged_of(replay, bag, name)))
 
 
@@ -269,39 +267,29 @@ def trouble_in(rows: Sequence[Judged]) -> int:
 
 def monitor_fleet(
     bags: Mapping[str, Path],
-    funnel: Path,
-    proved: Proved[AnyDesign],
+    task: JudgeBag,
+    calibration: Sequence[float],
     *,
-    centre: Centre,
-    definitions: Definitions,
     workers: Workers,
     manifest: Path | None = None,
-    folder: int | None = None,
     progress: Progress = silent,
 ) -> FleetVerdict:
     """Each bag as `nlsid monitor` judges it; one that cannot be read or judged is `not read`.
 
-    funnel: the file, beside which the trials of the calibration are looked for. folder: of a bag's
-    name, that says whose it is (`robots_of`).
+    calibration: what each trial that scaled the design spent (`calibration_spent`).
     """
-    task, robots, known = JudgeBag(proved, centre, definitions), robots_of(bags, folder), 0
-    rows = []
+    robots, known, rows = robots_of(bags), 0, []
     with Manifest(manifest) as kept:
         for answer in ask(task, bags, workers, kept, progress=progress):
             known += answer.kept
             row = (
                 Judged(answer.name, "", UNREAD, answer.reason)
                 if answer.reason
-                else Judged(**_document(answer.content))
+                else Judged(**json.loads(answer.content))
             )
             rows.append(replace(row, robot=robots[row.bag]))
-    design: Any = proved.design
-    return FleetVerdict(
-        tuple(counted_once(rows)),
-        calibration_spent(funnel, design),
-        frozenset(design.made_with),
-        known,
-    )
+    made_of = frozenset(task.design.made_with)
+    return FleetVerdict(tuple(counted_once(rows)), tuple(calibration), made_of, known)
 
 
 def counted_once(rows: Sequence[Judged]) -> list[Judged]:
@@ -316,23 +304,21 @@ def counted_once(rows: Sequence[Judged]) -> list[Judged]:
     return counted
 
 
-def calibration_spent(funnel: Path, design: AnyDesign) -> tuple[float, ...]:
+def calibration_spent(folder: Path, design: AnyDesign) -> tuple[float, ...]:
     """What each trial that scaled the design spends of what it assumes; empty if none is there.
 
-    They are found by their digests in training.npz and held_back.npz beside the funnel.
+    They are found by their digests in training.npz and held_back.npz in the design's folder.
     """
-    parts: Any = design
-    if not isinstance(parts.funnel, TubeFunnel):
+    if not isinstance(design.funnel, TubeFunnel):
         return ()
-    wanted = {digest for _, digest in parts.funnel.tubes[0].measured_on}
-    training = funnel.with_name(documents.TRAINING)
-    held_back = load_held_back(
-        funnel.with_name(documents.HELD_BACK), model=files.digest(parts.model.document())
-    )
+    wanted = {digest for _, digest in design.funnel.tubes[0].measured_on}
+    training = folder / documents.TRAINING
+    digest = files.digest(design.model.document())
+    held_back = load_held_back(folder / documents.HELD_BACK, model=digest)
     trials: list[Trajectory] = [trial for data in held_back.values() for trial in data]
     if training.exists():
-        trials += load_training(training, digest=parts.model.training)
-    monitor = Monitor(parts.model, parts.policy, parts.funnel, centre=Centre.COMMAND)
+        trials += load_training(training, digest=design.model.training)
+    monitor = design.monitor(Centre.COMMAND)
     own = [trial for trial in trials if recording(trial) in wanted]
     most = [most_spent(_readings(monitor, trial)) for trial in own]
     return tuple(reading.assumption for reading in most if reading is not None)
@@ -348,11 +334,6 @@ def _readings(monitor: Monitor, trial: Trajectory) -> list[Reading]:
         for t, y, u in samples
     ]
     return [reading for reading in said if reading.status is not Status.UNKNOWN]
-
-
-def _document(content: bytes) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(content)
-    return found
 
 
 def in_percent(part: float) -> str:

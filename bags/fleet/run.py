@@ -1,6 +1,5 @@
 """One task a bag, by whatever executor; what went wrong with a bag is an answer, not an end."""
 
-import time
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import (
@@ -42,7 +41,7 @@ class Answer:
     """Of one bag: content, or the reason why there is none.
 
     was_read: the reason is what the bag holds, not that it cannot be read. kept: it was in the
-    manifest. seconds; requests, fetched (bytes): what reading it took.
+    manifest. requests, fetched (bytes): what reading it took.
     """
 
     bag: Path
@@ -51,7 +50,6 @@ class Answer:
     reason: str = ""
     was_read: bool = False
     kept: bool = False
-    seconds: float = 0.0
     requests: int = 0
     fetched: int = 0
 
@@ -167,7 +165,6 @@ def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
     key: of the bag as it was listed. If it is another afterwards there is no answer: ranges of two
     files would be taken for one recording.
     """
-    started = time.monotonic()
     content, reason, was_read = b"", "", False
     again = bag.anew() if isinstance(bag, RemotePath) else bag
     try:
@@ -179,8 +176,7 @@ def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
     requests, fetched = map(sum, zip(_traffic(bag), _traffic(again), strict=True))
     if isinstance(bag, RemotePath):
         bag.forget()
-    seconds = time.monotonic() - started
-    return Answer(bag, name, content, reason, was_read, False, seconds, requests, fetched)
+    return Answer(bag, name, content, reason, was_read, False, requests, fetched)
 
 
 def is_of_content(error: BaseException) -> bool:

@@ -14,9 +14,11 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.kernel import text
 from nlsid_core.models import StableModel
+from nlsid_core.running.comparison import Centre
 from nlsid_core.running.detectors import DETECTORS, Detector, Residuals
 from nlsid_core.running.monitor import OVER, Monitor
 from nlsid_core.running.reading import Reading, Status
@@ -229,11 +231,6 @@ class Catching:
     remedy: str
 
     @property
-    def widest(self) -> Width:
-        """The output whose half-width is the largest part of its range."""
-        return max(self.widths, key=lambda width: width.share)
-
-    @property
     def beyond(self) -> list[str]:
         """What to know of a tube that follows the commands beyond the output's range."""
         return [
@@ -257,19 +254,19 @@ class Catching:
             if width.share <= WIDE and width.half_width > WIDE * width.moves
         ]
 
-    def warnings(self, most: float = WIDE) -> list[str]:
-        """What to know of a tube whose half-width is more than `most` of the range."""
+    def warnings(self) -> list[str]:
+        """What to know of a tube whose half-width is more than WIDE of the range."""
         said = []
         for width in self.widths:
-            if not width.share <= most:
+            if not width.share <= WIDE:
+                causes = "; ".join(self._causes(width))
                 said.append(
                     f"the half-width of {width.name}, {width.said}, is {width.part}; more than "
-                    f"{most:g} says little of where the robot is"
+                    f"{WIDE:g} says little of where the robot is: {causes}"
                 )
-                said += [f"  {cause}" for cause in self._causes(width, most)]
         return said
 
-    def _causes(self, width: Width, most: float) -> list[str]:
+    def _causes(self, width: Width) -> list[str]:
         """Which trial sets the level, and whether model or assumption is what is wide."""
         said = []
         names, parts = zip(*self.shares, strict=True)
@@ -286,7 +283,7 @@ class Catching:
             f"the simulation is off by up to {_up(width.error)} {width.unit} on the calibration "
             f"trials, {_up(needed)} {width.unit} with the safety factor"
         )
-        if needed > most * width.range:
+        if needed > WIDE * width.range:
             said.append(f"{off}: try more lags, another class of models, or more training trials")
         else:
             said.append(
@@ -315,25 +312,24 @@ class _Run:
 
 
 def what_it_catches(
-    monitor: Monitor,
-    model: StableModel,
-    half_widths: Sequence[float],
+    design: AnyDesign,
     *,
     held_back: Dataset,
     calibration: Dataset,
     ranges: FloatArray,
-    factor: float,
     remedy: str,
 ) -> Catching:
     """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
 
     Of several outputs a sensor's fault is put into one at a time.
 
-    half_widths, ranges: (p,) of each output, in its unit. factor: the safety factor, which the
-    thresholds of the detectors have too. remedy: see `Catching`. A detector that alarms in more of
-    the untouched trials than the monitor gets its threshold raised until it does not.
+    ranges: (p,) of each output, in its unit. remedy: see `Catching`. The thresholds of detectors
+    have the tube's safety factor too. A detector that alarms in more of the untouched trials than
+    the monitor gets its threshold raised until it does not.
     """
-    p = len(ranges)
+    monitor, p = design.monitor(Centre.COMMAND), len(ranges)
+    factor = design.funnel.tubes[0].safety_factor
+    half_widths = design.funnel.half_widths.tolist()
     first = held_back.trajectories[0]
     scaling = [_run(monitor, _untouched(trial), p) for trial in calibration]
     clean = [_run(monitor, _untouched(trial), p) for trial in held_back]
@@ -349,7 +345,7 @@ def what_it_catches(
     rows = [_row(UNTOUCHED, clean, [0] * len(clean), detectors)]
     for name, fault in SABOTAGES:
         try:
-            copies = [fault(trial, ranges, model) for trial in held_back]
+            copies = [fault(trial, ranges, design.model) for trial in held_back]
         except (DataError, SolverError) as reason:
             rows.append(Row(name, Caught(), {}, str(reason)))
             continue

@@ -9,10 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from bags.designs.design import AnyDesign, is_tube
-from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
-from bags.monitoring.watch import Forecasted, Stamped, Watch
+from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
@@ -22,7 +20,9 @@ from bags.signals.columns import read_columns
 from bags.signals.reader import bag_digest
 from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sampler, said_filled
 from nlsid_core import files
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status, cause
 
@@ -77,13 +77,35 @@ def _joined(row: Sequence[Stretch]) -> Stretch:
     )
 
 
+class Clock:
+    """The stamps of a bag's messages, topic by topic, and where they go back."""
+
+    def __init__(self) -> None:
+        self.start_ns = 0
+        self._last: dict[str, int] = {}
+        self._back: dict[str, list[int]] = {}  # ns, of each place
+
+    def add(self, topic: str, stamp_ns: int) -> None:
+        """Take note of a message's stamp."""
+        last = self._last.get(topic, stamp_ns)
+        self._last[topic] = stamp_ns
+        if stamp_ns < last:
+            self._back.setdefault(topic, []).append(last - stamp_ns)
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"stamps of {topic} go back in {len(steps)} "
+            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
+            for topic, steps in self._back.items()
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Replay:
     """One bag's readings, and what a summary says of them.
 
     axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
-    forecasts: those that were followed, one after another, if any were asked for. start_ns: the
-    bag's first log time. clock: what is wrong with the stamps, in words; empty if nothing.
+    noted: the stamps of the bag's messages.
     """
 
     name: str
@@ -93,9 +115,17 @@ class Replay:
     unit: str
     half_width: float
     period: float = 0.0
-    forecasts: tuple[Forecasted, ...] = ()
-    start_ns: int = 0
-    clock: str = ""
+    noted: Clock | None = None
+
+    @property
+    def start_ns(self) -> int:
+        """The bag's first log time; 0 if it is not known."""
+        return self.noted.start_ns if self.noted else 0
+
+    @property
+    def clock(self) -> str:
+        """What is wrong with the stamps, in words; empty if nothing."""
+        return str(self.noted or "")
 
     @property
     def span(self) -> float:
@@ -124,16 +154,6 @@ class Replay:
             return 0.0
         pace = float(np.median(np.diff(stamps)))
         return pace if abs(pace - self.period) > OTHER_PACE * self.period else 0.0
-
-    @property
-    def fans(self) -> list[list[Forecasted]]:
-        """The forecasts, each from where it begins."""
-        found: list[list[Forecasted]] = []
-        for entry in self.forecasts:
-            if entry.ahead == 0.0:
-                found.append([])
-            found[-1].append(entry)
-        return found
 
     @property
     def filled(self) -> int:
@@ -312,24 +332,21 @@ def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[st
 
 
 def replay_bag(
-    proved: Proved[AnyDesign],
+    design: AnyDesign,
     bag: Path | str,
     *,
     centre: Centre,
     definitions: Definitions | None = None,
-    forecast: float = 0.0,
 ) -> Replay:
     """Every response in `bag` held against a funnel.
 
-    definitions: of message types that the bag does not define. forecast: s ahead, of forecasts that
-    each begin where the one before ends, under the commands in the bag; 0: none. Raises BagError as
-    `replay_messages`, DataError of a forecast with a funnel that gives none.
+    definitions: of message types that the bag does not define. Raises BagError as
+    `replay_messages`.
     """
-    design = proved.design
-    clock = _Clock()
-    stamped, forecasts = _replayed(design, bag, centre, definitions, forecast, clock)
+    clock = Clock()
+    stamped = _replayed(design, bag, centre, definitions, clock)
     unit, half_width = "", 0.0
-    if is_tube(design) and len(design.signals[0]) == 1:
+    if isinstance(design.funnel, TubeFunnel) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, design.funnel.half_width
     return Replay(
         name=Path(bag).name,
@@ -339,9 +356,7 @@ def replay_bag(
         unit=unit,
         half_width=half_width,
         period=design.period,
-        forecasts=tuple(forecasts),
-        start_ns=clock.start_ns,
-        clock=str(clock),
+        noted=clock,
     )
 
 
@@ -359,7 +374,7 @@ def replay_messages(
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
     """
-    return _replayed(design, bag, centre, definitions, 0.0, _Clock())[0]
+    return _replayed(design, bag, centre, definitions, Clock())
 
 
 def _replayed(
@@ -367,15 +382,13 @@ def _replayed(
     bag: Path | str,
     centre: Centre,
     definitions: Definitions | None,
-    forecast: float,
-    clock: "_Clock",
-) -> tuple[list[Stamped], list[Forecasted]]:
-    """The readings, and the forecasts that were followed."""
+    clock: Clock,
+) -> list[Stamped]:
+    """The readings."""
     bag = place(bag)
     planned = centre is Centre.PROFILE or design.has_plan
     announced = planned and bool(announced_runs(design, bag, definitions))
-    steps = max(1, round(forecast / design.period)) if forecast > 0.0 else 0
-    watch = Watch(design, centre=centre, announced=announced, steps=steps)
+    watch = Watch(design, centre=centre, announced=announced)
     stamped = [
         entry
         for said in _fed(watch, bag, definitions, clock, announced=announced)
@@ -384,7 +397,7 @@ def _replayed(
     stamped += watch.end()
     if not stamped:
         raise BagError(f"{bag}: no sample with all of {watch.pairing}")
-    return stamped, watch.forecasts
+    return stamped
 
 
 def announced_runs(
@@ -398,33 +411,11 @@ def announced_runs(
     return [run for run in found if run.funnel == digest and not run.ended]
 
 
-class _Clock:
-    """The stamps of a bag's messages, topic by topic, and where they go back."""
-
-    def __init__(self) -> None:
-        self.start_ns = 0
-        self._last: dict[str, int] = {}
-        self._back: dict[str, list[int]] = {}  # ns, of each place
-
-    def add(self, topic: str, stamp_ns: int) -> None:
-        last = self._last.get(topic, stamp_ns)
-        self._last[topic] = stamp_ns
-        if stamp_ns < last:
-            self._back.setdefault(topic, []).append(last - stamp_ns)
-
-    def __str__(self) -> str:
-        return "; ".join(
-            f"stamps of {topic} go back in {len(steps)} "
-            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
-            for topic, steps in self._back.items()
-        )
-
-
 def _fed(
     watch: Watch,
     bag: Path,
     definitions: Definitions | None,
-    clock: _Clock,
+    clock: Clock,
     *,
     announced: bool,
 ) -> Iterator[list[Stamped]]:

@@ -7,15 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bags.designs.design import AnyDesign
+from bags.designs.wiring import sampler_of
 from bags.signals.grid import seconds
 from bags.signals.sampling import LOST, NOT_FINITE, Sample
-from nlsid_core.arrays import FloatArray
+from nlsid_core.designs import AnyDesign
 from nlsid_core.running.alarm import Alarm, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.forecast import Forecast
 from nlsid_core.running.reading import Reading, Status
-from nlsid_core.running.tubes import Ahead
 
 HELD = 4096  # samples kept for a run whose start is announced late: 4 s at 1 kHz
 WAITING = "waiting for the controller to announce its start"
@@ -29,26 +28,6 @@ class Stamped(NamedTuple):
     state: State
 
 
-class Forecasted(NamedTuple):
-    """Between which values each output was said to be, `ahead` s before it was measured.
-
-    t: s, as the reading's; low, high, measured: of each output, in its unit. ahead is 0 where a
-    forecast begins, and all are what was measured.
-    """
-
-    t: float
-    ahead: float
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    measured: tuple[float, ...]
-
-    @property
-    def kept(self) -> bool:
-        """Whether every output was between its two values."""
-        rows = zip(self.low, self.measured, self.high, strict=True)
-        return all(low <= value <= high for low, value, high in rows)
-
-
 SILENT = 5  # periods that commands may go on after the last response of a recording
 
 
@@ -59,9 +38,8 @@ class Watch:
     the samples before it then give the observer its state, and runs may follow each other. Time in
     the readings is s since the run's first sample or announced start. samples: since then; lost,
     filled: those of them that nobody measured, and so not judged (`LOST`, `Sample.filled`); judged:
-    since a run began, which may have been by itself. steps: samples that a forecast is followed for
-    before the next one, in `forecasts`; 0: none is made. `pairing.check` says whether messages have
-    the signals, `pairing.stamp` which of their times is the stamp.
+    since a run began, which may have been by itself. `pairing.check` says whether messages have the
+    signals, `pairing.stamp` which of their times is the stamp.
     """
 
     def __init__(
@@ -71,18 +49,15 @@ class Watch:
         centre: Centre = Centre.COMMAND,
         options: AlarmOptions | None = None,
         announced: bool = False,
-        steps: int = 0,
     ) -> None:
         self.design = design
         self.monitor = design.monitor(centre)
-        self.pairing = design.sampler()
+        self.pairing = sampler_of(design)
         self._single = design.is_single
         self._count = len(self.pairing.responses)
         self._framed = any(signal.path.framed for signal in self.pairing.responses)
         self._alarm = Alarm(options)
         self._announced = announced
-        self._steps = steps
-        self.forecasts: list[Forecasted] = []
         self.restart()
 
     def warn(self, options: AlarmOptions) -> None:
@@ -102,7 +77,6 @@ class Watch:
         self._start_ns: int | None = None
         self._over: tuple[float, str] = (math.inf, "")  # the run's last stamp (ns), and why
         self._running = not self._announced
-        self._ahead: Ahead | None = None
         self._held: tuple[int, Any] | None = None
 
     @property
@@ -243,25 +217,8 @@ class Watch:
                 judged_now = reading.status is not Status.UNKNOWN
                 self.judged = 0 if reading.waits else self.judged + judged_now
                 self._held = sample.stamp_ns, u
-                if self._steps:
-                    self._look_ahead(reading, np.atleast_1d(u))
             judged.append(Stamped(sample.stamp_ns, reading, self._alarm.update(reading)))
         return judged
-
-    def _look_ahead(self, reading: Reading, u: FloatArray) -> None:
-        """Hold the sample against the forecast that is followed, or begin one with it."""
-        if reading.status is Status.UNKNOWN:
-            self._ahead = None
-            return
-        y, ahead = reading.measured, self._ahead
-        bounds = None if ahead is None else ahead.step(u)
-        if ahead is not None and bounds is not None:
-            low, high = (tuple(bound.tolist()) for bound in bounds)
-            later = ahead.steps * self.design.period
-            self.forecasts.append(Forecasted(reading.t, later, low, high, y))
-        if ahead is None or bounds is None or ahead.steps >= self._steps:
-            self._ahead = self.monitor.ahead()
-            self.forecasts.append(Forecasted(reading.t, 0.0, y, y, y))
 
     def forecast(self, steps: int) -> tuple[int, Forecast] | None:
         """The newest judged sample's stamp (ns), and the forecast while its command is held.

@@ -1,15 +1,12 @@
-"""The chapter of a design page that shows a funnel of given equations: read from its files."""
+"""The chapter of a design page that shows a funnel of given equations."""
 
 from fractions import Fraction
 from html import escape
-from pathlib import Path
 from typing import Any
 
 from bags.designs import documents
-from nlsid_core import files
-from nlsid_core.documents import read
+from nlsid_core.designs import AnyDesign
 from nlsid_core.dynamics import VectorField
-from nlsid_core.errors import NlsidError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.kernel import text
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -18,27 +15,16 @@ from nlsid_core.running.held import Held
 MOST_TERMS = 12  # of an equation that is printed
 
 
-def equations_chapter(folder: Path) -> str:
-    """Half-widths, equations and limits; empty if the folder's funnel is another.
-
-    It reads the files and decides nothing: for folders whose proof holds.
-    """
-    try:
-        field, policy, funnel = (
-            read(files.load_document(folder / name), source=name)
-            for name in (documents.VECTOR_FIELD, documents.POLICY, documents.FUNNEL)
-        )
-        claim = files.load_document(folder / documents.FUNNEL_PROOF)["claim"]
-    except (NlsidError, OSError):
+def equations_chapter(design: AnyDesign) -> str:
+    """Half-widths, equations and limits; empty if the funnel is of another kind."""
+    field, policy, funnel = design.model, design.policy, design.funnel
+    if not isinstance(funnel, ContinuousFunnel) or design.parts:
         return ""
-    if not isinstance(field, VectorField) or not isinstance(funnel, ContinuousFunnel):
-        return ""
-    assert isinstance(policy, ContinuousPolicy), "the proof is about the three of them"
     lines = [
         "x are the states and u the inputs, counted from 0, in the order and in the units of the "
         "equations below; the files have no other names for them",
         *_equations(field),
-        *_bounds(field, policy, Held.of_claim(claim)),
+        *_bounds(field, policy, design.held),
     ]
     said = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f"{_widths(funnel)}<ul>{said}</ul>"

@@ -7,25 +7,23 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 import base64
 import hashlib
 import math
-import os
 import re
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
 from bags.designs import documents
-from bags.designs.design import is_tube
 from bags.monitoring.replay import Replay
 from bags.pictures.equations_report import equations_chapter
-from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, report_available
+from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, drawable, report_available
 from bags.tools.info import GAP, BagInfo, TopicInfo
 from nlsid_core import files, proofs
-from nlsid_core.errors import CertificateRejected, DataError, DocumentError, NlsidError
+from nlsid_core.designs import AnyDesign
+from nlsid_core.errors import CertificateRejected, DocumentError, NlsidError
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
@@ -50,77 +48,34 @@ PICTURES = {
     documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
     documents.COMPARISON_PLOT: "Classes and methods on the same test trials",
     documents.FREE_RUN_PLOT: "The model in free run",
-    documents.MOTION_PLOT: "The motion that the policy tracks",
     documents.FUNNEL_PLOT: FUNNEL_CAPTION,
     documents.CATCHING_PLOT: "What the funnel can catch",
     documents.MARGIN_PLOT: "Recordings held against the funnel, when they were last replayed",
 }
 REJECTED = "REJECTED"
 LARGEST_PICTURE = 20 * 2**20  # bytes
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-PATIENCE = 120.0  # s for one of them to print a page
 
 
-def write_folder_report(
-    folder: Path,
-    out: Path,
-    *,
-    recordings: Sequence[BagInfo] = (),
-    replays: Sequence[Replay] = (),
-    used: Sequence[str] = (),
-    drawn: str = "",
-) -> None:
+@dataclass(frozen=True)
+class Held:
+    """Bags that a page lists: their losses, how they were held against the funnel, and lines about
+    those that the design was made with.
+    """
+
+    recordings: Sequence[BagInfo] = ()
+    replays: Sequence[Replay] = ()
+    used: Sequence[str] = ()
+
+
+def write_folder_report(folder: Path, out: Path, held: Held | None = None) -> None:
     """Write the page of a design folder.
 
-    recordings: bags whose losses are listed, with the topics to list. replays: bags held against
-    its funnel, `drawn` their picture as <svg> or empty; used: lines about bags that the design was
-    made with. Raises DocumentError if the folder has
-    neither a proof nor a report.
+    Raises DocumentError if the folder has neither a proof nor a report.
     """
-    page = folder_page(folder, recordings=recordings, replays=replays, used=used, drawn=drawn)
-    files.write_atomically(out, page.encode())
+    files.write_atomically(out, folder_page(folder, held or Held()).encode())
 
 
-def print_page(page: Path, out: Path) -> None:
-    """Print a page to a PDF file by Chromium or Chrome; DataError if there is none, or it fails."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        raise DataError(
-            f"a PDF is printed by Chromium or Chrome; none of {', '.join(BROWSERS)} is on PATH; "
-            f"install one (Debian, Ubuntu: apt install chromium), or open {page} and print it"
-        )
-    with tempfile.TemporaryDirectory() as scratch:
-        printed = Path(scratch) / "page.pdf"
-        options = [
-            "--headless",
-            "--disable-gpu",
-            "--no-first-run",
-            "--no-pdf-header-footer",
-            f"--user-data-dir={scratch}/profile",
-            f"--print-to-pdf={printed}",
-        ]
-        if os.geteuid() == 0:  # as root it does not start with one; the page may run nothing anyway
-            options.append("--no-sandbox")
-        command = [browser, *options, page.resolve().as_uri()]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, timeout=PATIENCE, check=False
-            )
-        except subprocess.TimeoutExpired as error:
-            raise DataError(f"{browser} did not print {page} in {PATIENCE:g} s") from error
-        if not printed.is_file():
-            raise DataError(f"{browser} printed no {out.name}: {done.stderr[-500:].strip()}")
-        files.write_atomically(out, printed.read_bytes())
-
-
-def folder_page(
-    folder: Path,
-    *,
-    recordings: Sequence[BagInfo] = (),
-    replays: Sequence[Replay] = (),
-    used: Sequence[str] = (),
-    drawn: str = "",
-) -> str:
+def folder_page(folder: Path, held: Held) -> str:
     """The whole page as text."""
     proofs = {path.name: _decided(path) for path in sorted(folder.glob("*.proof.json"))}
     decided = "".join(_proof(name, found) for name, found in proofs.items())
@@ -129,15 +84,16 @@ def folder_page(
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     if not proofs and not model:
         raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
-    funnel = "" if REJECTED in decided else equations_chapter(folder)
+    design = None if REJECTED in decided else _design(folder)
+    funnel = "" if design is None else equations_chapter(design)
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     chapters = {
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
         "funnel": ("The funnel of these equations", funnel),
-        "pictures": ("Pictures", _pictures(folder, without=in_model)),
-        "replays": ("Recordings held against the funnel", _replays(replays, used, drawn)),
-        "recordings": ("Recordings and their losses", _recordings(recordings)),
+        "pictures": ("Pictures", _pictures(folder, design, without=in_model)),
+        "replays": ("Recordings held against the funnel", _replays(held)),
+        "recordings": ("Recordings and their losses", _recordings(held.recordings)),
         "files": ("Files", _files(folder, proofs)),
     }
     present = {key: found for key, found in chapters.items() if found[1]}
@@ -199,7 +155,7 @@ def _model_chapter(report: Path) -> str:
     return f'<p class="note">As it was written when model and funnel were made.</p>{chapter}'
 
 
-def _pictures(folder: Path, *, without: set[str]) -> str:
+def _pictures(folder: Path, design: AnyDesign | None, *, without: set[str]) -> str:
     figures = []
     for name, caption in PICTURES.items():
         path = folder / name
@@ -212,25 +168,29 @@ def _pictures(folder: Path, *, without: set[str]) -> str:
                 f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    if not (folder / documents.FUNNEL_PLOT).is_file() and (drawn := _drawn_funnel(folder)):
+    if not (folder / documents.FUNNEL_PLOT).is_file() and (drawn := _drawn(design)):
         figures.append(f"<figure>{drawn}<figcaption>{FUNNEL_CAPTION}</figcaption></figure>")
     return "".join(figures)
 
 
-def _drawn_funnel(folder: Path) -> str:
-    """A proved funnel around a motion, from its files, as <svg>; empty where there is none."""
-    path = documents.funnel_of(folder)
-    if not path.is_file() or not report_available():
-        return ""
+def _design(folder: Path) -> AnyDesign | None:
+    """The design of a folder; None where there is none that is proved."""
     try:
-        design = documents.load_proved(path).design
+        return documents.load(folder)
     except (NlsidError, OSError):
-        return ""  # the chapter on the proofs says why
-    if is_tube(design):
-        return ""  # as wide always, or as the commands move it: `catching.png` has it
-    from bags.pictures import plots, tracking_plots
+        return None  # the chapter on the proofs says why
 
-    return plots.svg(tracking_plots.draw_tube(design))
+
+def _drawn(design: AnyDesign | None) -> str:
+    """The tube around a motion as <svg>; empty where there is none.
+
+    One around a simulation is as wide always, or as the commands move it: `catching.png` has it.
+    """
+    if design is None or isinstance(design.funnel, TubeFunnel) or not report_available():
+        return ""
+    from bags.pictures import plots, tubes  # matplotlib only where something is drawn
+
+    return plots.svg(tubes.draw_tube(design))
 
 
 def _recordings(recordings: Sequence[BagInfo]) -> str:
@@ -287,20 +247,23 @@ def _between(values: Sequence[float], unit: str = "") -> str:
     return f"{' to '.join(ends)}{unit}"
 
 
-def _replays(replays: Sequence[Replay], used: Sequence[str], drawn: str) -> str:
-    if not replays:
+def _replays(held: Held) -> str:
+    if not held.replays:
         return ""
-    rows = "".join(_replay(replay) for replay in replays)
-    head = "".join(
-        f"<th>{name}</th>"
-        for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
-    )
+    rows = "".join(map(_replay, held.replays))
+    names = ("bag", "verdict", "least margin", "at", "assumption used", "judged")
+    head = "".join(f"<th>{name}</th>" for name in names)
     wide = "".join(
         f'<p class="not">{escape(f"{replay.name}: {replay.said_wide}")}</p>'
-        for replay in replays
+        for replay in held.replays
         if replay.said_wide
     )
-    lines = "".join(f"<p>{escape(line[0].upper() + line[1:])}.</p>" for line in used)
+    lines = "".join(f"<p>{escape(line[0].upper() + line[1:])}.</p>" for line in held.used)
+    drawn = ""
+    if drawable(held.replays):
+        from bags.pictures import plots  # matplotlib only where something is drawn
+
+        drawn = plots.svg(plots.margins(held.replays))
     return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{lines}
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
 most of what is assumed that any judged sample used.</p>{wide}{drawn}"""

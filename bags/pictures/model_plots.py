@@ -1,29 +1,19 @@
 """Pictures of an identified model (extra `report`: matplotlib). Each function returns a Figure."""
 
-import re
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Candidate, Fit, History, Model, Validation, simulate_trial
+from nlsid_core.identification import Candidate, Fit, Model, Validation, simulate_trial
 from nlsid_core.identification.prediction import history, learns
-from nlsid_core.models import BlockCascade, CellNetwork, DifferenceEquation, MonotoneEquation
-from nlsid_core.models.monotone_equation import solve_increasing
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
 DRAWN = 800  # points of a residual over time
 COLUMNS = 4
-BARS = 12  # steps of a search that are drawn as bars with their names, at most
-ITERATE = re.compile(r"(certified )?iterate \d+")
-LOGARITHMIC = 30.0  # largest over smallest value from which on an axis is logarithmic
 
 
 def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
@@ -117,98 +107,9 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     return figure
 
 
-def search_history(history: History) -> Figure:
-    """The value each step of the search reached; choices by name, iterates as a line."""
-    values = [step.value for step in history.steps]
-    if len(values) > BARS or all(ITERATE.fullmatch(step.what) for step in history.steps):
-        figure = Figure(figsize=(4.6, 3.0), layout="constrained")
-        axes = figure.subplots()
-        axes.plot(np.arange(1, len(values) + 1), values, ".-", color=BLUE, lw=LINE, ms=5)
-        if min(values) > 0 and max(values) > LOGARITHMIC * min(values):
-            axes.set_yscale("log")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_xlabel(f"{history.steps[0].what} to {history.steps[-1].what}", fontsize=8)
-    else:
-        figure = Figure(figsize=(6.2, 0.25 * len(values) + 0.8), layout="constrained")
-        axes = figure.subplots()
-        places = np.arange(len(values))[::-1]
-        colors = [BLUE if value == min(values) else GREY for value in values]
-        axes.barh(places, values, color=colors, height=0.6)
-        axes.set_yticks(places, [step.what for step in history.steps])
-    axes.set_title(history.value, fontsize=8, loc="left")
-    tidy([axes])
-    return figure
-
-
-def structure(chosen: Candidate[Model]) -> Figure | None:
-    """What can be drawn of the model itself: poles, the static nonlinearity; None: nothing."""
-    model = chosen.model
-    if isinstance(model, DifferenceEquation):
-        figure = Figure(figsize=(3.4, 3.4), layout="constrained")
-        _poles(figure.subplots(), [("poles", model.poles)], chosen)
-    elif isinstance(model, BlockCascade):
-        figure = Figure(figsize=(7.2, 3.4), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        names = ("first filter", "second filter")
-        _poles(left, list(zip(names, model.poles, strict=True)), chosen)
-        x = np.linspace(model.f.low, model.f.high, 400)
-        right.plot(x, model.f(x), color=BLUE, lw=LINE)
-        right.set_xlabel("between the filters", fontsize=8)
-        right.set_title("static nonlinearity f, linear beyond", fontsize=8, loc="left")
-        tidy([right])
-    elif isinstance(model, CellNetwork):
-        count = len(model.maps)
-        figure = Figure(
-            figsize=(min(7.2, 2.4 * count), 2.2 * ((count + 2) // 3)), layout="constrained"
-        )
-        grid = figure.subplots((count + 2) // 3, min(count, 3), squeeze=False)
-        for number, (axes, f) in enumerate(zip(grid.flat, model.maps, strict=False), 1):
-            axes.plot(f.knots, f.values, ".-", color=BLUE, lw=LINE, ms=4)
-            axes.set_title(f"map {number}", fontsize=8, loc="left")
-        for axes in grid.flat[count:]:
-            axes.set_visible(False)
-        tidy(list(grid.flat[:count]))
-    elif isinstance(model, MonotoneEquation):
-        figure = Figure(figsize=(3.8, 3.2), layout="constrained")
-        axes = figure.subplots()
-        drive = np.linspace(-3.0, 3.0, 300) * float(model.e[0])
-        e = tuple(model.e.tolist())
-        axes.plot(
-            drive,
-            [model.y_offset + solve_increasing(e, v, 0.0) for v in drive.tolist()],
-            color=BLUE,
-            lw=LINE,
-        )
-        axes.set_xlabel("past and inputs, combined", fontsize=8)
-        axes.set_ylabel(f"{model.y.name} [{model.y.unit}]", fontsize=8)
-        axes.set_title("static nonlinearity e⁻¹", fontsize=8, loc="left")
-        tidy([axes])
-    else:
-        return None
-    return figure
-
-
 def axis_name(trial: Trajectory, output: int) -> str:
     """The output with its unit."""
     return f"{trial.y_names[output]} [{trial.y_units[output]}]"
-
-
-def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candidate[Model]) -> None:
-    title = "poles"
-    axes.add_patch(Circle((0, 0), 1.0, fill=False, color=INK, lw=LINE))
-    if chosen.proof is not None:
-        rate = chosen.proof.rate
-        title += f", dashed: proved rate {rate:.4f}"
-        axes.add_patch(Circle((0, 0), rate, fill=False, color=BLUE, ls="--", lw=LINE))
-    for (name, z), (marker, color) in zip(groups, (("x", RED), ("+", ORANGE)), strict=False):
-        axes.plot(z.real, z.imag, marker, color=color, ms=7, label=name)
-    if len(groups) > 1:
-        axes.legend(fontsize=7, frameon=False, loc="upper center", ncols=len(groups))
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.1, 1.1)
-    axes.set_ylim(-1.1, 1.1 if len(groups) == 1 else 1.4)
-    axes.set_title(title, fontsize=8, loc="left")
-    tidy([axes])
 
 
 def _correlations(

@@ -95,18 +95,6 @@ def _tube(axes: Axes, replay: Replay) -> None:
         t, nominal - width, nominal + width, color=BLUE, alpha=0.18, lw=0, label="proved tube"
     )
     axes.plot(t, nominal, color=BLUE, lw=LINE, label="nominal")
-    label = "forecast from its present estimate"
-    for fan in replay.fans:
-        axes.fill_between(
-            [f.t for f in fan],
-            [f.low[0] for f in fan],
-            [f.high[0] for f in fan],
-            color=ORANGE,
-            alpha=0.35,
-            lw=0,
-            label=label,
-        )
-        label = ""
     everything = replay.readings
     measured = [_output(r.measured) for r in everything]
     axes.plot([r.t for r in everything], measured, color=INK, lw=LINE, label="measured")

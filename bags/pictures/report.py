@@ -2,7 +2,7 @@
 
 import importlib.util
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
@@ -43,23 +43,15 @@ def report_available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def write_report(
-    path: Path,
-    fit: Fit[Model],
-    train: Dataset,
-    test: Dataset,
-    *,
-    validation: Dataset | None = None,
-    calibration: Dataset | None = None,
-    robot: str,
-) -> None:
-    """Write the page; needs the extra `report`."""
-    files.write_atomically(
-        path,
-        page(
-            fit, train, test, validation=validation, calibration=calibration, robot=robot
-        ).encode(),
-    )
+def drawable(replays: Sequence[Replay]) -> bool:
+    """Whether replayed bags can be drawn in their tubes: those of one output, if any was judged."""
+    judged = any(entry.judged for entry in replays)
+    return report_available() and judged and all(entry.half_width for entry in replays)
+
+
+def write_report(path: Path, fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> None:
+    """Write the page; needs the extra `report`. parts: trials by what they are for."""
+    files.write_atomically(path, page(fit, parts, robot=robot).encode())
 
 
 def write_margins(path: Path, replays: Sequence[Replay]) -> None:
@@ -140,33 +132,19 @@ def _catching_row(row: Row, detectors: Sequence[str]) -> str:
     return f"<tr><td>{fault}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
 
 
-def page(
-    fit: Fit[Model],
-    train: Dataset,
-    test: Dataset,
-    *,
-    validation: Dataset | None = None,
-    calibration: Dataset | None = None,
-    robot: str,
-) -> str:
+def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     """The whole HTML page as text."""
     from bags.pictures import model_plots, plots  # matplotlib only where a report is drawn
 
-    chosen = fit.chosen
+    chosen, test = fit.chosen, parts["test"]
     outputs = range(test.trajectories[0].y.shape[1])
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
-    recordings = [
-        (train, "training"),
-        (validation, "validation"),
-        (calibration, "calibration"),
-        (test, "test"),
-    ]
-    kept = [(data, use) for data, use in recordings if data is not None]
-    listed = "".join(_recordings(data, use) for data, use in kept)
-    counts = ", ".join(f"{len(data)} {use}" for data, use in kept)
+    listed = "".join(_recordings(data, use) for use, data in parts.items())
+    counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
     rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
+    calibrated = ", calibration trials for neither: they scale the tube"
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
 <style>{STYLE}</style>
@@ -180,10 +158,9 @@ def page(
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
 simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
 Trials: {counts}; test trials were only used
-for this table and the pictures below{_calibrated(calibration)}.</p>
+for this table and the pictures below{calibrated if "calibration" in parts else ""}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
 {_residuals(chosen, test)}
-{_inside(fit)}
 {FUNNEL_BEGINS}{FUNNEL_ENDS}
 <h2>Recordings</h2>
 <table class="left">
@@ -263,10 +240,6 @@ def _equation(m: Model) -> str:
     return f"y = G₂ f(G₁ u): {m}; {signals}"
 
 
-def _calibrated(calibration: Dataset | None) -> str:
-    return "" if calibration is None else ", calibration trials for neither: they scale the tube"
-
-
 def _left_out(chosen: Candidate[Model]) -> str:
     return f" and the first {chosen.transient}" if chosen.transient else ""
 
@@ -287,19 +260,6 @@ def _residuals(chosen: Candidate[Model], test: Dataset) -> str:
 independent of the input. White noise on the measurement leaves the simulation residual white, white
 noise in the equation the one-step residual; if neither is white, the model leaves dynamics
 unexplained, the noise is coloured, or there is noise of both kinds.</p>"""
-
-
-def _inside(fit: Fit[Model]) -> str:
-    """What the model looks like, and how the search went."""
-    from bags.pictures import model_plots, plots
-
-    figures = []
-    structure = model_plots.structure(fit.chosen)
-    if structure is not None:
-        figures.append(plots.svg(structure))
-    if len(fit.history.steps) > 1:
-        figures.append(plots.svg(model_plots.search_history(fit.history)))
-    return f"<h2>The model and the search</h2>{''.join(figures)}" if figures else ""
 
 
 def _recordings(dataset: Dataset, use: str) -> str:

@@ -1,5 +1,6 @@
 """Names that exist, for errors about one that does not."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Final
@@ -11,10 +12,17 @@ LISTED: Final = 20
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """`; did you mean 'a' or 'b'?` for the candidates nearest to `name`; empty if none is near."""
-    near = get_close_matches(name, list(candidates), n=SHOWN, cutoff=CLOSE)
+    known = list(candidates)
+    near = [each for each in known if _unpadded(each) == _unpadded(name)]
+    near = near or get_close_matches(name, known, n=SHOWN, cutoff=CLOSE)
     if not near:
         return ""
     return f"; did you mean {' or '.join(repr(found) for found in near)}?"
+
+
+def _unpadded(name: str) -> str:
+    """The name with its numbers as they are written without leading zeros."""
+    return re.sub(r"0+(?=\d)", "", name)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.recordings.message_types import is_stamped
 from bags.setup.proposal import Unfit
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.delays import Delay, delay
@@ -87,8 +86,7 @@ class Candidate:
     """A number that may be a signal.
 
     text: its path with operations. command: the share, 0 to 1, by which type and names say that it
-    drives; why: those words. stamped: whether its messages have a header. low, high: in the bags
-    looked into. rate: Hz, the median.
+    drives; why: those words. low, high: in the bags looked into. rate: Hz, the median.
     """
 
     text: str
@@ -96,7 +94,6 @@ class Candidate:
     unit: str
     command: float
     why: str
-    stamped: bool
     low: float
     high: float
     rate: float
@@ -218,8 +215,7 @@ def _of_bag(
             columns = read_columns(bag, mine)[topic] if mine else None
             if columns is None or len(columns) < WINDOW:
                 continue
-            msgtype, types = bag.types_on(topic)
-            stamped = is_stamped(msgtype, types)
+            msgtype, _ = bag.types_on(topic)
             for text, values in columns.values.items():
                 for signal, numbers, unit in _forms(text, paths[text].unit, columns, values):
                     finite = np.isfinite(numbers)
@@ -237,7 +233,6 @@ def _of_bag(
                             unit,
                             command,
                             why,
-                            stamped,
                             float(numbers[finite].min()),
                             float(numbers[finite].max()),
                             _rate(stamps),

@@ -30,23 +30,43 @@ LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed
 
 
 @dataclass(frozen=True)
-class Paces:
-    """What the chosen signals of all bags show: the responses' steps, the commands' ages.
+class Steps:
+    """The responses' steps in s.
 
-    off_grid: periods by which the stamps of a run of responses stray from one grid of the period.
-    longest_tail: s of responses after the last command, where those have come to an end and the
-    last is not held.
+    on_grid: the share of them that is near the period. off_grid: periods by which the stamps of a
+    run stray from one grid of the period. repeated: stamps that are the one before.
     """
 
     period: float
     on_grid: float
     off_grid: float
     repeated: int
-    longest_gap: float
+    longest: float
+
+
+@dataclass(frozen=True)
+class Ages:
+    """The commands' ages in s.
+
+    tail: of responses after the last command, where those have come to an end and the last is not
+    held.
+    """
+
+    period: float
+    longest: float
+    tail: float
+
+
+@dataclass(frozen=True)
+class Paces:
+    """What the chosen signals of all bags show.
+
+    band: Hz below which a response has 99 % of its power. topics: that responses are on.
+    """
+
+    steps: Steps
+    ages: Ages
     band: float
-    command_period: float
-    longest_held: float
-    longest_tail: float
     u_ranges: tuple[tuple[float, float], ...]
     y_ranges: tuple[tuple[float, float], ...]
     topics: int
@@ -70,6 +90,9 @@ def read_paces(
     for path in bags:
         with Bag(path, definitions=types) as bag:
             read = read_signals(bag, [*y_paths, *u_paths], sort=True, gaps_in=y_paths)
+        for name in read:
+            if doubt := read[name].doubt(responds=name in y_paths):
+                raise BagError(f"{path.name}: {doubt}; record it again with one of them")
         for name in y_paths:
             diffs = np.diff(read[name].stamp_ns) / 1e9
             repeated += int((diffs <= 0).sum())
@@ -89,15 +112,13 @@ def read_paces(
     near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
     period, off_grid = _grid(steps, median)
     return Paces(
-        period=period,
-        on_grid=float(near.mean()),
-        off_grid=off_grid,
-        repeated=repeated,
-        longest_gap=float(every.max()),
+        Steps(period, float(near.mean()), off_grid, repeated, float(every.max())),
+        Ages(
+            period=float(np.median(u_every)) if len(u_every) else math.inf,
+            longest=max(each.longest for each in commanded),
+            tail=max(each.tail for each in commanded),
+        ),
         band=float(np.median([b for b in bands if b > 0] or [0.0])),
-        command_period=float(np.median(u_every)) if len(u_every) else math.inf,
-        longest_held=max(each.longest for each in commanded),
-        longest_tail=max(each.tail for each in commanded),
         u_ranges=_whole(ranges["u"]),
         y_ranges=_whole(ranges["y"]),
         topics=len({name.partition(":")[0] for name in y_paths}),
@@ -182,69 +203,70 @@ def _up(value: float) -> float:
 
 def say_grid(proposal: Proposal, read: Paces) -> None:
     """Period, resampling, gaps and holding of the configuration, and what follows from them."""
-    grid: dict[str, Any] = {"period": read.period}
+    steps, ages = read.steps, read.ages
+    grid: dict[str, Any] = {"period": steps.period}
     why, walls = proposal.why, proposal.walls
     why["period"] = (
-        f"the response's step; {100 * read.on_grid:.0f} % of steps are near it, and stamps of a "
-        f"run stray by {read.off_grid:.2g} periods from its grid"
+        f"the response's step; {100 * steps.on_grid:.0f} % of steps are near it, and stamps of a "
+        f"run stray by {steps.off_grid:.2g} periods from its grid"
     )
-    steady = read.on_grid >= ON_GRID and read.off_grid <= TOLERANCE
-    regular = steady and read.topics == 1 and not read.repeated
-    if read.period >= SLOW:
+    steady = steps.on_grid >= ON_GRID and steps.off_grid <= TOLERANCE
+    regular = steady and read.topics == 1 and not steps.repeated
+    if steps.period >= SLOW:
         proposal.doubts.append(
-            f"samples are {read.period:.4g} s apart, {1.0 / read.period:.2g} Hz; is it so, or were "
-            "times in milliseconds taken for seconds?"
+            f"samples are {steps.period:.4g} s apart, {1.0 / steps.period:.2g} Hz; is it so, or "
+            "were times in milliseconds taken for seconds?"
         )
     factor = 1
     if read.band > 0:
-        factor = max(int(1.0 / (DYNAMICS * read.band) / read.period), 1)
+        factor = max(int(1.0 / (DYNAMICS * read.band) / steps.period), 1)
     if factor > 1:
-        grid["period"] = float(f"{factor * read.period:.4g}")
+        grid["period"] = float(f"{factor * steps.period:.4g}")
         why["period"] = (
-            f"{factor} times {read.period:g} s: 99 % of the response's power is below "
+            f"{factor} times {steps.period:g} s: 99 % of the response's power is below "
             f"{read.band:.3g} Hz"
         )
         regular = False
     if not regular:
         grid["resample"] = "last" if factor > 1 and steady else "linear"
-        why["resample"] = (
-            "fewer samples than are recorded"
-            if factor > 1
-            else "responses come from several topics"
-            if read.topics > 1
-            else f"only {100 * read.on_grid:.0f} % of steps are near the period"
-            if read.on_grid < ON_GRID
-            else f"stamps of a run stray by {read.off_grid:.2g} periods from one grid, and "
-            f"a monitor takes {TOLERANCE:g}"
-        )
-    most = FEW_GAPS * read.period
-    grid["max_gap"] = _up(max(min(1.2 * read.longest_gap, most), 2.0 * grid["period"]))
-    why["max_gap"] = f"the longest step of a response is {read.longest_gap:.3g} s"
-    if read.longest_gap > grid["max_gap"]:
+        reasons = {
+            "fewer samples than are recorded": factor > 1,
+            "responses come from several topics": read.topics > 1,
+            f"only {100 * steps.on_grid:.0f} % of steps are near the period": (
+                steps.on_grid < ON_GRID
+            ),
+            f"stamps of a run stray by {steps.off_grid:.2g} periods from one grid, and a monitor "
+            f"takes {TOLERANCE:g}": True,
+        }
+        why["resample"] = next(reason for reason, holds in reasons.items() if holds)
+    most = FEW_GAPS * steps.period
+    grid["max_gap"] = _up(max(min(1.2 * steps.longest, most), 2.0 * grid["period"]))
+    why["max_gap"] = f"the longest step of a response is {steps.longest:.3g} s"
+    if steps.longest > grid["max_gap"]:
         grid["split_gaps"] = True
         why["split_gaps"] = "longer gaps end a trial and begin the next"
         walls.append(
-            f"a response is missing for up to {read.longest_gap:.3g} s: trials are cut there, and "
+            f"a response is missing for up to {steps.longest:.3g} s: trials are cut there, and "
             "a monitor says unknown from there on"
         )
-    if read.longest_held > grid["max_gap"]:
-        grid["hold"] = _up(1.1 * read.longest_held)
-        why["hold"] = f"one was held for {read.longest_held:.3g} s in these bags"
-        if read.longest_held > LONG_HELD * min(read.command_period, 1.0):
+    if ages.longest > grid["max_gap"]:
+        grid["hold"] = _up(1.1 * ages.longest)
+        why["hold"] = f"one was held for {ages.longest:.3g} s in these bags"
+        if ages.longest > LONG_HELD * min(ages.period, 1.0):
             walls.append(
-                f"commands are held for up to {read.longest_held:.3g} s: a lost one is not noticed "
+                f"commands are held for up to {ages.longest:.3g} s: a lost one is not noticed "
                 "before"
             )
-    if read.longest_tail > grid.get("hold", grid["max_gap"]):
+    if ages.tail > grid.get("hold", grid["max_gap"]):
         grid["split_gaps"] = True
         why.setdefault("split_gaps", "what comes after the last command is not fitted")
         walls.append(
-            f"commands end up to {read.longest_tail:.3g} s before the responses do: what the robot "
+            f"commands end up to {ages.tail:.3g} s before the responses do: what the robot "
             "does there is not fitted, as nothing says what it was told"
         )
     proposal.content["grid"] = grid
-    if read.repeated:
+    if steps.repeated:
         walls.append(
-            f"{read.repeated} stamps of the response repeat the one before, which identification "
+            f"{steps.repeated} stamps of the response repeat the one before, which identification "
             "refuses; is the topic published twice?"
         )

@@ -7,7 +7,7 @@ refused there is changed (gaps cut out, responses resampled) or said.
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from bags.chain.steps import Trials, read_trials
 from bags.recordings.bag import Bag
-from bags.recordings.definitions import Definition
+from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, slope_window
@@ -85,36 +85,45 @@ def _unmoved(found: Found) -> list[str]:
     return [] if others else found.constant_commands
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """What a configuration is made of: signals, what people call the robot, files of types.
+
+    named: the signals that a person named.
+    """
+
+    responses: tuple[str, ...]
+    excitations: tuple[str, ...]
+    robot: str = "robot"
+    definitions: tuple[Path, ...] = ()
+    named: tuple[str, ...] = ()
+
+
 def propose(
     bags: Sequence[Path],
     found: Found,
+    chosen: Chosen,
     *,
-    responses: Sequence[str],
-    excitations: Sequence[str],
-    robot: str,
-    definitions: Sequence[Path] = (),
-    types: Mapping[str, Definition] | None = None,
-    named: Sequence[str] = (),
     widen: bool = False,
     alone: bool = False,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
 
-    named: those that a person named.
-
     widen: where models of one excitation are poor, take those too that the response follows
     besides, if that is better. alone: nobody chose the one response, and others like it are said.
-    Raises BagError and DataError if the bags cannot be read as any
-    configuration says.
+
+    Raises BagError and DataError if the bags cannot be read as any configuration says.
     """
+    responses, excitations, definitions = chosen.responses, chosen.excitations, chosen.definitions
+    types = read_definitions(definitions)
     texts = [*responses, *excitations]
     if twice := next((text for text in texts if texts.count(text) > 1), None):
         raise BagError(f"{twice} is named twice")
-    signals = _named_apart([_signal(found, text, named) for text in texts])
-    chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
-    proposal = Proposal({"robot": robot})
-    _say_signals(proposal, chosen, found)
-    if all(any(_unwrapped(s.path) for s in signals) for signals in chosen.values()):
+    signals = _named_apart([_signal(found, text, chosen.named) for text in texts])
+    sides = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
+    proposal = Proposal({"robot": chosen.robot})
+    _say_signals(proposal, sides, found)
+    if all(any(_unwrapped(s.path) for s in side) for side in sides.values()):
         proposal.walls.append(
             "an angle drives and an angle answers: if a trial begins near half a turn, they may "
             "begin a whole turn apart; leave such trials out, or take |derivative of both"
@@ -122,8 +131,8 @@ def propose(
     if definitions:
         proposal.content["definitions"] = [str(path) for path in definitions]
     with Bag(bags[0], definitions=types) as bag:
-        _say_clock(proposal, chosen, bag)
-    read = read_paces(bags, chosen, proposal.content["clock"], types)
+        _say_clock(proposal, sides, bag)
+    read = read_paces(bags, sides, proposal.content["clock"], types)
     _refuse_constant(excitations, read.u_ranges, "drives", "these bags")
     _refuse_constant(responses, read.y_ranges, "answers", "these bags")
     say_grid(proposal, read)
@@ -149,16 +158,8 @@ def propose(
     if linear:
         say_lags(proposal, trials.train)
         if _may_add_up(proposal, found):
-            moved = propose(
-                bags,
-                found,
-                responses=[f"{responses[0]}|washout({WASHOUT:g} s)"],
-                excitations=excitations,
-                robot=robot,
-                definitions=definitions,
-                types=types,
-                named=named,
-            )
+            washed = f"{responses[0]}|washout({WASHOUT:g} s)"
+            moved = propose(bags, found, replace(chosen, responses=(washed,)))
             if moved.error <= proposal.error / 2.0:
                 _say_washed_out(moved, proposal.error)
                 moved.walls += _beside(moved, found) if alone else []
@@ -168,16 +169,7 @@ def propose(
     _say_funnel(proposal)
     others = [pair.command.text for pair in followed(proposal, found)]
     if widen and proposal.error > POOR and others:
-        wider = propose(
-            bags,
-            found,
-            responses=responses,
-            excitations=[*excitations, *others],
-            robot=robot,
-            definitions=definitions,
-            types=types,
-            named=named,
-        )
+        wider = propose(bags, found, replace(chosen, excitations=(*excitations, *others)))
         wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
             without = f"; without it models are off by {proposal.error:.3g} %"

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from bags.designs.design import AnyDesign
-from nlsid_core.dynamics import VectorField
+from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.running.reading import Reading
@@ -13,8 +12,6 @@ from nlsid_core.running.reading import Reading
 
 def signal_names(design: AnyDesign) -> tuple[str, ...]:
     """Of the measured signals, with their units."""
-    if isinstance(design.model, VectorField):
-        return tuple(f"x{i}" for i in range(design.model.n))
     return tuple(f"{s.name} [{s.unit}]" if s.unit else s.name for s in design.signals[0])
 
 

@@ -3,12 +3,11 @@
 import threading
 from pathlib import Path
 
-from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved
 from bags.monitoring.replay import replay_bag, replay_messages
 from bags.monitoring.watch import Stamped
 from bags.viewing.drawn import HalfWidths, signal_names
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
+from nlsid_core.designs import AnyDesign
 from nlsid_core.running.alarm import State
 from nlsid_core.running.comparison import Centre
 
@@ -25,11 +24,10 @@ LEVELS = {
 class Recording:
     """A bag's readings and what is drawn beside them; raises BagError as `replay_messages`."""
 
-    def __init__(self, proved: Proved[AnyDesign], bag: Path, *, centre: Centre) -> None:
-        design = proved.design
+    def __init__(self, design: AnyDesign, bag: Path, *, centre: Centre) -> None:
         self.name = bag.name
         self._stamped = replay_messages(design, bag, centre=centre)
-        summary = replay_bag(proved, bag, centre=centre)
+        summary = replay_bag(design, bag, centre=centre)
         self._verdict = " ".join(filter(None, [f"verdict: {summary.verdict}.", summary.reason]))
         self._widths, self._names = HalfWidths(design), signal_names(design)
         self._said: tuple[State | None, str] = None, ""

@@ -2,9 +2,7 @@
 
 from typing import Protocol, TypeAlias
 
-from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.funnels import continuous, sampled, tube
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
@@ -37,13 +35,3 @@ class Funnel(Protocol):
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
-
-
-def read_funnel(document: Json, *, source: str = "funnel") -> AnyFunnel:
-    """The funnel of a document, by its kind; DocumentError says what is wrong with it."""
-    kinds: dict[str, type[AnyFunnel]] = {
-        sampled.KIND: SampledFunnel,
-        continuous.KIND: ContinuousFunnel,
-        tube.KIND: TubeFunnel,
-    }
-    return files.of_kind(document, kinds, source=source).from_document(document, source=source)

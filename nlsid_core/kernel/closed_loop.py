@@ -16,10 +16,10 @@ from math import prod
 from typing import Any
 
 from .exact import Matrix, dot
-from .files import Node, Terms
+from .files import Node, Terms, limit
 from .polynomials import Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .trajectory import Field, Funnel, Mode, Part, Piece, in_order, pushed, refuse_many
+from .trajectory import MAX_PIECES, Field, Funnel, Mode, Part, Piece, in_order, pushed
 
 Corner = tuple[int, ...]  # -1 or 1 for each input that is off; 0 where it is not
 
@@ -173,8 +173,7 @@ def read_hold(claim: Node, stated: dict[str, Any], field: Field, funnel: Funnel)
         error = Node(claim.value["error"], "error").array(field.n)
         claim.require({"error should be 0 or more": min(error) >= 0}, "not_below")
     if held or "error" in claim.value:
-        wanted = "f should be affine in each input, else corners do not bound its hold"
-        claim.require({wanted: field.affine}, "not_valid")
+        claim.require({"f is not affine in each input that is off": field.affine}, "not_valid")
 
     shaken = [
         [max(dot(list(map(abs, gain[i])), error) for gain in points) for i in range(field.m)]
@@ -205,7 +204,8 @@ def decide_rates(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any
         ((low + high) / 2,) if m + j in free else (low, high)
         for j, (low, high) in enumerate(field.box)
     ]
-    refuse_many(count, 2 ** (m + len(field.box) - len(free)), 3 ** len(limited), 2 * m)
+    cases_of = 2 ** (m + len(field.box) - len(free)) * len(funnel.modes) * 2 * m
+    limit(count * cases_of, MAX_PIECES, "intervals, vertices and modes")
     vertices = list(product(product(*sides), product(*values)))
     cases = [
         (i, sign, *mode)

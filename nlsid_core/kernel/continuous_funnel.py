@@ -21,10 +21,10 @@ from typing import Any
 from . import text
 from .closed_loop import ClosedLoop, Hold, at, decide_rates, read_hold, read_multiplier
 from .exact import Matrix, Rows, at_most, dot, identity, inverse_forms, scaled, semidefinite, unit
-from .files import Node, Read, Table, bound_files, itself, refuse_if
+from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
 from .polynomials import Polynomial, Ring, at_width
 from .positivity import positive, read_squares
-from .trajectory import Field, Funnel, Piece, in_order, pushed, read_field, read_funnel, refuse_many
+from .trajectory import MAX_PIECES, Field, Funnel, Piece, in_order, pushed, read_field, read_funnel
 
 SENTENCE = (
     "funnel: every solution that {whose} in it at a time from {start:exact} to {end:exact} s, such "
@@ -160,10 +160,11 @@ def _decide_pieces(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, A
         kappa = stated["kappa"].array(count, len(field.box))
         above = all(entry > 0 for row in kappa for entry in row)
         stated["kappa"].require({"should be positive": above}, "not_below")
-        pushing = field.pushing.issuperset(columns)
-        stated["kappa"].require({"w does more than add constants": pushing}, "not_valid")
+        pushing = {"w does more than add constants": field.pushing.issuperset(columns)}
+        stated["kappa"].require(pushing, "not_valid")
         values = [tuple((low + high) / 2 for low, high in field.box)]
-    refuse_many(count, 2 ** (0 if kappa else len(field.box)), len(hold.corners), 3**limited)
+    most = count * 2 ** (0 if kappa else len(field.box)) * len(hold.corners) * 3**limited
+    limit(most, MAX_PIECES, "intervals, vertices and modes")
     vertices = list(product(hold.corners, values))
     needed = list(product(range(count), range(len(vertices)), funnel.modes))
     pieces = in_order(stated["pieces"], "mu" + " tau" * bool(limited), needed, limited)

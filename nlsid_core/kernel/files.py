@@ -130,7 +130,7 @@ class Node:
         made_for: the digests, by role, that it has to name; Mismatch if it names another.
         """
         version = whole(VERSION, VERSION)
-        heads: dict[str, Reader] = {"format": one_of(f"nlsid/{form}"), "version": version}
+        heads: Table = {"format": one_of(f"nlsid/{form}"), "version": version}
         if kinds:
             heads["kind"] = one_of(*kinds.split())
         for role, made in (made_for or {}).items():

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from fractions import Fraction
 
-from .files import Node, Reader, Terms, each, itself, one_of, refuse_if
+from .files import Node, Table, Terms, each, itself, one_of, refuse_if
 
 EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
 MAX_IMPLICIT, MAX_WINDOW = 30, 60  # states, and entries of w
 EQUATIONS = "format version kind equation period states inputs monotonicity h"
-IMPLICIT: dict[str, Reader] = {  # the members of a file; those of recorded signals are not read
+IMPLICIT: Table = {  # the members of a file; those of recorded signals are not read
     "equation": one_of(EQUATION),
     "period": (),
     "states": each(Node.text, 1, MAX_IMPLICIT),

@@ -17,7 +17,7 @@ from math import comb, lcm
 from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Terms, limit, refuse_if
+from .files import MAX_DEGREE, Rejected, Terms, limit, refuse_if
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
 SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
@@ -170,7 +170,8 @@ class Ring:
             for right, b in q.terms.items():
                 key = left + right
                 terms[key] = terms.get(key, 0) + a * b
-            limit(len(terms), MAX_TERMS, "terms of a polynomial")
+            if len(terms) > MAX_TERMS:
+                raise Rejected(f"a polynomial of more than {MAX_TERMS} terms", "too_large")
         denominator = p.denominator * q.denominator
         return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
 
@@ -212,10 +213,7 @@ def _halves(width: int, count: int) -> int:
 
 
 def at_width(
-    count: int,
-    cases: Iterable[Case],
-    decide: Callable[[Ring, Case], None],
-    least: int = WIDTHS[0],
+    count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], None], least: int = WIDTHS[0]
 ) -> None:
     """Decide each case in a ring of `count` variables, wider from the first that needs it on."""
     widths = [width for width in WIDTHS if width >= least]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, lcm
 
-from .files import MAX_DEGREE, Node, Table, itself, limit, refuse_if, whole
+from .files import MAX_DEGREE, Node, Rejected, Table, itself, limit, refuse_if, whole
 from .polynomials import Polynomial, Ring, packed, unpacked
 
 MAX_BASIS = 200
@@ -162,8 +162,10 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             charge = abs(values[place]) << 2 * highest - columns[i] - columns[j]
             left[i] -= charge
             left[j] -= charge
-        where = f"Bernstein coefficient {k} of {D}, monomial {left.index(min(left))}"
-        refuse_if(min(left) < 0, f"{what}: not positive ({where})", "not_positive")
+        if min(left) < 0:
+            raise Rejected(
+                f"{what}: not positive (Bernstein coefficient {k} of {D})", "not_positive"
+            )
         left = [room * (common // comb(D, k)) for room in left]
         least = list(map(min, least, left)) if k else left
     return {

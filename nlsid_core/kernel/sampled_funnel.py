@@ -14,7 +14,7 @@ from typing import Any
 
 from . import text
 from .exact import Matrix, at_most, identity, inverse_forms, product, transposed
-from .files import Node, Read, Reader, Table, bound_files, itself, limit, refuse_if
+from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 from .sampled_step import Link, Model, Sample, nonnegative, read_link, stretch, triangular
@@ -29,7 +29,7 @@ MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variable
 Policy = dict[str, Any]  # the members of a policy's file
 Funnel = dict[str, Any]  # the members of a funnel's file and of its assumption
 
-ASSUMPTION: dict[str, Reader] = {  # what was measured is no part of the claim
+ASSUMPTION: Table = {  # what was measured is no part of the claim
     "form": Node.text,
     **dict.fromkeys(("bound", "rate", "gain"), nonnegative),
     **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
-from math import prod
 from typing import Any
 
 from .exact import Matrix, definite
-from .files import Mismatch, Node, Reader, Table, Terms, itself, limit, whole
+from .files import Mismatch, Node, Reader, Table, Terms, itself, whole
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -75,8 +74,8 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
     n, count = len(x[0][0]), len(x)
     if policy["t"] != t or _curve(policy["x"], count, n) != x:
         raise Mismatch("the funnel is around another nominal than the policy's")
-    node.require({"one rho a knot": len(rho) == len(t)})
-    node.require({"x should not jump": all(a[-1] == b[0] for a, b in pairwise(x))})
+    smooth = all(a[-1] == b[0] for a, b in pairwise(x))
+    node.require({"one rho a knot": len(rho) == len(t), "x should not jump": smooth})
     node.require({"rho should be positive": min(rho) > 0}, "not_below")
     P = given["P"].array(len(t), n, n)
     for k, shape in enumerate(P):
@@ -85,11 +84,10 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
     u = _curve(policy["u"], count, None)
     m, rows = len(u[0][0]), policy["limits"]
     limits = {int(i): (low, high) for i, low, high in rows if i in range(m)}
+    single = len(limits) == len(rows) <= MAX_LIMITED
     documents["policy"].require(
         {
-            f"at most {MAX_LIMITED} limits, of one input each": len(limits)
-            == len(rows)
-            <= MAX_LIMITED,
+            f"at most {MAX_LIMITED} limits, each of another input": single,
             "limits should have low < high": all(low < high for low, high in limits.values()),
         }
     )
@@ -177,11 +175,6 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
     return pieces
 
 
-def refuse_many(*counts: int) -> None:
-    """Raise Rejected if there are more intervals, vertices and modes than pieces."""
-    limit(prod(counts), MAX_PIECES, "intervals, vertices and modes")
-
-
 def _times(least: int, most: int) -> Reader:
     """A reader of so many times that increase."""
 
@@ -199,7 +192,5 @@ def _curve(node: Node, count: int, *shape: int | None) -> Any:
     for control in curve:
         even = all(len(point) == len(curve[0][0]) for point in control)
         fits = 0 < len(control) <= MAX_TIME_DEGREE + 1 and even
-        node.require(
-            {f"should have degree 0 to {MAX_TIME_DEGREE} in time, points of one size": fits}
-        )
+        node.require({f"should have curves of degree 0 to {MAX_TIME_DEGREE} in time": fits})
     return curve

@@ -24,8 +24,8 @@ from .exact import Matrix, Rows, at_most, definite, unit
 from .files import (
     Node,
     Read,
-    Reader,
     Rejected,
+    Table,
     bound_files,
     each,
     itself,
@@ -45,7 +45,7 @@ MAX_PLAN = 10**6  # samples of a plan
 MAX_TERMS = 200
 MAX_FACTORS = 4
 WORDS = ("E", "e", "g", "i", "x", "sum", "change")  # of a formula: names that are these are quoted
-TERM: dict[str, Reader] = {
+TERM: Table = {
     "inputs": lambda node: node.wholes(None),
     "of": one_of("value", "change"),
     "centre": (),
@@ -59,7 +59,7 @@ CommandLevel = list[tuple[Fraction, Term]]  # its weights, not negative, some po
 Tube = dict[str, Any]  # the members of a tube in a funnel's file
 Policy = dict[str, Any]  # the members of a policy's file
 
-ASSUMPTION: dict[str, Reader] = {  # what was measured is no part of the claim
+ASSUMPTION: Table = {  # what was measured is no part of the claim
     "kind": one_of("fading", "energy"),
     "samples?": whole(1, MAX_SAMPLES),
     **dict.fromkeys(("measured", "safety_factor", "designed_on", "measured_on"), itself),
@@ -94,7 +94,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     roles = "model policy funnel" if planned else "model funnel"
     documents, digests = bound_files(about, read, roles)
     made_for = {role: digests[role] for role in roles.split()[:-1]}
-    table: dict[str, Reader] = {"settling": whole(0, MAX_SAMPLES), "tubes": itself, "box?": itself}
+    table: Table = {"settling": whole(0, MAX_SAMPLES), "tubes": itself, "box?": itself}
     if not planned:
         table |= {"response?": itself, "cusum?": itself}
     funnel = documents["funnel"].document("funnel", table, "tube", made_for)
@@ -172,7 +172,7 @@ def _gaps(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
 
 def _read_tube(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    table: dict[str, Reader] = {
+    table: Table = {
         "rho": (),
         "L": (n, p),
         "P": (n, n),
@@ -209,13 +209,7 @@ def _read_tube(node: Node, model: Model) -> Tube:
 
 def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
     n, p, m = model.states, len(model.H), len(model.u)
-    table: dict[str, Reader] = {
-        "period": (),
-        "start": (n,),
-        "u": (None, m),
-        "K": (m, n),
-        "L": (n, p),
-    }
+    table: Table = {"period": (), "start": (n,), "u": (None, m), "K": (m, n), "L": (n, p)}
     policy = node.document("policy", table, "tube", {"model": made_for})
     node.require({"the period should be the model's": policy["period"] == model.period})
     limit(len(policy["u"]), MAX_PLAN, "samples of a plan", least=1)

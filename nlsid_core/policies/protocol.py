@@ -2,9 +2,7 @@
 
 from typing import Any, Protocol, TypeAlias
 
-from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.policies import continuous, sampled, tube
+from nlsid_core.arrays import FloatArray
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
@@ -31,13 +29,3 @@ class Policy(Protocol):
 
     def covers(self, when: float, x: FloatArray) -> tuple[Any, Any]:
         """The least and greatest input that the proof covers at `when` for the state x."""
-
-
-def read_policy(document: Json, *, source: str = "policy") -> AnyPolicy:
-    """The policy of a document, by its kind; DocumentError says what is wrong with it."""
-    kinds: dict[str, type[AnyPolicy]] = {
-        tube.KIND: TubePolicy,
-        sampled.KIND: SampledPolicy,
-        continuous.KIND: ContinuousPolicy,
-    }
-    return files.of_kind(document, kinds, source=source).from_document(document, source=source)

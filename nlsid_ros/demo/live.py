@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import rclpy
 
 from bags.chain.faults import FAULTS, write_faulty_copy
-from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved, load_proved
+from bags.designs.documents import load
+from bags.designs.wiring import sampler_of
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns
@@ -45,21 +45,21 @@ class Outcome(NamedTuple):
 
 def run_live(funnel: Path, bag: Path, out: Path) -> list[Outcome]:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
-    proved = load_proved(funnel)
+    design = load(funnel)
     faulty = out / f"{bag.name}, {FAULT}"
-    response = proved.design.sampler().responses[0].path
+    response = sampler_of(design).responses[0].path
     write_faulty_copy(bag, faulty, str(response), FAULTS[FAULT])
-    bad = _replayed(proved, faulty)
+    bad = replay_bag(design, faulty, centre=Centre.COMMAND)
     if bad.first_bad is None:
         raise NlsidError(
             f"{bag.name} with its sensor {FAULT} is not flagged: {bad.reason or bad.verdict}. The "
             "demonstration needs a funnel that such a fault leaves"
         )
-    topics = list(proved.design.sampler().topics)
+    topics = list(sampler_of(design).topics)
     first, second = (play(funnel, each, topics, out) for each in (bag, faulty))
     return [
         recorded(bag, first, topics),
-        monitored(first, _replayed(proved, bag)),
+        monitored(first, replay_bag(design, bag, centre=Centre.COMMAND)),
         alarmed(second, response.topic, bad),
     ]
 
@@ -151,10 +151,6 @@ def _decoded(recording: Path, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         msgtype, types = bag.types_on(topic)
         for message in bag.messages([topic]):
             yield message.log_time_ns, message.data, decode(message.data, msgtype, types)
-
-
-def _replayed(proved: Proved[AnyDesign], bag: Path) -> Replay:
-    return replay_bag(proved, bag, centre=Centre.COMMAND)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -25,7 +25,6 @@ from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.design.tube import energy, innovations
-from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD, synthetic_dataset
@@ -49,13 +48,10 @@ def found(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catch
 
 def catches(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catching:
     return what_it_catches(
-        Monitor(design.model, design.policy, design.funnel, centre=Centre.COMMAND),
-        design.model,
-        design.funnel.half_widths.tolist(),
+        design,
         held_back=held_back,
         calibration=calibration_trials(train, least=72).calibration,
         ranges=np.array([np.ptp(np.concatenate([trial.y for trial in train]))]),
-        factor=FACTOR,
         remedy="a shorter run",
     )
 
@@ -182,18 +178,16 @@ def wide(found: Catching, share: float, error: float, shares: tuple[float, ...])
 
 def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert wide(found, 0.5, 0.1, (0.4,)).warnings() == []
-    poor = wide(found, 0.5625, 0.375, (0.44, 0.05, 0.04)).warnings()
-    assert "is 0.5625 of its range, 1 m/s; more than 0.5 says little" in poor[0]
-    assert "trial 0 sets the level: it uses 8.8 times as much" in poor[1]
-    assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor[1]
-    assert "off by up to 0.375 m/s" in poor[2]
-    assert "0.5625 m/s with the safety factor" in poor[2]
-    assert "try more lags, another class" in poor[2]
-    loose = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
-    assert len(loose) == 2
-    assert "the half-width is 20 times that" in loose[1]
-    assert loose[1].endswith("Try a shorter run")
-    assert len(wide(found, 0.3, 0.1, (0.4,)).warnings(0.2)) == 2
+    (poor,) = wide(found, 0.5625, 0.375, (0.44, 0.05, 0.04)).warnings()
+    assert "is 0.5625 of its range, 1 m/s; more than 0.5 says little" in poor
+    assert "trial 0 sets the level: it uses 8.8 times as much" in poor
+    assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor
+    assert "off by up to 0.375 m/s" in poor
+    assert "0.5625 m/s with the safety factor" in poor
+    assert "try more lags, another class" in poor
+    (loose,) = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
+    assert "the half-width is 20 times that" in loose
+    assert loose.endswith("Try a shorter run")
     constant = replace(found, widths=(Width("speed", "m/s", 0.1, 0.0, 0.05),))
     assert "is inf of its range" in constant.warnings()[0]
 
@@ -248,7 +242,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
-        show.say_catching(console, replace(found, rows=(*found.rows, refused)), None)
+        show.say_catching(console, replace(found, rows=(*found.rows, refused)))
     assert "refused was not tried: no such input" in said.get()
 
 
@@ -268,15 +262,11 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     model = made.model
     calibration, held_back = dataset(model, 100), dataset(model, 200, 3)
     ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
-    monitor = Monitor(model, None, made.funnel)
     found = what_it_catches(
-        monitor,
-        model,
-        made.funnel.half_widths.tolist(),
+        made,
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        factor=FACTOR,
         remedy="",
     )
     level, settling = made.funnel.tubes[0].follows, made.funnel.settling
@@ -303,13 +293,10 @@ def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() ->
     ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
     monitor = Monitor(made.model, None, made.funnel)
     found = what_it_catches(
-        monitor,
-        made.model,
-        made.funnel.half_widths.tolist(),
+        made,
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        factor=FACTOR,
         remedy="",
     )
     counts = []
@@ -349,7 +336,7 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     for caught in (c for r in zero for c in (r.funnel, *r.others.values())):
         assert not caught.after < 0.0
     console = Console(record=True, width=100)
-    show.say_catching(console, found, None)
+    show.say_catching(console, found)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
 

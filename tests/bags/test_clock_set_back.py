@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.designs.design import WiredDesign, WiredTube
 from bags.monitoring.replay import replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.batch import LogOrder
@@ -16,6 +15,7 @@ from bags.signals.reader import read_signals
 from bags.signals.sampling import Grid
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
@@ -72,7 +72,7 @@ def test_the_monitor_says_it_and_does_not_blame_the_robot(
         u=Signal("command", "m/s", f"{COMMAND}|clock(log)"),
     )
     design = design_output_tube(OutputTube(model, train))
-    wired: WiredTube = WiredDesign(design.model, None, design.funnel)
+    wired: AnyDesign = Design(design.model, None, design.funnel)
     said = replay_messages(wired, bag, centre=Centre.COMMAND)
     readings = [entry.reading for entry in said]
     assert [r.status for r in readings[len(model) : SET_AT]] == [Status.INSIDE] * (

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from bags.commands.cli import app
 from bags.designs.bundle import Bundle
-from bags.designs.design import Wiring
-from bags.designs.documents import load_proved
+from bags.designs.documents import load
+from bags.designs.wiring import wiring_of
 from bags.monitoring.replay import replay_messages
 from bags.viewing.drawn import HalfWidths
 from bags.viewing.replay import Recording
@@ -27,7 +27,7 @@ from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
 
 RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"
-WIRING = Wiring.parse([RESPONSE], [COMMAND], 0.05)
+WIRING = wiring_of([RESPONSE], [COMMAND], 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -55,16 +55,16 @@ def test_a_stage_that_was_changed_is_refused(folder: Path, tmp_path: Path) -> No
     path = tmp_path / "copy" / "stage2.funnel.json"
     path.write_text(path.read_text().replace("stage", "stage ") + " ")
     with pytest.raises(CertificateMismatch, match=r"stage2"):
-        load_proved(path.with_name(designs.COMPOSITION))
+        load(path.with_name(designs.COMPOSITION))
     path.unlink()
     with pytest.raises(CertificateRejected, match=r"stage2.*funnel"):
-        load_proved(path.with_name(designs.COMPOSITION))
+        load(path.with_name(designs.COMPOSITION))
 
 
 def test_it_is_driven_from_stage_to_stage_and_held_against_each(
     folder: Path, tmp_path: Path
 ) -> None:
-    design = load_proved(folder / designs.COMPOSITION, wiring=WIRING).design
+    design = load(folder / designs.COMPOSITION, wiring=WIRING)
     controller = design.controller(Limits(lowest=-9.0, highest=9.0, stop_rate=9.0), 1.0)
     monitor, x = design.monitor(Centre.PROFILE), np.array([0.05])
     stages, readings, samples = [], [], []
@@ -88,7 +88,7 @@ def test_it_is_driven_from_stage_to_stage_and_held_against_each(
     assert (said.exit_code, "inside" in said.output) == (0, True), said.output
     scene = Scene("a recording", "replay")
     recording = Recording(
-        load_proved(folder / designs.COMPOSITION, wiring=WIRING),
+        load(folder / designs.COMPOSITION, wiring=WIRING),
         tmp_path / "bag",
         centre=Centre.PROFILE,
     )

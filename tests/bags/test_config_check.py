@@ -54,7 +54,7 @@ def test_a_configuration_that_does_not_fit_its_bags_says_all_at_once(tmp_path: P
     assert "Field 'v' does not exist on 'geometry_msgs/msg/Vector3'" in output
     assert "/cmd" in output
     assert "trial_01 and 40 more" in output
-    assert "split.test names run_1, and no bag is called so" in output
+    assert "split.test names run_1; the bags are " in output
     assert len(output.splitlines()) == 3
 
 

@@ -71,7 +71,7 @@ def test_unseen_drives_stay_inside_and_other_floors_are_named(tmp_path: Path) ->
     design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
     for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
         assert str(check(tmp_path / name)).startswith("PROVED")
-    proved = documents.load_proved(tmp_path / documents.FUNNEL)
+    proved = documents.load(tmp_path / documents.FUNNEL)
     test = [bag for bag in dart("rubbery") if bag.name in config.split.test]
     said = {
         bag.name: replay_bag(proved, bag, centre=Centre.COMMAND)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 
@@ -34,7 +33,6 @@ from tests import repeated
 from tests.conftest import synthetic_dataset
 from tests.identified_bags import saturating
 
-SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 CASCADE = Network(FilterMapFilter((2, 1), phases=(1,), intervals=(8,), starts=4))
 
 
@@ -290,29 +288,6 @@ def test_a_selection_without_a_model_says_why() -> None:
 
 
 # -- documents ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["block_cascade", "monotone_equation"])
-def test_documents_of_each_class_validate_against_the_published_schemas(
-    name: str, cascade: Fit[BlockCascade], monotone: Fit[MonotoneEquation]
-) -> None:
-    fit: Fit[BlockCascade] | Fit[MonotoneEquation] = (
-        cascade if name == "block_cascade" else monotone
-    )
-    for schema_name, document in (
-        (name, fit.model.document()),
-        ("proof_stability", fit.proof.document(fit.model, "model.json")),
-    ):
-        schema = files.load_document(SCHEMAS / f"{schema_name}.schema.json")
-        jsonschema.Draft202012Validator.check_schema(schema)
-        jsonschema.validate(document, schema)
-        without = {k: v for k, v in document.items() if k != "format"}
-        for damaged in (without, document | {"extra": 1}, document | {"version": 3}):
-            with pytest.raises(jsonschema.ValidationError):
-                jsonschema.validate(damaged, schema)
-    bent = fit.model.document() | ({"b1": []} if name == "block_cascade" else {"e": [1.0]})
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(bent, files.load_document(SCHEMAS / f"{name}.schema.json"))
 
 
 # -- the last step -----------------------------------------------------------------------------

@@ -222,19 +222,19 @@ def test_select_takes_the_order_with_the_least_validation_error(
 def test_select_tries_every_combination_and_shows_what_has_no_model(
     folder: Path, tmp_path: Path
 ) -> None:
-    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
-    options = {"lags": [1, 3, 100]}
+    config = load_config(
+        write_config(tmp_path / "c.yaml", {"lags": 1}, select={"lags": [1, 3, 100]})
+    )
     few = [bag for bag in bags_in(folder) if bag.name in ("run_0", "run_4", "run_5")]
-    chosen = select_bags(few, config, tmp_path, options=options, progress=silent)
+    chosen = select_bags(few, config, tmp_path, progress=silent)
     one, three, hundred = chosen.selection.errors
     assert three < one
     assert hundred == np.inf
     assert "equations for 202 parameters" in chosen.selection.tried[2].refusal
     section = {"model": "state_affine", "lags": 1, "iterations": 3}
-    affine = load_config(write_config(tmp_path / "a.yaml", section))
-    both = select_bags(
-        few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=silent
-    )
+    tried = {"lags": [1, 2], "right_degree": [1, 2]}
+    affine = load_config(write_config(tmp_path / "a.yaml", section, select=tried))
+    both = select_bags(few, affine, tmp_path, progress=silent)
     assert len(both.selection.tried) == 4
     least = both.selection.tried[int(np.argmin(both.selection.errors))]
     assert both.selection.best is least.model_class
@@ -257,9 +257,9 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
 def test_a_selection_that_makes_no_sense_says_why(
     folder: Path, tmp_path: Path, options: dict[str, list[object]], reason: str
 ) -> None:
-    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
+    path = write_config(tmp_path / "c.yaml", {"lags": 1}, select=options or None)
     with pytest.raises(DataError, match=reason):
-        select_bags(bags_in(folder), config, tmp_path / "out", options=options, progress=silent)
+        select_bags(bags_in(folder), load_config(path), tmp_path / "out", progress=silent)
     assert not (tmp_path / "out").exists()
 
 
@@ -389,7 +389,7 @@ def test_a_split_that_no_bag_fits_is_refused_before_a_bag_is_read(tmp_path: Path
     config = load_config(write_config(tmp_path / "robot.yaml", {"model": "linear", "lags": 2}))
     names = config.split.model_copy(update={"test": ["another"]})
     given = config.model_copy(update={"split": names})
-    with pytest.raises(DataError, match="none of the bags is a test trial"):
+    with pytest.raises(DataError, match=r"split\.test names another; the bags are not_there"):
         read_trials([tmp_path / "not_there"], given, progress=silent)
 
 

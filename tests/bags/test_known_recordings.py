@@ -260,7 +260,6 @@ def ros1_bag(
     text: str = "float64 data",
     compression: str = "none",
     closed: bool = True,
-    chunk: int = 10,
 ) -> Path:
     """A ROS 1 bag of (connection, data): connections 0 and 1 are both on `speed`."""
 
@@ -280,10 +279,10 @@ def ros1_bag(
 
     pack = {"none": bytes, "bz2": bz2.compress, "lz4": lz4.frame.compress}[compression]
     chunks, count = b"", 0
-    for first in range(0, len(messages), chunk):
+    for first in range(0, len(messages), 10):
         content = b"".join(map(connection, sorted({n for n, _ in messages})))
         index: dict[int, bytes] = {}
-        for k, (number, data) in list(enumerate(messages))[first : first + chunk]:
+        for k, (number, data) in list(enumerate(messages))[first : first + 10]:
             stamp = struct.pack("<II", *divmod(START_NS + k * STEP_NS, 10**9))
             index[number] = index.get(number, b"") + stamp + struct.pack("<I", len(content))
             fields = {"op": b"\x02", "conn": struct.pack("<I", number), "time": stamp}

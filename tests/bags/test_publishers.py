@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from bags.designs.design import WiredDesign, WiredTube
 from bags.monitoring.replay import replay_messages
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import read_dataset
@@ -17,6 +16,7 @@ from bags.signals.sampling import Grid
 from bags.tools.fitness import Level, check_fitness
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
@@ -87,20 +87,20 @@ def bag_of(path: Path, senders: Iterable[Sent], *, counted: bool) -> Path:
 
 
 @pytest.fixture
-def resampled(fit: Fit[DifferenceEquation], train: Dataset) -> WiredTube:
+def resampled(fit: Fit[DifferenceEquation], train: Dataset) -> AnyDesign:
     model = replace(
         fit.model,
         y=Signal("speed", "m/s", f"{SPEED}|linear(0.3 s)"),
         u=Signal("command", "m/s", COMMAND),
     )
     design = design_output_tube(OutputTube(model, train))
-    return WiredDesign(design.model, None, design.funnel)
+    return Design(design.model, None, design.funnel)
 
 
 @pytest.mark.parametrize("counted", [False, True], ids=["no counts", "counted"])
 @pytest.mark.parametrize("senders", TWO.values(), ids=TWO)
 def test_a_signal_of_two_publishers_is_unknown_bad_and_refused(
-    senders: tuple[Sent, ...], counted: bool, resampled: WiredTube, tmp_path: Path
+    senders: tuple[Sent, ...], counted: bool, resampled: AnyDesign, tmp_path: Path
 ) -> None:
     bag = bag_of(tmp_path / "bag", senders, counted=counted)
     readings = [r.reading for r in replay_messages(resampled, bag, centre=Centre.COMMAND)]
@@ -122,7 +122,7 @@ def test_a_signal_of_two_publishers_is_unknown_bad_and_refused(
 
 @pytest.mark.parametrize("senders", ONE.values(), ids=ONE)
 def test_a_signal_of_one_publisher_after_another_is_known(
-    senders: tuple[Sent, ...], resampled: WiredTube, tmp_path: Path
+    senders: tuple[Sent, ...], resampled: AnyDesign, tmp_path: Path
 ) -> None:
     bag = bag_of(tmp_path / "bag", senders, counted=True)
     readings = [r.reading for r in replay_messages(resampled, bag, centre=Centre.COMMAND)]

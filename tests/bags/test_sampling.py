@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bags.designs.design import WiredDesign
 from bags.monitoring.replay import Replay, replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types
@@ -22,6 +21,7 @@ from bags.signals.reader import read_signals
 from bags.signals.sampling import LOST, MOST_LOST, Grid, Sample, Sampler
 from bags.tools.listing import bag_signals
 from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
 from nlsid_core.identification import Polynomial, identify
 from nlsid_core.running.comparison import Centre
@@ -433,7 +433,7 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     fit = identify(data, Polynomial(4))
     model = replace(fit.model, training="sha256:0")
     made = design_output_tube(OutputTube(model, data, profile=[(0.0, 0.0), (9.7, 0.5)], inlet=0.1))
-    design = WiredDesign(made.model, made.policy, made.funnel)
+    design: AnyDesign = Design(made.model, made.policy, made.funnel)
     said = replay_messages(design, bags[0], centre=Centre.COMMAND)
     trial = data.trajectories[0]
     assert [list(entry.reading.measured) for entry in said] == trial.y.tolist()
@@ -463,7 +463,7 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
     model = replace(identify(data, Polynomial(1)).model, training="sha256:0")
     made = design_output_tube(OutputTube(model, data))
-    design = WiredDesign(made.model, made.policy, made.funnel)
+    design: AnyDesign = Design(made.model, made.policy, made.funnel)
     before, after = (replay_messages(design, bag) for bag in (whole, lossy))
     assert len(before) == len(after) == len(u)
     assert [entry.reading for entry in after[:50]] == [entry.reading for entry in before[:50]]

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.plants import ARM, PENDULUM, PERIOD, Plant
 from bags.chain.simulation import record_repeats
+from bags.chain.steps import read_signals_of
 from bags.chain.tracking_config import load_tracking_config
-from bags.chain.tracking_steps import read_states
 from bags.commands.cli import app
 from nlsid_core.errors import DataError
 
@@ -55,7 +55,7 @@ def test_drives_do_not_give_more_than_their_limit() -> None:
 def test_bags_of_a_simulated_robot_read_back_bit_for_bit_as_repeats(tmp_path: Path) -> None:
     data = record_repeats(ARM, peak=np.array([4.0, 2.0]), groups=1, repeats=2, seconds=1.0, seed=0)
     bags = [write_joint_bag(tmp_path, trial) for trial in data]
-    again = read_states(bags, load_tracking_config(ROOT / "config" / "arm.yaml"))
+    again = read_signals_of(bags, load_tracking_config(ROOT / "config" / "arm.yaml"))
     for trial, read in zip(data, again, strict=True):
         np.testing.assert_array_equal(read.y, trial.y)
         np.testing.assert_array_equal(read.u, trial.u)

@@ -1,7 +1,6 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,11 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
 from bags.commands.show import UNJUDGED_SAID
 from bags.designs import documents
-from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved
 from bags.monitoring.replay import replay_bag
 from bags.monitoring.watch import Watch
 from bags.signals.sampling import LOST
 from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.designs import AnyDesign
 from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
@@ -60,9 +58,9 @@ def linear_funnel(one: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def linear(linear_funnel: Path) -> Proved[AnyDesign]:
+def linear(linear_funnel: Path) -> AnyDesign:
     """The same, loaded."""
-    return documents.load_proved(linear_funnel)
+    return documents.load(linear_funnel)
 
 
 @pytest.fixture(scope="module")
@@ -81,11 +79,8 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     path = write_config(tmp_path / "config.yaml", (ONE | TWO)[name], **counts, **FUNNEL)
     funnel = designed(path, folder, tmp_path / "out")
     assert "for ever" in check(funnel.parent / documents.FUNNEL_PROOF).statement
-    proved = documents.load_proved(funnel)
-    replayed = replay_bag(proved, folder / "run_5", centre=Centre.COMMAND, forecast=6 * PERIOD)
-    assert [len(fan) for fan in replayed.fans[:3]] == [7, 7, 7]
-    assert len(replayed.forecasts) > len(replayed.judged)
-    assert all(entry.kept for entry in replayed.forecasts)
+    proved = documents.load(funnel)
+    replayed = replay_bag(proved, folder / "run_5", centre=Centre.COMMAND)
     assert replayed.judged_span == pytest.approx(replayed.span)
     assert replayed.span > 1.5
     assert replayed.verdict == Status.INSIDE.value
@@ -116,33 +111,14 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     assert done.output.count("1 sample is missing") == UNJUDGED_SAID == 3
     last = f"the last 1 sample at {PERIOD * 250:.3f} s"
     assert f"gaps: not judged: 2 more samples in 2 places, {last}" in done.output
-    replayed = replay_bag(documents.load_proved(linear_funnel), bag, centre=Centre.COMMAND)
+    replayed = replay_bag(documents.load(linear_funnel), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
     assert [k for k, r in enumerate(replayed.readings) if r.reason == LOST] == [100, 101, 102]
     assert replayed.span - replayed.judged_span == pytest.approx(0.03)
     assert {r.status for r in replayed.readings[103:]} == {Status.INSIDE}, "the run goes on"
 
 
-def test_forecasts_of_a_bag_are_counted_and_a_faulty_output_leaves_them(
-    one: Path, linear_funnel: Path, tmp_path: Path
-) -> None:
-    held = ["monitor", str(linear_funnel.parent), "--forecast", "0.2"]
-    done = CliRunner().invoke(app, [*held, str(one / "run_5")])
-    said = re.search(r"under the commands that came, hold (\d+) of (\d+) samples", done.output)
-    assert said is not None, done.output
-    assert said[1] == said[2] != "0"
-    y = np.zeros((60, 2))
-    y[40:, 0] = 50.0
-    trial = Trajectory(t=PERIOD * np.arange(60), y=y, u=np.zeros((60, 1)), name="step")
-    bag, proved = write_joint_bag(tmp_path, trial), documents.load_proved(linear_funnel)
-    replayed = replay_bag(proved, bag, centre=Centre.COMMAND, forecast=0.2)
-    left = [entry.t for entry in replayed.forecasts if not entry.kept]
-    assert left[0] == pytest.approx(40 * PERIOD)
-    assert replayed.first_bad is not None
-    assert replayed.first_bad.t <= left[0]
-
-
-def test_a_bag_with_a_long_hole_is_not_inside(linear: Proved[AnyDesign], tmp_path: Path) -> None:
+def test_a_bag_with_a_long_hole_is_not_inside(linear: AnyDesign, tmp_path: Path) -> None:
     kept = np.r_[np.arange(60), np.arange(20_060, 20_100)]
     zeros = np.zeros((len(kept), 2))
     trial = Trajectory(t=PERIOD * kept, y=zeros, u=zeros[:, :1], name="hole")
@@ -152,9 +128,9 @@ def test_a_bag_with_a_long_hole_is_not_inside(linear: Proved[AnyDesign], tmp_pat
 
 
 def test_a_recording_whose_outputs_stop_before_its_commands_is_not_inside(
-    linear: Proved[AnyDesign],
+    linear: AnyDesign,
 ) -> None:
-    watch = Watch(linear.design)
+    watch = Watch(linear)
     for k in range(300):
         stamp_ns = round((k + 1) * PERIOD * 1e9)
         watch.excitation(stamp_ns, 0.0)

@@ -16,6 +16,7 @@ import pytest
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.designs import documents
+from bags.designs.wiring import read_at
 from bags.monitoring.replay import replay_messages
 from bags.samples import f1tenth
 from bags.viewing import scene
@@ -336,18 +337,18 @@ def test_a_browser_shows_hostile_names_as_text(page: Page) -> None:
 
 
 def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_path: Path) -> None:
-    proved = documents.load_proved(funnel)
+    proved = documents.load(funnel)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     bad = tmp_path / "bad"
-    write_faulty_copy(trial, bad, str(proved.design.response), FAULTS["scaled by 0.6"])
-    readings = replay_messages(proved.design, bad, centre=Centre.COMMAND)
+    write_faulty_copy(trial, bad, str(read_at(proved)), FAULTS["scaled by 0.6"])
+    readings = replay_messages(proved, bad, centre=Centre.COMMAND)
     shown = Scene("a recording", "replay")
     Recording(proved, bad, centre=Centre.COMMAND).play(shown, 1e6, threading.Event())
     _, samples = shown.samples_after(0, 10**9)
     assert [s.stamp_ns for s in samples] == [entry.stamp_ns for entry in readings]
     margins = [s.numbers["margin"] for s in samples]
     assert margins == pytest.approx([e.reading.margin for e in readings], nan_ok=True, abs=0.0)
-    width = proved.design.funnel.half_width  # type: ignore[union-attr]
+    width = proved.funnel.half_width
     assert {s.signal("half_width", 0) for s in samples} == {width}
     said = shown.verdict()
     assert (said.word, said.level) == ("recording over", STALE)
@@ -361,10 +362,10 @@ def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_
 
 
 def test_a_replay_keeps_the_pace_of_the_stamps_and_stops_when_asked(funnel: Path) -> None:
-    proved = documents.load_proved(funnel)
+    proved = documents.load(funnel)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     recording = Recording(proved, trial, centre=Centre.COMMAND)
-    stamps = [e.stamp_ns for e in replay_messages(proved.design, trial, centre=Centre.COMMAND)]
+    stamps = [e.stamp_ns for e in replay_messages(proved, trial, centre=Centre.COMMAND)]
     span = (max(stamps) - stamps[0]) / 1e9
     shown, closing = Scene("a recording", "replay"), threading.Event()
     began = time.monotonic()
@@ -380,7 +381,7 @@ def test_a_replay_keeps_the_pace_of_the_stamps_and_stops_when_asked(funnel: Path
 def test_the_plotjuggler_layout_asks_for_what_is_published(funnel: Path) -> None:
     root = ElementTree.parse(config_file("plotjuggler_layout.xml")).getroot()
     asked = {curve.attrib["name"].split("/")[3] for curve in root.iter("curve")}
-    proved = documents.load_proved(funnel)
+    proved = documents.load(funnel)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    reading = replay_messages(proved.design, trial, centre=Centre.COMMAND)[-1].reading
-    assert asked <= set(reading.numbers | HalfWidths(proved.design).of(reading))
+    reading = replay_messages(proved, trial, centre=Centre.COMMAND)[-1].reading
+    assert asked <= set(reading.numbers | HalfWidths(proved).of(reading))

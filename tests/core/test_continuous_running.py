@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.designs.design import WiredDesign, Wiring
+from bags.designs.wiring import read_at, wiring_of
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.running.controller import Controller, Limits
@@ -294,13 +295,11 @@ def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
 
 
 def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
-    design = WiredDesign(*stage())
+    design: AnyDesign = Design(*stage())
     with pytest.raises(DataError, match="names no signals"):
-        _ = design.response
-    wired = replace(
-        design, wiring=Wiring.parse(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
-    )
-    assert str(wired.response) == "/joints:position[0]"
+        read_at(design)
+    wired = replace(design, wiring=wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD))
+    assert str(read_at(wired)) == "/joints:position[0]"
     watch = Watch(wired, announced=True)
     said = watch.begin(0)
     for k in range(3):
@@ -314,8 +313,8 @@ def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
 def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_path: Path) -> None:
     """The state in one message, the input in another, on a clock of nanoseconds."""
     field, policy, funnel = stage()
-    wiring = Wiring.parse(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
-    design = WiredDesign(field, policy, funnel, wiring)
+    wiring = wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
+    design: AnyDesign = Design(field, policy, funnel, wiring=wiring)
     controller = design.controller(LIMITS, 1.0)
     x: FloatArray = np.array([0.1])
     samples: list[tuple[FloatArray, FloatArray]] = []

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import nlsid_core
 from nlsid_core import files
 from nlsid_core.documents import load
-from nlsid_core.dynamics import Nominal, VectorField, constant_on, cubic_through, linear_through
+from nlsid_core.dynamics import VectorField, constant_on, cubic_through, linear_through
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
@@ -61,11 +60,6 @@ def discrete_documents() -> dict[str, Any]:
         ),
         "tube_policy": TubePolicy(np.zeros(2), np.zeros(3), np.zeros(2), np.ones(2), 0.1, "m"),
     }
-
-
-def test_the_promised_names_are_at_home_in_nlsid_core() -> None:
-    assert set(nlsid_core.__all__) == {"Nominal", "VectorField", "load"}
-    assert Nominal.__module__.startswith("nlsid_core.dynamics")
 
 
 def test_a_funnel_reads_back_bit_for_bit_with_every_promised_name(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """The searches beside the sweep: the sampled relaxation, which proves nothing, and alternations."""
 
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,11 @@ from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, i
 from nlsid_core.design.continuous.pieces import proof_basis, prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.vstep import improve
-from nlsid_core.designs import Design
+from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.proofs import Verdict, check
+from nlsid_core.proofs import check
 
 GOAL = 20 * np.eye(2)
 WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}
@@ -77,10 +76,9 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
         "pieces": [],
         "goal_multiplier": 0.995,
     }
-    claimed = Verdict("all of it", Fraction(1), (), {})
     goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
     claim = {"kind": "continuous_funnel", "goal": goal}
-    forged = Design(*parts, claim, proof, claimed, None)
+    forged: AnyDesign = Design(*parts, {"claim": claim, "proof": proof})
     with pytest.raises(CertificateRejected, match="pieces should be a list of 1 to"):
         check(forged.save(tmp_path)[-1])
 

@@ -118,7 +118,7 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
     scores = validate(stable.model, data)
     assert not scores.white
     assert "NOT white" in str(scores)
-    report = page(stable, data, data, robot="unstable")
+    report = page(stable, {"training": data, "test": data}, robot="unstable")
     assert "simulation residual is NOT white (99 %)" in report
     assert "one-step residual is NOT white (99 %)" in report
 

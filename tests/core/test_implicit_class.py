@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -27,7 +26,6 @@ from nlsid_core.models import ImplicitModel
 from nlsid_core.proofs import check, proof_document
 from tests import implicit_models
 
-SCHEMA = Path(__file__).resolve().parents[2] / "docs" / "schema" / "implicit.schema.json"
 WIDE = ((-30.0, 30.0),) * 3
 STATE = (1,)  # delays where the output is the state
 SPRING = Polynomial(1, STATE, Degrees(left=3), set="2.11")
@@ -238,10 +236,9 @@ def test_a_coefficient_that_was_changed_with_all_digests_is_refused(tmp_path: Pa
         check(path)
 
 
-def test_the_document_keeps_signals_and_validates_against_the_published_schema() -> None:
+def test_the_document_keeps_signals_and_refuses_a_wrong_window() -> None:
     model = identify(Dataset((spring(200, 0, noise=0.01),)), CLASSES[3], comparators=()).model
-    document, schema = model.document(), files.load_document(SCHEMA)
-    jsonschema.validate(document, schema)
+    document = model.document()
     again = ImplicitModel.from_document(document)
     assert (again.y, again.u, again.window) == (model.y, model.u, ((0, 0), (0, 1)))
     assert again.document() == document

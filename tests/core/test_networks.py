@@ -63,7 +63,9 @@ def example(name: str) -> Example:
     """Signals of a structure that use all that it has, with their parameters."""
     rng = np.random.default_rng(1)
     if name in ("loop", "stages"):
-        layout = Layout.of(Feedback(2), [Trial(np.zeros((9, 2)), np.linspace(-1, 1, 9), [], 0)])
+        layout = Layout.of(
+            Feedback(2), [Trial(np.zeros((9, 2)), np.linspace(-1, 1, 9), np.zeros(0), 0)]
+        )
         a, b, e, phi = (
             np.array([1.2, -0.5]),
             0.1 * rng.normal(size=7),
@@ -360,7 +362,7 @@ def test_a_damaged_network_or_cascade_is_refused() -> None:
     model = truth()
     for numbers in ({"b2": np.ones((2, 2))}, {"period": 0.0}):
         with pytest.raises((DataError, ShapeError)):
-            replace(model, **numbers)  # type: ignore[arg-type]
+            replace(model, **numbers)
     with pytest.raises(ShapeError):
         model.simulate(np.ones(5), np.zeros(2))
     with pytest.raises(DataError, match="pole at 1"):

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bags.designs.design import WiredDesign
 from bags.monitoring.watch import Watch
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid_core.designs import Design
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import factor
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
@@ -290,7 +290,7 @@ def test_a_lost_first_message_does_not_shift_the_plan() -> None:
         states.append(plan[k - 1] + 0.35 * radius[k] * step / np.linalg.norm(S[k] @ step))
     away = [np.linalg.norm(S[k] @ (states[k] - plan[k])) / radius[k] for k in range(1, STEPS)]
     assert max(away) > 1.0, "it is truly outside"
-    watch = Watch(WiredDesign(made.model, made.policy, made.funnel), announced=True)
+    watch = Watch(Design(made.model, made.policy, made.funnel), announced=True)
     start_ns, period_ns = 10**12, round(PERIOD * 1e9)
     said = watch.begin(start_ns)
     for k in range(1, STEPS):

@@ -195,7 +195,7 @@ def test_a_missing_step_is_refused(tmp_path: Path) -> None:
     proof = copy.deepcopy(design.proof)
     del proof["steps"][3]
     with pytest.raises(CertificateRejected, match="steps"):
-        check(write(replace(design, proof=proof), tmp_path))
+        check(write(replace(design, certificate=design.certificate | {"proof": proof}), tmp_path))
 
 
 def test_commissioning_on_the_fitting_bags_is_refused_before_anything_is_written() -> None:

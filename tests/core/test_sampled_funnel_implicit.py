@@ -4,7 +4,6 @@ import copy
 from dataclasses import replace
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import tvlqr
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, Infeasible
-from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.proofs import check
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -25,7 +23,6 @@ from tests.marks import slow_among
 from tests.tracked import assumption, resigned, step, write
 
 ROLES = ("model", "policy", "funnel")
-SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 
 
 @pytest.mark.parametrize("form", ["response", "peak"])
@@ -117,7 +114,7 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         taken["curvature"] = [0.9 * v for v in taken["curvature"]]
     else:
         raise ValueError(what)
-    return replace(design, proof=proof)
+    return replace(design, certificate=design.certificate | {"proof": proof})
 
 
 def rows_of(entry: Json) -> list[list[int]]:
@@ -219,24 +216,3 @@ def test_the_monitor_reads_unknown_where_the_model_has_no_next_state() -> None:
     reading = monitor.update(PERIOD, start, np.zeros(1))
     assert reading.status is Status.UNKNOWN
     assert "no next state" in reading.reason
-
-
-@pytest.mark.parametrize(
-    ("file", "name"),
-    {
-        "model.json": "model_trapezoidal",
-        "funnel.json": "funnel_sampled",
-        "policy.json": "policy_sampled",
-        "funnel.proof.json": "proof_sampled_funnel",
-    }.items(),
-)
-def test_the_documents_of_an_implicit_funnel_validate_and_damaged_ones_do_not(
-    file: str, name: str, tmp_path: Path
-) -> None:
-    write(designed(), tmp_path)
-    assert isinstance(designed().model, TrapezoidalModel)
-    schema = files.load_document(SCHEMAS / f"{name}.schema.json")
-    document = files.load_document(tmp_path / file)
-    jsonschema.validate(document, schema)
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(document | {"extra": 1}, schema)

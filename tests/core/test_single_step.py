@@ -1,6 +1,5 @@
 """One sample of an implicit model on plain numbers: the same as the step of whole arrays."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -31,16 +30,3 @@ def test_a_single_step_is_the_step_of_whole_arrays(name: str, size: float) -> No
         w = size * rng.normal(size=len(model.inputs))
         expected = model.step(x, np.tile(w, (3, 1)))
         assert single(x, w) == pytest.approx(expected, rel=1e-8, abs=1e-8)
-
-
-def test_a_single_step_is_quick() -> None:
-    """A monitor that has 60 us for a sample takes two such states; a slow machine gets 200."""
-    model, rng = implicit_models.lagged(), np.random.default_rng(0)
-    single, x, w = SingleStep(model), rng.normal(size=(2, 2)), rng.normal(size=len(model.inputs))
-    best = np.inf
-    for _ in range(5):
-        started = time.perf_counter()
-        for _ in range(200):
-            single(x, w)
-        best = min(best, (time.perf_counter() - started) / 200)
-    assert best < 200e-6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES, _make
-from bags.designs.design import SampledDesign, is_sampled, read_design
+from bags.designs.bundle import Bundle
 from bags.monitoring.announcement import Run
 from bags.monitoring.replay import announced_runs, replay_messages
 from bags.recordings.message_types import standard_types
@@ -14,6 +14,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.running.controller import Controller, Limits
@@ -26,7 +27,7 @@ LIMITS = Limits(lowest=-9.0, highest=9.0, stop_rate=50.0)
 NOISE = np.array([1e-4, 1e-3])
 
 
-def design() -> SampledDesign:
+def design() -> AnyDesign:
     """The funnel of `tests.tracked` as the nodes read it, its signals on joint topics."""
     made = designed()
     documents = {role: getattr(made, role).document() for role in ("model", "policy", "funnel")}
@@ -37,9 +38,7 @@ def design() -> SampledDesign:
     digest = files.digest(documents["model"])
     documents["policy"]["model"] = documents["funnel"]["model"] = digest
     documents["funnel"]["policy"] = files.digest(documents["policy"])
-    read = read_design(documents)
-    assert is_sampled(read)
-    return read
+    return Bundle({name: files.encode(document) for name, document in documents.items()}).design()
 
 
 def run(

@@ -6,14 +6,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from nlsid_core import files
+from nlsid_core import documents, files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.states import identify_states
 from nlsid_core.kernel.sampled_step import Sample, implicit_step
-from nlsid_core.models.measured_state import read_measured_state
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from tests.implicit_pendulum import EXPONENTS, PERIOD, PHYSICS, truth
 
@@ -98,7 +97,7 @@ def test_the_linearised_step_is_the_slope_of_steps() -> None:
 
 def test_a_trapezoidal_model_reads_back_from_its_document_bit_for_bit() -> None:
     text = files.encode(truth().document())
-    again = read_measured_state(files.parse_document(text))
+    again = documents.read(files.parse_document(text), source="model")
     assert isinstance(again, TrapezoidalModel)
     assert files.encode(again.document()) == text
 

@@ -37,9 +37,9 @@ ROOMS = (
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {
     "search": {"identification", "design", "sos", "conic"},
-    "run": {"running"},
+    "run": {"running", "designs"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
-    | {"documents", "proofs", "designs"},
+    | {"documents", "proofs"},
     "base": {"errors", "arrays", "files", "options", "progress", "native"},
     "kernel": {"kernel"},
 }

@@ -18,8 +18,8 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from sensor_msgs.msg import JointState
 
-from bags.designs.design import Wiring
-from bags.designs.documents import load_proved
+from bags.designs.documents import load
+from bags.designs.wiring import wiring_of
 from examples import (
     cart_pole,
     pendulum,
@@ -180,8 +180,8 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
     robot.controlled(path)
     judged = robot.run(np.array([0.1]), lambda _x, u: u)
     assert len(judged) == pytest.approx(20 * stages, abs=1)
-    wiring = Wiring.parse(["/joints:position[0]"], ["/effort:effort[0]"], 0.05)
-    monitor = load_proved(path, wiring=wiring).design.monitor(Centre.PROFILE)
+    wiring = wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], 0.05)
+    monitor = load(path, wiring=wiring).monitor(Centre.PROFILE)
     margins = [monitor.update(k * 0.05, x, u).margin for k, (_, x, u) in enumerate(judged)]
     assert [robot.margins[stamp] for stamp, *_ in judged] == margins, "bit for bit"
     assert min(margins) > 0.3

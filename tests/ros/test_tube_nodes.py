@@ -244,8 +244,8 @@ def test_live_is_replay_for_every_class(stack: ExitStack, tmp_path: Path) -> Non
                 sent[topic].publish(data)
             robot.spin_until(lambda stamp=stamp: stamp in heard)  # type: ignore[misc]
         stop(monitor)
-        proved = documents.load_proved(folder / documents.FUNNEL)
-        funnel = proved.design.funnel
+        proved = documents.load(folder / documents.FUNNEL)
+        funnel = proved.funnel
         assert isinstance(funnel, TubeFunnel)
         assert funnel.tubes[0].follows is not None
         replayed = replay_bag(proved, bag, centre=Centre.COMMAND)

@@ -54,7 +54,7 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
     robot: Robot, funnel: Path
 ) -> None:
     port = free_port()
-    proved = documents.load_proved(funnel).design.funnel
+    proved = documents.load(funnel).funnel
     assert isinstance(proved, TubeFunnel)
     width = proved.half_width
     names = {"__ns": "/robot1"}

@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from itertools import count, pairwise
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM, Signals
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
 from bags.samples import dart, f1tenth
 from bags.setup.candidates import look
-from bags.setup.proposing import propose
+from bags.setup.proposing import Chosen, propose
 from bags.setup.written import yaml_text
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
@@ -144,9 +143,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    replayed = replay_bag(
-        documents.load_proved(out / documents.FUNNEL), trial, centre=Centre.COMMAND
-    )
+    replayed = replay_bag(documents.load(out / documents.FUNNEL), trial, centre=Centre.COMMAND)
     assert replayed.verdict == "inside"
     expected = [
         (stamp, reading.margin)
@@ -400,7 +397,7 @@ def test_the_loop_is_closed_and_judged_as_in_replay_whether_pushed_gently_or_too
     for each in running:
         stop(each)
 
-    replay = replay_bag(documents.load_proved(funnel), bag, centre=Centre.PROFILE)
+    replay = replay_bag(documents.load(funnel), bag, centre=Centre.PROFILE)
     judged = {
         stamp_ns: reading.numbers
         for stamp_ns, reading in zip(replay.stamps_ns, replay.readings, strict=True)
@@ -466,14 +463,11 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
 ) -> None:
     """The F1TENTH car: speed and steering commands to speed and yaw rate, over DDS."""
     bags, config, out = f1tenth(), tmp_path / "robot.yaml", tmp_path / "two_by_two"
-    chosen: dict[str, Any] = {
-        "responses": [
-            "/odom:twist.twist.linear.x",
-            "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)",
-        ],
-        "excitations": ["/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"],
-    }
-    config.write_text(yaml_text(propose(bags, look(bags), robot="car", **chosen)))
+    chosen = Chosen(
+        ("/odom:twist.twist.linear.x", "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"),
+        ("/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"),
+    )
+    config.write_text(yaml_text(propose(bags, look(bags), chosen)))
     settings = load_config(config)
     identify_bags(bags, settings, out, progress=silent)
     design_funnel_files(out / documents.MODEL, settings, out)

@@ -1,7 +1,6 @@
 """A motion to track and what follows it: direct transcription, time-varying LQR, observer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,16 +19,7 @@ ITERATIONS = 30  # of linearising the model around the last motion
 SETTLED = 1e-6  # largest defect of a motion, in half-widths of the data box, when it is done
 RESERVE = 0.1  # of the box's half-width, kept free for feedback and funnel
 SMOOTHNESS = 10.0  # weight of changes of the input against the input itself
-NEARNESS = 1e-3  # weight of the state against the input where no motion is given ...
-FIDELITY = 1e5  # ... and of being near a motion that is given
-
-
-@dataclass(frozen=True, eq=False)
-class _Pull:
-    """weight·|x - towards|² in the cost, towards (N + 1, n) in unit variables of the box."""
-
-    towards: FloatArray
-    weight: float
+NEARNESS = 1e-3  # weight of the state against the input
 
 
 def plan_motion(
@@ -53,32 +43,13 @@ def plan_motion(
         if end.shape != (n,):
             raise ShapeError(f"start and goal should have shape ({n},), one has {end.shape}")
     straight = ends[0] + np.linspace(0.0, 1.0, steps + 1)[:, None] * (ends[1] - ends[0])
-    return _transcribed(model, straight, reserve=reserve, fidelity=None)
-
-
-def follow_motion(
-    model: MeasuredState, samples: ArrayLike, *, reserve: float = RESERVE
-) -> tuple[FloatArray, FloatArray]:
-    """The model's own motion nearest to given states (N + 1, n), one per period: x and u (N, p).
-
-    It starts and ends where they do, with smooth inputs, within the data box. Raises as
-    `plan_motion`.
-    """
-    given = np.asarray(samples, dtype=np.float64)
-    if given.ndim != 2 or given.shape[1] != len(model) or len(given) < 2:
-        raise ShapeError(f"samples should be (N + 1, {len(model)}), N > 0; they are {given.shape}")
-    if not np.isfinite(given).all():
-        raise DataError("the samples of the motion hold NaN or infinity")
-    return _transcribed(model, given, reserve=reserve, fidelity=FIDELITY)
+    return _transcribed(model, straight, reserve=reserve)
 
 
 def _transcribed(
-    model: MeasuredState, given: FloatArray, *, reserve: float, fidelity: float | None
+    model: MeasuredState, given: FloatArray, *, reserve: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Sequential quadratic programs from the states (N + 1, n) `given`, which fix the ends.
-
-    fidelity: weight of staying near them; None: only the ends count.
-    """
+    """Sequential quadratic programs from the states (N + 1, n) `given`, which fix the ends."""
     for end in (given[0], given[-1]):
         outside = (end < model.x_range[:, 0]) | (end > model.x_range[:, 1])
         if outside.any():
@@ -87,12 +58,10 @@ def _transcribed(
                 f"{model.x[i].name} {end[i]:g} is outside {model.x_range[i].tolist()}, where the "
                 "model has data"
             )
-    half, middle = np.diff(model.x_range, axis=1)[:, 0] / 2, model.x_range.mean(axis=1)
-    near = np.zeros_like(given) if fidelity is None else (given - middle) / half
-    pull = _Pull(near, NEARNESS if fidelity is None else fidelity)
+    half = np.diff(model.x_range, axis=1)[:, 0] / 2
     x, u = given, np.tile(model.u_range.mean(axis=1), (len(given) - 1, 1))
     for _ in range(ITERATIONS):
-        x, u = _subproblem(model, x, u, (given[0], given[-1]), reserve, pull)
+        x, u = _subproblem(model, x, u, (given[0], given[-1]), reserve)
         defect = float(np.abs((x[1:] - model(x[:-1], u)) / half).max())
         if defect < SETTLED:
             return _rolled_out(model, x, u), u
@@ -151,7 +120,6 @@ def _subproblem(
     u: FloatArray,
     ends: Sequence[FloatArray],
     reserve: float,
-    pull: "_Pull",
 ) -> tuple[FloatArray, FloatArray]:
     """The quadratic program linearised at (x, u), in unit variables of the box."""
     N, n, p = len(u), len(model), len(model.u)
@@ -178,10 +146,10 @@ def _subproblem(
     bound[free] = 2.0
     changes = sp.eye(N * p, format="csr")[p:] - sp.eye(N * p, format="csr")[:-p]
     cost = sp.eye(N * p) + SMOOTHNESS * N * (changes.T @ changes)
-    P = sp.block_diag([pull.weight * sp.eye((N + 1) * n), cost], format="csc")
+    P = sp.block_diag([NEARNESS * sp.eye((N + 1) * n), cost], format="csc")
     program = ConeProgram(
         P=sp.csc_matrix(P),
-        q=np.concatenate([-pull.weight * pull.towards.ravel(), np.tile(mid_u / half_u, N)]),
+        q=np.concatenate([np.zeros((N + 1) * n), np.tile(mid_u / half_u, N)]),
         A=sp.vstack([*rows, pick, -pick], format="csc"),
         b=np.concatenate([*right, bound, bound]),
         cones=(Cone("zero", (N + 2) * n), Cone("nonnegative", 2 * size)),

@@ -149,7 +149,9 @@ def cells_in_a_row(
     for row, found in sorted(tried, key=lambda entry: entry[1].rms)[:KEPT]:
         finer, theta, trials = _finer(row, found, scaled.trials, made.intervals)
         problem = finer.problem(trials, slowest)
-        last = minimise(problem, theta, steps=task.method.iterations, tolerance=TOLERANCE)
+        last = minimise(
+            problem, theta, steps=task.wanted("sem_certified").iterations, tolerance=TOLERANCE
+        )
         refined.append((finer, last))
         steps.append(Step(f"{made.intervals} intervals", scaled.y[1] * last.rms))
     row, best = min(refined, key=lambda entry: entry[1].rms)

@@ -207,7 +207,7 @@ def feedback_unrolled(
         begin = np.concatenate([theta, further])
         problem = _stages(first, maps, known, slowest)
         theta = minimise(
-            problem, begin, steps=task.method.iterations, tolerance=TOLERANCE
+            problem, begin, steps=task.wanted("sem_certified").iterations, tolerance=TOLERANCE
         ).parameters
         further = theta[-len(further) :]
         reached = _stages(first, maps, judges, slowest).mean_square(theta) ** 0.5
@@ -217,7 +217,9 @@ def feedback_unrolled(
             best, chosen = reached, (maps, theta)
     maps, theta = chosen
     problem = _stages(layout, maps, _known(layout, loop, model_class), slowest)
-    last = minimise(problem, theta, steps=task.method.iterations, tolerance=TOLERANCE)
+    last = minimise(
+        problem, theta, steps=task.wanted("sem_certified").iterations, tolerance=TOLERANCE
+    )
     every = _stages(layout, maps, loop.trials, slowest)
     error = every.mean_square(last.parameters) ** 0.5
     history.append(Step("fitted to all trials, training error", scaled.y[1] * error))

@@ -148,10 +148,9 @@ class Minimum:
 
 def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance: float) -> Minimum:
     """A local minimum from the parameters and the trials' starts."""
-    free = np.full(problem.starts, np.inf)
-    size = np.ones(len(parameters))
-    low = np.concatenate([-free, problem.low * size])
-    high = np.concatenate([free, problem.high * size])
+    free, size = np.full(problem.starts, np.inf), len(parameters)
+    low = np.concatenate([-free, np.broadcast_to(problem.low, size)])
+    high = np.concatenate([free, np.broadcast_to(problem.high, size)])
     theta = np.clip(problem.joined(parameters), low, high)
     reached, taken, small, damping = problem.cost(theta), 0, 0, FIRST_DAMPING
     while taken < steps and small < PATIENCE and damping < GIVE_UP_DAMPING:

@@ -29,8 +29,11 @@ def network_of(
     m, size = len(into), len(after)
     x = np.concatenate([_states(signals, theta, trial) for trial in found.trials])
     middle, spread = x.mean(axis=0), x.std(axis=0)
-    C = np.cov((x - middle).T).reshape(size, size)
-    C += 1e-9 * np.diag(spread**2) + 1e-12 * np.eye(size)
+    C = (
+        np.cov((x - middle).T).reshape(size, size)
+        + 1e-9 * np.diag(spread**2)
+        + 1e-12 * np.eye(size)
+    )
     T = cholesky(C, lower=True) * min(1.0, PRIOR / max(found.rms, SMALLEST))
     inside = slice(m, m + size)
 
@@ -47,9 +50,12 @@ def network_of(
     output = scaled.y[1] * recorded(y[None])
     output[:, -1] += scaled.y[0]
     first = train.trajectories[0]
-    maps = [node for node in signals.nodes if isinstance(node, Mapped)]
     return CellNetwork(
-        maps=tuple(as_piecewise_linear(one.function, theta[one.at]) for one in maps),
+        maps=tuple(
+            as_piecewise_linear(node.function, theta[node.at])
+            for node in signals.nodes
+            if isinstance(node, Mapped)
+        ),
         into=recorded(into),
         next=solve_triangular(T, following, lower=True),
         output=output,
@@ -73,7 +79,9 @@ def _rows(signals: Signals, theta: FloatArray) -> tuple[FloatArray, FloatArray, 
     m, size = len(signals.nodes) - len(depths), sum(depths)
     unit = np.eye(m + size + signals.inputs + 1)
     sources: list[FloatArray] = list(unit[m + size :])
-    into, after, first = [], [], m
+    into: list[FloatArray] = []
+    after: list[FloatArray] = []
+    first = m
     for node in signals.nodes:
         if isinstance(node, Mapped):
             sources.append(unit[len(into)])

@@ -1,7 +1,7 @@
 """Static maps of a scalar x with free numbers p (J,).
 
 Each has values f(x), slopes f'(x), both (N,), and moves ∂f(x)/∂p (J, N); those that are piecewise
-linear say where they bend.
+linear say where they bend (knots).
 """
 
 from dataclasses import dataclass
@@ -41,6 +41,10 @@ class Smooth:
         for r, weight in enumerate(weights):
             basis[index + r, np.arange(len(x))] = weight
         return basis
+
+    def knots(self, _p: FloatArray) -> FloatArray:
+        """The ends of its cubics."""
+        return self.low + self.spacing * np.arange(self.intervals + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +173,10 @@ class Limited:
 
 
 Limit = Top | DeadZone
-Bent = Knotted | Limit | Limited  # piecewise linear
-Map = Smooth | Bent
+Map = Smooth | Knotted | Limit | Limited
 
 
-def as_piecewise_linear(f: Bent, p: FloatArray) -> PiecewiseLinear:
+def as_piecewise_linear(f: Map, p: FloatArray) -> PiecewiseLinear:
     """The map, one interval longer on each side."""
     knots = np.sort(f.knots(p))
     apart = np.diff(knots, prepend=-np.inf) > APART * max(1.0, float(np.ptp(knots)))

@@ -18,7 +18,7 @@ from scipy.linalg import solve_banded
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.identification.network.maps import Bent, Map, as_piecewise_linear
+from nlsid_core.identification.network.maps import Map, as_piecewise_linear
 
 DIVERGED = 1e3  # spreads of a signal, at which a loop's simulation is held
 
@@ -152,7 +152,7 @@ class Signals:
         """`run`, and the derivatives (G + P, N) of each in [start; θ]; G: of free starts."""
         sources, first, N = self.run(theta, trial), 0, len(trial.u)
         G = self.given if self.free else 0
-        moved = [np.zeros((G + len(theta), N))] * (self.inputs + 1)
+        moved: list[FloatArray] = [np.zeros((G + len(theta), N))] * (self.inputs + 1)
         live: list[list[int]] = [[]] * (self.inputs + 1)  # the rows that are not zero
         for number, node in enumerate(self.nodes, self.inputs + 1):
             direct = np.zeros((G + len(theta), N))
@@ -245,7 +245,7 @@ def _looped(
     return np.array(y)
 
 
-def _compiled(function: Bent, p: FloatArray) -> Callable[[float], float]:
+def _compiled(function: Map, p: FloatArray) -> Callable[[float], float]:
     """A piecewise-linear map of one number."""
     f = as_piecewise_linear(function, p)
     inner, knots, values, slopes = (

@@ -187,7 +187,7 @@ def set_constraints(
         part = replace(part, domain=inside)
         of_set = [_minus(part, _diagonal(S, rows.weight)), Inequality(storage)]
     else:
-        E = conditions.slopes([_renamed(p, names) for p in e], names.x)
+        E = conditions.slopes(np.array([_renamed(p, names) for p in e], dtype=object), names.x)
         F = conditions.slopes(f, names.x)
         if storage is None:
             part = conditions.linear(E, F, 0, rate=rate)

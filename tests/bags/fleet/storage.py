@@ -4,9 +4,12 @@ import math
 import time
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
@@ -29,26 +32,38 @@ IMAGE_TYPE = "std_msgs/msg/ByteMultiArray"
 Fault = Callable[[str, int], int | None]  # (path, number of the request) -> status, None: serve
 
 
+@dataclass(frozen=True)
+class Odd:
+    """What is odd about a drive.
+
+    held: the command throughout. without: samples of the speed that are not there. back_from: the
+    sample from which on stamps, not log times, are ten samples earlier. odom: the speed's topic.
+    lost: messages of it that the recorder says it lost. start_ns: of the first stamp.
+    """
+
+    held: float | None = None
+    without: Container[int] = ()
+    back_from: int | None = None
+    odom: str = ODOM
+    lost: int | None = None
+    start_ns: int = START_NS
+
+
+USUAL = Odd()
+
+
 def drive(
     file: Path,
     *,
     samples: int = 200,
     seed: int = 0,
-    compression: CompressionType = CompressionType.NONE,
     image_bytes: int = 0,
-    chunk_size: int = 64 * 2**10,
-    start_ns: int = START_NS,
-    held: float | None = None,
-    without: Container[int] = (),
-    back_from: int | None = None,
-    odom: str = ODOM,
-    lost: int | None = None,
+    writer: Mapping[str, Any] = MappingProxyType({}),
+    odd: Odd = USUAL,
 ) -> Path:
     """An MCAP file of a car's speed that follows commands, in chunks, with images between.
 
-    held: the command throughout. without: samples of the speed that are not there. back_from: the
-    sample from which on stamps, not log times, are ten samples earlier. odom: the speed's topic.
-    lost: messages of it that the recorder says it lost.
+    writer: options of mcap's writer.
     """
     from bags.recordings.definitions import standard_definition
 
@@ -57,29 +72,26 @@ def drive(
     file.parent.mkdir(parents=True, exist_ok=True)
     speed = 0.0
     with file.open("wb") as stream:
-        writer = Writer(
-            stream, chunk_size=chunk_size, compression=compression, index_types=IndexType.ALL
-        )
-        writer.start(profile="ros2")
+        options = {"chunk_size": 64 * 2**10, "compression": CompressionType.NONE, **writer}
+        mcap = Writer(stream, index_types=IndexType.ALL, **options)
+        mcap.start(profile="ros2")
         channels = {}
-        for topic, kind in ((CMD, CMD_TYPE), (odom, ODOM_TYPE), (IMAGE, IMAGE_TYPE)):
-            schema = writer.register_schema(
-                kind, "ros2msg", standard_definition(kind).text.encode()
-            )
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for topic, kind in ((CMD, CMD_TYPE), (odd.odom, ODOM_TYPE), (IMAGE, IMAGE_TYPE)):
+            schema = mcap.register_schema(kind, "ros2msg", standard_definition(kind).text.encode())
+            channels[topic] = mcap.register_channel(topic, "cdr", schema)
         for k, u in enumerate(commands.tolist()):
-            u = u if held is None else held
-            at = start_ns + k * PERIOD_NS
-            stamp = at if back_from is None or k < back_from else at - 10 * PERIOD_NS
+            u = u if odd.held is None else odd.held
+            at = odd.start_ns + k * PERIOD_NS
+            stamp = at if odd.back_from is None or k < odd.back_from else at - 10 * PERIOD_NS
             speed = 0.8 * speed + 0.2 * u + 1e-3 * rng.standard_normal()
-            writer.add_message(channels[CMD], at, command(stamp, u), at)
-            if k not in without:
-                writer.add_message(channels[odom], at, odometry(stamp, speed), at)
+            mcap.add_message(channels[CMD], at, command(stamp, u), at)
+            if k not in odd.without:
+                mcap.add_message(channels[odd.odom], at, odometry(stamp, speed), at)
             if image_bytes:
-                writer.add_message(channels[IMAGE], at, b"\0\1\0\0" + rng.bytes(image_bytes), at)
-        if lost is not None:
-            writer.add_metadata(CUSTOM_DATA, {f"{odom} lost": str(lost)})
-        writer.finish()  # type: ignore[no-untyped-call]
+                mcap.add_message(channels[IMAGE], at, b"\0\1\0\0" + rng.bytes(image_bytes), at)
+        if odd.lost is not None:
+            mcap.add_metadata(CUSTOM_DATA, {f"{odd.odom} lost": str(odd.lost)})
+        mcap.finish()  # type: ignore[no-untyped-call]
     return file
 
 

@@ -96,31 +96,23 @@ def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("names", "folder", "robots"),
+    ("names", "robots"),
     [
-        (["a/d_1", "b/d_1"], None, ["a", "b"]),
-        (["d_1", "d_2"], None, ["-", "-"]),
-        (["a/2026-08/d", "b/2026-08/d", "a/2026-09/d"], None, ["a", "b", "a"]),
-        (["2026-08/a/d", "2026-08/b/d", "2026-09/a/d"], None, ["a", "b", "a"]),
-        (["2026/8/01/a/d", "2026/9/02/b/d"], None, ["a", "b"]),
-        (["x/20260801/1/d", "x/20260801/2/d"], None, ["x", "x"]),
-        (["fleet/1/2026-08-01/d", "fleet/2/2026-08-01/d"], None, ["1", "2"]),
-        (["date=2026-08-01/a/d", "date=2026-08-02/b/d"], None, ["a", "b"]),
-        (["site/a/run_1/d", "site/a/run_2/d"], None, ["run_1", "run_2"]),
-        (["site/a/run_1/d", "site/a/run_2/d"], 2, ["a", "a"]),
-        (["a/2026-08/d", "d"], -1, ["2026-08", "-"]),
-        (["a/2026-08/d", "d"], 7, ["-", "-"]),
+        (["a/d_1", "b/d_1"], ["a", "b"]),
+        (["d_1", "d_2"], ["-", "-"]),
+        (["a/2026-08/d", "b/2026-08/d", "a/2026-09/d"], ["a", "b", "a"]),
+        (["2026-08/a/d", "2026-08/b/d", "2026-09/a/d"], ["a", "b", "a"]),
+        (["2026/8/01/a/d", "2026/9/02/b/d"], ["a", "b"]),
+        (["x/20260801/1/d", "x/20260801/2/d"], ["x", "x"]),
+        (["fleet/1/2026-08-01/d", "fleet/2/2026-08-01/d"], ["1", "2"]),
+        (["date=2026-08-01/a/d", "date=2026-08-02/b/d"], ["a", "b"]),
+        (["site/a/run_1/d", "site/a/run_2/d"], ["run_1", "run_2"]),
     ],
 )
 def test_the_robot_is_the_folder_that_tells_bags_apart_and_is_no_date(
-    names: list[str], folder: int | None, robots: list[str]
+    names: list[str], robots: list[str]
 ) -> None:
-    assert robots_of(names, folder) == dict(zip(names, robots, strict=True))
-
-
-def test_folders_of_a_name_are_counted_from_one() -> None:
-    with pytest.raises(DataError, match="counted from 1"):
-        robots_of(["a/d"], 0)
+    assert robots_of(names) == dict(zip(names, robots, strict=True))
 
 
 def test_a_folder_whose_folders_hold_bags_says_the_pattern(tmp_path: Path) -> None:
@@ -246,7 +238,7 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
 def test_two_recordings_with_the_same_samples_are_one(tmp_path: Path, config: Path) -> None:
     """An object and its copy of another storage have other digests."""
     folder = fleet(tmp_path / "fleet", 3)
-    drive(folder / "copied" / "drive.mcap", seed=2, samples=120, chunk_size=2**20)
+    drive(folder / "copied" / "drive.mcap", seed=2, samples=120, writer={"chunk_size": 2**20})
     found = read_fleet(
         named_bags([folder / "*" / "*.mcap"]), load_config(config), tmp_path, workers=Workers()
     )

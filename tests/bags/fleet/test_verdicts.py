@@ -1,12 +1,10 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
-import io
 import math
 import os
 import re
-import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import permutations
@@ -14,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
+import yaml
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
@@ -26,6 +24,7 @@ from bags.fleet.bags import named_bags
 from bags.fleet.check import Checked, check_fleet, write_parquet
 from bags.fleet.monitor import (
     FleetVerdict,
+    JudgeBag,
     Judged,
     calibration_spent,
     monitor_fleet,
@@ -40,7 +39,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
 from tests.bag_messages import START_NS
-from tests.bags.fleet.storage import drive, web_server
+from tests.bags.fleet.storage import Odd, drive, web_server
 from tests.marks import slow_among
 
 CONFIG = Path("config/f1tenth.yaml")
@@ -52,6 +51,13 @@ def design(f1tenth_chain: Path) -> Path:
     return f1tenth_chain / documents.FUNNEL
 
 
+def held_against(funnel: Path, bags: Mapping[str, Path]) -> FleetVerdict:
+    """The bags of a fleet, judged in this process."""
+    design = documents.load(funnel)
+    task = JudgeBag(design, Centre.COMMAND, {})
+    return monitor_fleet(bags, task, calibration_spent(funnel.parent, design), workers=Workers())
+
+
 def judged(spent: float, month: str = "2026-01", **other: str) -> Judged:
     row = Judged(
         f"bag_{spent}_{month}", "robot", "inside", spent=spent, start=f"{month}-03T00:00:00+00:00"
@@ -60,11 +66,9 @@ def judged(spent: float, month: str = "2026-01", **other: str) -> Judged:
 
 
 def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
-    proved = documents.load_proved(design)
+    proved = documents.load(design)
     bags = {path.name: path for path in f1tenth()[:6]}
-    found = monitor_fleet(
-        bags, design, proved, centre=Centre.COMMAND, definitions={}, workers=Workers()
-    )
+    found = held_against(design, bags)
     for row, path in zip(found.rows, bags.values(), strict=True):
         alone = replay_bag(proved, path, centre=Centre.COMMAND)
         assert alone.worst is not None
@@ -88,20 +92,17 @@ def _spent(reading: Reading) -> float:
 
 def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
     """The level is the square of the factor times the most that a calibration trial spent."""
-    proved = documents.load_proved(design)
-    spent = calibration_spent(design, proved.design)
-    tube = proved.design.funnel.tubes[0]  # type: ignore[union-attr]
+    proved = documents.load(design)
+    spent = calibration_spent(design.parent, proved)
+    tube = proved.funnel.tubes[0]
     assert len(spent) == len(tube.measured_on) == 16
     assert max(spent) == pytest.approx(1.0 / tube.safety_factor**2, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) -> None:
-    proved = documents.load_proved(design)
     bags = {path.name: path for path in f1tenth()}
-    found = monitor_fleet(
-        bags, design, proved, centre=Centre.COMMAND, definitions={}, workers=Workers()
-    )
+    found = held_against(design, bags)
     tests = load_config(CONFIG).split.test
     assert {row.bag for row in found.others} == set(tests)
     assert "probability 1/9 = 0.112 at most" in found.ranks[0]
@@ -179,15 +180,8 @@ def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: 
     for folder in "bc":
         (tmp_path / folder).mkdir()
     (tmp_path / "b" / "drive.mcap").write_bytes(original.read_bytes())
-    drive(tmp_path / "c" / "drive.mcap", samples=117, chunk_size=2**20)
-    found = monitor_fleet(
-        named_bags([tmp_path / "*" / "*.mcap"]),
-        design,
-        documents.load_proved(design),
-        centre=Centre.COMMAND,
-        definitions={},
-        workers=Workers(),
-    )
+    drive(tmp_path / "c" / "drive.mcap", samples=117, writer={"chunk_size": 2**20})
+    found = held_against(design, named_bags([tmp_path / "*" / "*.mcap"]))
     assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
@@ -209,20 +203,13 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
     web = tmp_path / "web"
     for name, seed in (("a", 1), ("b", 2), ("c", 1)):
         os.utime(
-            drive(web / f"{name}.mcap", samples=400, seed=seed, chunk_size=2**12),
+            drive(web / f"{name}.mcap", samples=400, seed=seed, writer={"chunk_size": 2**12}),
             ns=(10**18, 10**18),
         )
     tails = {file.name: file.read_bytes()[-MARK_BYTES:] for file in web.iterdir()}
     assert tails["a.mcap"] == tails["b.mcap"]
     with web_server(web) as url:
-        found = monitor_fleet(
-            named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]),
-            design,
-            documents.load_proved(design),
-            centre=Centre.COMMAND,
-            definitions={},
-            workers=Workers(),
-        )
+        found = held_against(design, named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]))
     rows = {row.bag: row for row in found.rows}
     assert rows["b"].judged > 0
     assert "copy" not in (rows["a"].verdict, rows["b"].verdict)
@@ -274,15 +261,15 @@ def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(8):
         start_ns = START_NS + (k % 3) * 86_400 * 10**9
         file = folder / f"r{k % 4}" / "2022-01" / f"d{k:02d}.mcap"
-        drive(file, samples=60, seed=k, start_ns=start_ns)
+        drive(file, samples=60, seed=k, odd=Odd(start_ns=start_ns))
     own = folder / "r9" / "2022-01"
     whole = drive(own / "cut.mcap", samples=60, seed=50).read_bytes()
     (own / "cut.mcap").write_bytes(whole[: len(whole) // 2])
     (own / "empty.mcap").write_bytes(b"")
-    drive(own / "gap.mcap", samples=60, seed=51, without=range(30, 45))
-    drive(own / "back.mcap", samples=60, seed=52, back_from=30)
-    drive(own / "still.mcap", samples=60, seed=53, held=0.25)
-    drive(own / "other.mcap", samples=60, seed=54, odom="/wheels")
+    drive(own / "gap.mcap", samples=60, seed=51, odd=Odd(without=range(30, 45)))
+    drive(own / "back.mcap", samples=60, seed=52, odd=Odd(back_from=30))
+    drive(own / "still.mcap", samples=60, seed=53, odd=Odd(held=0.25))
+    drive(own / "other.mcap", samples=60, seed=54, odd=Odd(odom="/wheels"))
     (own / "copy.mcap").write_bytes((folder / "r1" / "2022-01" / "d01.mcap").read_bytes())
     return folder
 
@@ -380,14 +367,7 @@ def test_a_table_of_groups_says_how_many_it_does_not_show(capsys: Any) -> None:
 
 def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_path: Path) -> None:
     bags = named_bags([drive(tmp_path / "drive.mcap", samples=117)])
-    (row,) = monitor_fleet(
-        bags,
-        design,
-        documents.load_proved(design),
-        centre=Centre.COMMAND,
-        definitions={},
-        workers=Workers(),
-    ).rows
+    (row,) = held_against(design, bags).rows
     assert row.verdict == "assumption violated"
     assert row.reason.startswith(row.assumption.partition(" ...")[0])
     assert not re.search(r"\d", row.assumption)
@@ -395,7 +375,7 @@ def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_p
 
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     for k in range(2):
-        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, held=0.25)
+        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(held=0.25))
     status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines == [
@@ -408,7 +388,7 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
     tmp_path: Path,
 ) -> None:
     for k, lost in enumerate((3, 0, None)):
-        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, lost=lost)
+        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(lost=lost))
     status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
     assert status == 0
     assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
@@ -426,22 +406,27 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
     assert re.fullmatch(r"d0 +look +2\S+ \S+ +3 its recorder lost 3 messages *", lines[3])
 
 
+def identified_with(test: list[str], bags: Path, folder: Path, reason: str) -> str:
+    """What `identify` prints of bags read by workers, of which these are test trials."""
+    content = yaml.safe_load(CONFIG.read_text())
+    content["split"] = {"test": test}
+    config = folder / "robot.yaml"
+    config.write_text(yaml.safe_dump(content))
+    given = ["identify", str(folder / "out"), str(bags), "--config", str(config), "--workers", "1"]
+    done = CliRunner().invoke(app, given)
+    assert isinstance(done.exception, DataError)
+    assert re.search(reason, str(done.exception))
+    return done.output
+
+
 def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -> None:
     """The one bag that is no test trial cannot be read, so nothing is left to train on."""
     drive(tmp_path / "bags" / "drive.mcap", samples=60)
     (tmp_path / "bags" / "cut.mcap").write_bytes(b"no bag")
-    config = load_config(CONFIG)
-    split = config.split.model_copy(update={"test": ["drive"], "calibration": []})
-    said = Console(file=io.StringIO(), width=80)
-    with pytest.raises(DataError, match="all of the bags are test trials"):
-        fleet_cli.identify(
-            said,
-            [tmp_path / "bags"],
-            config.model_copy(update={"split": split}),
-            tmp_path / "out",
-            fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )
-    lines = said.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    said = identified_with(
+        ["drive"], tmp_path / "bags", tmp_path, "all of the bags are test trials"
+    )
+    lines = said.splitlines()
     assert lines[0].startswith(
         "2 bags: 1 used, 1 not read, 0 not usable, 0 copies; 0 of them known"
     )
@@ -455,7 +440,7 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("test", "reason"),
     [
-        (["elsewhere"], "none of the bags is a test trial"),
+        (["elsewhere"], "split.test names elsewhere; the bags are drive_1, drive_2"),
         (["drive_?"], "all of the bags are test"),
     ],
 )
@@ -465,18 +450,7 @@ def test_names_that_cannot_be_split_are_refused_before_a_bag_is_read(
     """Neither bag is one, and none is said to be unreadable."""
     for k in (1, 2):
         (tmp_path / f"drive_{k}.mcap").write_bytes(b"no bag")
-    config = load_config(CONFIG)
-    split = config.split.model_copy(update={"test": test, "calibration": []})
-    said = Console(file=io.StringIO(), width=80)
-    with pytest.raises(DataError, match=reason):
-        fleet_cli.identify(
-            said,
-            [tmp_path],
-            config.model_copy(update={"split": split}),
-            tmp_path / "out",
-            fleet_cli.Reading(Workers(), strict=False, patience=5.0),
-        )
-    assert said.file.getvalue() == ""  # type: ignore[attr-defined]
+    assert identified_with(test, tmp_path, tmp_path, reason) == ""
     assert not (tmp_path / "out" / "fleet.sqlite").exists()
 
 
@@ -506,20 +480,12 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
         answers = {"/busy.mcap": 503, "/gone.mcap": 404}
         return 503 if path == "/late.mcap" and number <= 2 else answers.get(path)
 
-    started = time.monotonic()
     with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
         named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=1.0)
         found: Sequence[Checked | Judged] = (
             check_fleet(named, load_config(CONFIG), workers=Workers()).rows
             if verb == "check"
-            else monitor_fleet(
-                named,
-                design,
-                documents.load_proved(design),
-                centre=Centre.COMMAND,
-                definitions={},
-                workers=Workers(),
-            ).rows
+            else held_against(design, named).rows
         )
     rows = {row.bag: row for row in found}
     assert [row.bag for row in found] == sorted(rows) == sorted(named)
@@ -534,4 +500,3 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
     assert "not there any more" in said["gone"]
     assert not {rows[name].verdict for name in ("late", "good")} & {"bad", "not read"}
     assert asked["/late.mcap"] > 2
-    assert time.monotonic() - started < 30.0, "patience is of each bag, and is kept"
