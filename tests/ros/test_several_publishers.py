@@ -128,7 +128,7 @@ def test_a_driver_that_was_killed_and_replaced_counts_for_the_lease_of_dds(
 def test_a_command_with_a_stamp_that_is_none_is_told_as_that(
     robot: Robot, ahead: float | None, says: str
 ) -> None:
-    robot.watched(stale_after=LATE)
+    robot.watched(stale_after=10.0, command_wait=1.0)  # on a machine that is busy
     robot.ready()
 
     def drive(samples: int, command_ahead: float | None) -> None:
