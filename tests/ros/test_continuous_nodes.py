@@ -182,7 +182,7 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
     assert len(judged) == pytest.approx(20 * stages, abs=1)
     wiring = wiring_of(["/joints:position[0]"], ["/effort:effort[0]"], 0.05)
     monitor = load(path, wiring=wiring).monitor(Centre.PROFILE)
-    margins = [monitor.update(k * 0.05, x, u).margin for k, (_, x, u) in enumerate(judged)]
+    margins = [monitor.update(k * 5 / 100, x, u).margin for k, (_, x, u) in enumerate(judged)]
     assert [robot.margins[stamp] for stamp, *_ in judged] == margins, "bit for bit"
     assert min(margins) > 0.3
     assert not any(map(math.isnan, margins))
