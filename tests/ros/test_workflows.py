@@ -27,7 +27,7 @@ from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.samples import dart, f1tenth
+from bags.samples import f1tenth
 from bags.setup.candidates import look
 from bags.setup.proposing import Chosen, propose
 from bags.setup.written import yaml_text
@@ -474,35 +474,3 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
     done = demonstrated(out / documents.FUNNEL, tmp_path / "live")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "recorder: 361 of 361 messages, equal to what was sent" in done.stdout
-
-
-def init_live(config: Path, seconds: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "bags.commands.cli", "init", str(config.parent), "--live"]
-    options = ["--yes", "--seconds", seconds]
-    return subprocess.run(command + options, capture_output=True, text=True, check=False)
-
-
-def test_a_running_robot_is_looked_at_for_a_first_configuration(
-    bench: Bench, tmp_path: Path
-) -> None:
-    """A real car's drive, played in real time to whoever listens."""
-    drive = next(bag for bag in dart() if bag.name == "rubbery_20240916_151759")
-    config = tmp_path / "robot.yaml"
-    bench.start("bag_player", bag=drive, topics="['/command', '/motion']", wait_timeout=300.0)
-    done = init_live(config, "12")
-    assert done.returncode == 0, done.stdout + done.stderr
-    settings = load_config(config)
-    assert settings.signals.response[0].path.startswith("/motion:")
-    assert settings.signals.excitation[0].path.startswith("/command:")
-    assert settings.grid.period == pytest.approx(0.05, rel=0.05)
-    assert settings.split.share is not None
-    assert "topics:=[/command, /motion]" in done.stdout
-    assert f"nlsid identify {tmp_path} TRIALS" in done.stdout
-
-
-def test_where_nothing_runs_this_is_said(tmp_path: Path) -> None:
-    config = tmp_path / "robot.yaml"
-    done = init_live(config, "1")
-    assert done.returncode == 2
-    assert "nothing was heard" in done.stderr
-    assert not config.exists()
