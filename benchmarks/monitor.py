@@ -293,8 +293,7 @@ def main() -> None:
         echo()
         return
     result = updates() | live(options.seconds, options.rate)
-    result |= peers("ros-jazzy-rclpy")
-    tell(result, ASKED, as_json=options.json, what="asked")
+    tell(result | peers("ros-jazzy-rclpy"), ASKED, as_json=options.json, what="asked")
 
 
 if __name__ == "__main__":

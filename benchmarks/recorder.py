@@ -196,8 +196,7 @@ def main() -> None:
         result = throughput(Path(scratch), options.seconds, options.topics)
         if options.kills:
             result |= kills(Path(scratch), options.kills)
-    result |= peers("ros-jazzy-rclpy", "rosbags")
-    tell(result, ASKED, as_json=options.json, what="asked")
+    tell(result | peers("ros-jazzy-rclpy", "rosbags"), ASKED, as_json=options.json, what="asked")
 
 
 if __name__ == "__main__":
