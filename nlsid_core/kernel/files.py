@@ -188,18 +188,18 @@ class Node:
 
     def array(self, *shape: int | None) -> Any:
         """Nested lists of float64s of this shape, as Fractions; None: any length."""
-        return self._nested(self.value, shape, (int, Fraction)) if shape else self.number()
+        return self._nested(self.value, shape, {int, Fraction}) if shape else self.number()
 
     def wholes(self, *shape: int | None) -> Any:
         """Nested lists of whole numbers (at most 2^53 in size) of this shape."""
-        return self._nested(self.value, shape, (int,))
+        return self._nested(self.value, shape, {int})
 
-    def _nested(self, value: Any, shape: Sequence[int | None], kinds: tuple[type, ...]) -> Any:
+    def _nested(self, value: Any, shape: Sequence[int | None], kinds: set[type]) -> Any:
         if type(value) is not list or shape[0] not in (None, len(value)):
             raise Rejected(f"{self.where} should have shape {shape}")
         if len(shape) > 1:
             return [self._nested(entry, shape[1:], kinds) for entry in value]
-        if any(type(entry) not in kinds for entry in value):
+        if not kinds.issuperset(map(type, value)):
             wanted = "numbers" if Fraction in kinds else "whole numbers"
             raise Rejected(f"{self.where} should hold {wanted} only")
         return list(map(Fraction, value)) if Fraction in kinds else list(value)
