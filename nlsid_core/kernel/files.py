@@ -102,9 +102,9 @@ class Node:
         """An object with exactly these members (names separated by spaces)."""
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
-        self.require({f"'{name}' is missing": name in self.value for name in wanted})
+        self.require({f"'{name}' is missing": False for name in wanted if name not in self.value})
         known = {*wanted, *allowed}
-        self.require({f"unknown member {plain(name)!r}": name in known for name in self.value})
+        self.require({f"unknown member {plain(n)!r}": False for n in self.value if n not in known})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
     def read(self, table: Table) -> dict[str, Any]:
@@ -182,24 +182,24 @@ class Node:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
         if type(self.value) is not list or any(type(entry) is not int for entry in self.value):
             return [entry.integer() for entry in self.items(least, most)]
-        fits = least <= len(self.value) <= most
-        self.require({f"should be a list of {least} to {most} entries": fits})
+        if not least <= len(self.value) <= most:
+            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
         return self.value
 
     def array(self, *shape: int | None) -> Any:
         """Nested lists of float64s of this shape, as Fractions; None: any length."""
-        return self._nested(self.value, shape, (int, Fraction)) if shape else self.number()
+        return self._nested(self.value, shape, {int, Fraction}) if shape else self.number()
 
     def wholes(self, *shape: int | None) -> Any:
         """Nested lists of whole numbers (at most 2^53 in size) of this shape."""
-        return self._nested(self.value, shape, (int,))
+        return self._nested(self.value, shape, {int})
 
-    def _nested(self, value: Any, shape: Sequence[int | None], kinds: tuple[type, ...]) -> Any:
+    def _nested(self, value: Any, shape: Sequence[int | None], kinds: set[type]) -> Any:
         if type(value) is not list or shape[0] not in (None, len(value)):
             raise Rejected(f"{self.where} should have shape {shape}")
         if len(shape) > 1:
             return [self._nested(entry, shape[1:], kinds) for entry in value]
-        if any(type(entry) not in kinds for entry in value):
+        if not kinds.issuperset(map(type, value)):
             wanted = "numbers" if Fraction in kinds else "whole numbers"
             raise Rejected(f"{self.where} should hold {wanted} only")
         return list(map(Fraction, value)) if Fraction in kinds else list(value)

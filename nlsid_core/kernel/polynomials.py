@@ -17,7 +17,7 @@ from math import comb, lcm
 from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Rejected, Terms, limit, refuse_if
+from .files import MAX_DEGREE, Rejected, Terms, refuse_if
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
 SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
@@ -162,9 +162,9 @@ class Ring:
 
     def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
         """p q."""
-        degree = limit(p.degree + q.degree, MAX_DEGREE, "the degree of a product")
-        norm = p.norm * q.norm
-        limit(norm.bit_length(), WIDTHS[-1], "bits of a product")
+        degree, norm = p.degree + q.degree, p.norm * q.norm
+        if degree > MAX_DEGREE or norm.bit_length() > WIDTHS[-1]:
+            raise Rejected(f"a product beyond degree {MAX_DEGREE} or too long", "too_large")
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
             for right, b in q.terms.items():
