@@ -20,7 +20,7 @@ from nlsid_core.design import (
     plan_motion,
 )
 
-GRAVITY = 9.81  # m/s²
+HOVER = np.array([9.81, 0.0])  # thrust over mass in m/s², and no torque
 SECONDS = 2.0
 START, END = np.zeros(6), np.array([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 RADIUS = np.array([10.0, 10.0, 0.4, 10.0, 10.0, 20.0, 6.0, 100.0])  # around the motion
@@ -30,7 +30,7 @@ LEVEL = 0.3  # of the goal, in the LQR's cost at the end
 
 def rate(x: Any, u: Any) -> Any:
     """ẋ for one state, of numbers or of Taylor models; entries (6,)."""
-    return [x[3], x[4], x[5], -u[0] * np.sin(x[2]), u[0] * np.cos(x[2]) - GRAVITY, u[1]]
+    return [x[3], x[4], x[5], -u[0] * np.sin(x[2]), u[0] * np.cos(x[2]) - HOVER[0], u[1]]
 
 
 def truth(x: FloatArray, u: FloatArray) -> FloatArray:
@@ -41,14 +41,12 @@ def truth(x: FloatArray, u: FloatArray) -> FloatArray:
 def problem() -> tuple[VectorField, Nominal]:
     """The cubic models of the intervals, with what they leave out, and the motion."""
 
-    hover = np.array([GRAVITY, 0.0])
-
-    def hovering(x: Any, u: Any) -> Any:  # both inputs from those of hovering: they cost alike
-        return rate(x, hover + u)
-
-    planned = plan_motion(hovering, start=START, end=END, seconds=SECONDS, u=[0.0, 0.0])
+    # Inputs are counted from those of hovering, so that both cost alike.
+    planned = plan_motion(
+        lambda x, u: rate(x, HOVER + u), start=START, end=END, seconds=SECONDS, u=[0.0, 0.0]
+    )
     finer = planned.halved(np.ones(len(planned.t) - 1, dtype=bool))
-    t, x, u = finer.t, finer.x.ends(), finer.u.ends() + hover
+    t, x, u = finer.t, finer.x.ends(), finer.u.ends() + HOVER
     field = taylor_field(rate, t, x, u, radius=RADIUS)
     return field, nominal_through(t, x, u, field)
 
