@@ -9,7 +9,6 @@ that is not proved, that it had refused, or that nobody watched although it was 
 `hung`: those after which a node that was not killed said nothing more, or did not end.
 """
 
-import argparse
 import json
 import math
 import os
@@ -47,7 +46,7 @@ from bags.designs.bundle import MAX_BYTES, Bundle
 from bags.designs.documents import FUNNEL, MODEL
 from bags.monitoring.announcement import UNANNOUNCED, WAITING
 from bags.samples import f1tenth
-from benchmarks.machine import describe
+from benchmarks.machine import describe, parser
 from benchmarks.processes import isolate, node, python
 from nlsid_core import files
 from nlsid_core.design import ContinuousTracking, design, integrate_nominal
@@ -794,10 +793,9 @@ def run(folder: Path, only: str = "") -> Iterator[Seen]:
 
 def main() -> None:
     """Print the table; with --json the last line is one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
-    parser.add_argument("--only", default="", help="faults whose name contains this")
-    options = parser.parse_args()
+    taken = parser(__doc__)
+    taken.add_argument("--only", default="", help="faults whose name contains this")
+    options = taken.parse_args()
     isolate()
     print(describe())
     seen: list[Seen] = []

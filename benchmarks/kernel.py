@@ -11,10 +11,8 @@ oracle (tests/core/kernel), in fractions: `judged` counts them by kind. They are
 each from a seed of its own, so that the counts are the same for any number of processes.
 """
 
-import argparse
 import ast
 import contextlib
-import json
 import os
 import sys
 import tempfile
@@ -27,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import parser, tell
 from nlsid_core import files, kernel
 from nlsid_core.deciding import Deciding
 from nlsid_core.errors import CertificateRejected
@@ -55,24 +53,19 @@ REACHED = {  # what was aimed at
 
 def main() -> None:
     """Print the figures; the last line is one JSON object with --json."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--mutations", type=int, default=MUTATIONS)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="to mutate")
-    parser.add_argument("--processes", type=int, default=1, help="for the mutations")
-    parser.add_argument("--no-designs", action="store_true", help="lines and mutations only")
-    arguments = parser.parse_args()
+    taken = parser(__doc__ or "")
+    taken.add_argument("--mutations", type=int, default=MUTATIONS)
+    taken.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="to mutate")
+    taken.add_argument("--processes", type=int, default=1, help="for the mutations")
+    taken.add_argument("--no-designs", action="store_true", help="lines and mutations only")
+    arguments = taken.parse_args()
     result: dict[str, Any] = size()
     if not arguments.no_designs:
         with tempfile.TemporaryDirectory() as folder:
             result |= times(Path(folder))
     result |= {"hostile_s": hostile()}
     result |= mutated(arguments.mutations, arguments.processes, arguments.kinds)
-    print(describe())
-    for key, value in result.items():
-        print(f"{key:24}{value!s:>24}   {REACHED.get(key, '')}")
-    if arguments.json:
-        print(json.dumps(result))
+    tell(result, REACHED, as_json=arguments.json, what="asked")
 
 
 def size() -> dict[str, Any]:

@@ -27,20 +27,25 @@ def parser(doc: str, *, data: bool = False) -> argparse.ArgumentParser:
 
 
 def tell(
-    result: Mapping[str, Any], published: Mapping[str, Any] | None = None, *, as_json: bool
+    result: Mapping[str, Any],
+    beside: Mapping[str, Any] | None = None,
+    *,
+    as_json: bool,
+    what: str = "published",
 ) -> None:
-    """Print figures, one a line with what was published beside it; last, as one JSON object.
+    """Print figures, one a line with another beside it; last, as one JSON object.
 
     Args:
         result: The figures by key; groups of figures are shown by their dotted keys.
-        published: By dotted key.
+        beside: The others, by dotted key.
         as_json: Whether the last line is JSON.
+        what: What the others are.
     """
     print(f"\n{describe()}")
     for key, value in _dotted(result):
         shown = f"{value:.5g}" if isinstance(value, float) else str(value)
-        beside = f"   (published {published[key]})" if published and key in published else ""
-        print(f"{key:34} {shown:>12}{beside}")
+        other = f"   ({what} {beside[key]})" if beside and key in beside else ""
+        print(f"{key:34} {shown:>12}{other}")
     if as_json:
         print(json.dumps(result))
 

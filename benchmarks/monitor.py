@@ -41,7 +41,7 @@ from bags.designs.documents import FUNNEL
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from bags.signals.sampling import Grid
-from benchmarks.machine import describe, peers
+from benchmarks.machine import parser, peers, tell
 from benchmarks.processes import cpu_seconds, isolate, node, python, resident_mb
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -280,13 +280,12 @@ def _latencies(arrivals: dict[int, int], sent: list[int], start_ns: int, rate: i
 
 def main() -> None:
     """Print the table; with --json the last line is one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate", type=int, default=1000, help="Hz")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    taken = parser(__doc__)
+    taken.add_argument("--seconds", type=float, default=60.0)
+    taken.add_argument("--rate", type=int, default=1000, help="Hz")
+    taken.add_argument("--send", type=float, help=argparse.SUPPRESS)
+    taken.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
+    options = taken.parse_args()
     if options.send:
         send(options.send, options.rate)
         return
@@ -294,12 +293,7 @@ def main() -> None:
         echo()
         return
     result = updates() | live(options.seconds, options.rate)
-    print(f"{describe()}\n{'':24} {'reached':>10} {'asked':>10}")
-    for key, value in result.items():
-        asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""
-        print(f"{key:24} {value:10.4g} {asked}")
-    if options.json:
-        print(json.dumps(result | peers("ros-jazzy-rclpy")))
+    tell(result | peers("ros-jazzy-rclpy"), ASKED, as_json=options.json, what="asked")
 
 
 if __name__ == "__main__":

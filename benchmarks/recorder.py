@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.repair import repair
-from benchmarks.machine import describe, peers
+from benchmarks.machine import parser, peers, tell
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_core.errors import DataError
 from nlsid_ros import qos
@@ -181,14 +181,13 @@ def read_what_is_left(file: Path) -> list[bytes]:
 
 def main() -> None:
     """Print the table; with --json the last line is one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=90.0)
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--said", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--topics", type=int, default=20, help="each at 1 kHz")
-    options = parser.parse_args()
+    taken = parser(__doc__)
+    taken.add_argument("--seconds", type=float, default=90.0)
+    taken.add_argument("--kills", type=int, default=50)
+    taken.add_argument("--send", type=float, help=argparse.SUPPRESS)
+    taken.add_argument("--said", type=Path, help=argparse.SUPPRESS)
+    taken.add_argument("--topics", type=int, default=20, help="each at 1 kHz")
+    options = taken.parse_args()
     if options.send:
         options.said.write_text(str(send(options.send, options.topics)))
         return
@@ -197,12 +196,7 @@ def main() -> None:
         result = throughput(Path(scratch), options.seconds, options.topics)
         if options.kills:
             result |= kills(Path(scratch), options.kills)
-    print(f"{describe()}\n{'':30} {'reached':>10} {'asked':>10}")
-    for key, value in result.items():
-        asked = f"{ASKED[key]:10.6g}" if key in ASKED else ""
-        print(f"{key:30} {value:10.6g} {asked}")
-    if options.json:
-        print(json.dumps(result | peers("ros-jazzy-rclpy", "rosbags")))
+    tell(result | peers("ros-jazzy-rclpy", "rosbags"), ASKED, as_json=options.json, what="asked")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from nlsid_core.design import (
 )
 
 GRAVITY = 9.81  # m/s²
-SECONDS, KNOTS = 2.0, 41
+SECONDS = 2.0
 START, END = np.zeros(6), np.array([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 RADIUS = np.array([10.0, 10.0, 0.4, 10.0, 10.0, 20.0, 6.0, 100.0])  # around the motion
 Q, R = np.diag([10.0, 10.0, 10.0, 2.0, 2.0, 1.0]), np.diag([0.5, 0.02])
@@ -40,9 +40,15 @@ def truth(x: FloatArray, u: FloatArray) -> FloatArray:
 
 def problem() -> tuple[VectorField, Nominal]:
     """The cubic models of the intervals, with what they leave out, and the motion."""
-    planned = plan_motion(rate, start=START, end=END, seconds=SECONDS, u=[GRAVITY, 0.0])
-    t = np.linspace(0.0, SECONDS, KNOTS)
-    x, u = planned.x(t), planned.u(t)
+
+    hover = np.array([GRAVITY, 0.0])
+
+    def hovering(x: Any, u: Any) -> Any:  # both inputs from those of hovering: they cost alike
+        return rate(x, hover + u)
+
+    planned = plan_motion(hovering, start=START, end=END, seconds=SECONDS, u=[0.0, 0.0])
+    finer = planned.halved(np.ones(len(planned.t) - 1, dtype=bool))
+    t, x, u = finer.t, finer.x.ends(), finer.u.ends() + hover
     field = taylor_field(rate, t, x, u, radius=RADIUS)
     return field, nominal_through(t, x, u, field)
 

@@ -86,6 +86,7 @@ class Clock:
         self._back: dict[str, list[int]] = {}  # ns, of each place
 
     def add(self, topic: str, stamp_ns: int) -> None:
+        """Take note of a message's stamp."""
         last = self._last.get(topic, stamp_ns)
         self._last[topic] = stamp_ns
         if stamp_ns < last:

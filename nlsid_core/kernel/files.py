@@ -102,9 +102,9 @@ class Node:
         """An object with exactly these members (names separated by spaces)."""
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
-        self.require({f"'{name}' is missing": name in self.value for name in wanted})
+        self.require({f"'{name}' is missing": False for name in wanted if name not in self.value})
         known = {*wanted, *allowed}
-        self.require({f"unknown member {plain(name)!r}": name in known for name in self.value})
+        self.require({f"unknown member {plain(n)!r}": False for n in self.value if n not in known})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
     def read(self, table: Table) -> dict[str, Any]:
@@ -182,8 +182,8 @@ class Node:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
         if type(self.value) is not list or any(type(entry) is not int for entry in self.value):
             return [entry.integer() for entry in self.items(least, most)]
-        fits = least <= len(self.value) <= most
-        self.require({f"should be a list of {least} to {most} entries": fits})
+        if not least <= len(self.value) <= most:
+            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
         return self.value
 
     def array(self, *shape: int | None) -> Any:

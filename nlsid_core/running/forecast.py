@@ -21,6 +21,8 @@ from nlsid_core.kernel.models import read_model
 from nlsid_core.models import DifferenceEquation, ImplicitModel, StableModel, StateAffineModel
 
 OUTWARD = 1e-8  # relative: more than float64 can hide of a reach, a level or an output
+MOST_STEPS = 20_000  # after which a response that has not faded is not looked at any more
+FADED = 1e-9  # of a response of 1: what follows is less than a part in a million of its sum
 
 
 class Forecast(NamedTuple):
@@ -42,6 +44,25 @@ class Linear(NamedTuple):
     A: FloatArray
     C: FloatArray
     rounding: float
+
+    @property
+    def carried(self) -> FloatArray:
+        """(p, n) the sum of |C Aᵏ|: what a change of every state by 1 at every step can become.
+
+        inf where that is not known after so many steps.
+        """
+        power, total = np.eye(len(self.A)), np.zeros_like(self.C)
+        for _ in range(MOST_STEPS):
+            total += np.abs(self.C @ power)
+            power = self.A @ power
+            if np.max(np.abs(power)) < FADED:
+                return total
+        return np.full_like(self.C, np.inf)
+
+    def rounded(self, largest: FloatArray) -> FloatArray:
+        """(n,) the most that one step is off by, where |x| <= largest (n,)."""
+        each = 4.0 * (len(self.A) + STEPS) * (UNIT + self.rounding)
+        return np.asarray(each * (np.abs(self.A) @ largest + largest))
 
 
 def linear_form(model: StableModel) -> Linear | None:

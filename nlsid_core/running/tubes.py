@@ -107,6 +107,7 @@ class TubeRun:
         ]
         self._assuming = [assuming(funnel.tubes) for funnel in funnels]
         self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
+        self._carried = self._linear.carried if self._linear is not None else None
         self.restart()
 
     def restart(self) -> None:
@@ -344,9 +345,12 @@ class TubeRun:
         assert self._x is not None
         reached = np.abs(self._x[-1])
         if (reached > self._largest).any():
-            self._largest = np.maximum(self._largest, 2.0 * reached)  # so that this is seldom
+            self._largest = np.maximum(self._largest, 1.1 * reached)  # so that this is seldom
             none = np.zeros_like(simulated)
             self._hidden = np.array([tube.hidden(self._largest, none) for tube in self._tubes])
+            if self._linear is not None and self._carried is not None:
+                directly = self._carried @ self._linear.rounded(self._largest)
+                self._hidden = np.minimum(self._hidden, directly)
         return self._hidden + STEPS * UNIT * np.abs(simulated)
 
     def _followed(self, g: dict[int, list[float]]) -> tuple[FloatArray, FloatArray]:

@@ -86,7 +86,9 @@ def test_test_trials_do_not_influence_the_model(
     config: Config, chain: Path, tmp_path: Path
 ) -> None:
     fewer = [bag for bag in f1tenth() if bag.name[-2:] not in TEST[1:]]
-    identify_bags(fewer, config, tmp_path, progress=silent)
+    first = config.split.model_copy(update={"test": [f"trial_{TEST[0]}"]})
+    settings = config.model_copy(update={"split": first})
+    identify_bags(fewer, settings, tmp_path, progress=silent)
     assert documents.load_model(tmp_path / documents.MODEL).document() == (
         documents.load_model(chain / documents.MODEL).document()
     )

@@ -62,7 +62,7 @@ def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> 
     assert 0.97 * proved < float(part[1]) <= proved
     assert f"at 0 s: x0 {widths[0]:.3g}, x1 {widths[1]:.3g}; without, x0 " in said
     assert "samples should come every 0.008 s or more often" in said
-    assert "left" not in str(free)
+    assert "left" not in str(design(tracking())), "without a hold nothing is lost to one"
 
 
 def test_runs_that_are_held_and_measured_wrong_stay_inside(held: FunnelDesign) -> None:

@@ -103,6 +103,7 @@ def test_an_oscillator_without_an_input_is_proved() -> None:
     assert (found.funnel.widths(0.0) > [0.9, 1.1]).all()
 
 
+@pytest.mark.pictures
 def test_a_design_that_is_read_again_has_its_policy_and_is_drawn(tmp_path: Path) -> None:
     design(ContinuousTracking(pendulum, upright(), goal=[0.2, 0.5])).save(tmp_path)
     read = load(tmp_path)
