@@ -152,8 +152,8 @@ def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance:
         theta = _damped(problem, theta, steps, tolerance)
     else:
         free = np.full(problem.starts, np.inf)
-        low, high = problem.bounds
-        low, high = np.concatenate([-free, low]), np.concatenate([free, high])
+        ends = zip((-free, free), problem.bounds, strict=True)
+        low, high = (np.concatenate(pair) for pair in ends)
         theta = least_squares(
             problem.residual,
             np.clip(theta, low + INSIDE, high - INSIDE),
@@ -164,8 +164,11 @@ def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance:
             xtol=tolerance,
             max_nfev=steps,
         ).x
-    trials = tuple(trial for trial, _ in problem.parts(theta))
-    return Minimum(problem.mean_square(theta) ** 0.5, theta[problem.starts :], trials)
+    return Minimum(
+        rms=problem.mean_square(theta) ** 0.5,
+        parameters=theta[problem.starts :],
+        trials=tuple(trial for trial, _ in problem.parts(theta)),
+    )
 
 
 def _damped(problem: Problem, theta: FloatArray, steps: int, tolerance: float) -> FloatArray:

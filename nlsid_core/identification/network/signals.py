@@ -94,12 +94,11 @@ class Signals:
     @cached_property
     def parameters(self) -> int:
         """How many there are."""
-        parts = [
-            part
+        return 1 + max(
+            int(part.at.max(initial=-1))
             for node in self.nodes
             for part in (node.taps if isinstance(node, Signal) else (node,))
-        ]
-        return 1 + max(int(part.at.max(initial=-1)) for part in parts)
+        )
 
     @cached_property
     def chained(self) -> set[int]:
