@@ -106,7 +106,7 @@ class Row:
 
     def problem(self, trials: Sequence[Trial], slowest: float) -> Problem:
         """What is minimised, with slopes of φ_i in [0, slowest]."""
-        size = 1 + max(int(at.max(initial=0)) for cell in self.places for at in cell.values())
+        size = self.built[0].parameters
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
         bend = []
         for cell in self.places:
@@ -115,7 +115,7 @@ class Row:
                 low[cell["limit"][0]] = LEAST_FRICTION
             for slopes in (cell["phi"], cell.get("g", NONE)):
                 bend += list(np.diff(np.eye(size)[slopes], axis=0))
-        return Problem(self.built[0], trials, np.sqrt(SMOOTHING) * np.array(bend), low, high)
+        return Problem(self.built[0], trials, np.sqrt(SMOOTHING) * np.array(bend), (low, high))
 
 
 Begun = tuple[Row, FloatArray, tuple[Trial, ...]]  # cells, their numbers, trials with starts
@@ -201,7 +201,7 @@ def _start(
     x[-1] = np.concatenate([trial.y for trial in trials])
     x = [part / s for part, s in zip(x, spread, strict=True)]
     row = Row(np.array([_knots(part, K) for part in x]), len(gains) - 1, limit)
-    theta = np.zeros(1 + max(int(at.max(initial=0)) for at in row.places[-1].values()))
+    theta = np.zeros(row.built[0].parameters)
     for i, (cell, pole) in enumerate(zip(row.places, poles, strict=True)):
         level = pole * row.knots[i, 0]
         theta[cell["phi"]] = pole
@@ -258,7 +258,7 @@ def _finer(row: Row, found: Minimum, trials: Sequence[Trial], intervals: int) ->
     x = [np.concatenate([run[source] for run in runs]) for source in of_x]
     x[-1] = np.concatenate([trial.y for trial in trials])
     finer = Row(np.array([_knots(part, intervals) for part in x]), row.inputs, row.limit)
-    moved = np.zeros(1 + max(int(at.max(initial=0)) for at in finer.places[-1].values()))
+    moved = np.zeros(finer.built[0].parameters)
     for i, (cell, old) in enumerate(zip(finer.places, row.places, strict=True)):
         for name in ("level", "b", "limit", "gamma"):
             if name in cell:

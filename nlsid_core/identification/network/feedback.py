@@ -138,8 +138,8 @@ def _loop(made: Feedback, trials: Sequence[Trial]) -> tuple[Layout, Minimum]:
             rows.append(np.array(columns)[:, n:].T)
         outputs = np.concatenate([trial.y[n:] for trial in begun])
         start = np.linalg.lstsq(np.concatenate(rows), outputs, rcond=None)[0]
-        problem = Problem(layout.loop(), begun)
         theta = np.concatenate([start, phi])
+        problem = Problem(layout.loop(), begun, np.zeros((0, len(theta))))
         found.append(minimise(problem, theta, steps=LOOP_STEPS, tolerance=LOOP_TOLERANCE))
     best = min(found, key=lambda minimum: minimum.rms)
     if not best.rms < 1.0:
@@ -238,7 +238,7 @@ def _stages(layout: Layout, maps: int, trials: Sequence[Trial], radius: float) -
     """The stages on these trials, all with the same first samples."""
     signals = layout.stages(maps)
     begun = [replace(t, start=np.tile(t.start, maps + 1)) for t in trials]
-    return Problem(signals, begun, radius=radius)
+    return Problem(signals, begun, np.zeros((0, signals.parameters)), radius=radius)
 
 
 def _known(layout: Layout, loop: Minimum, model_class: Network[Feedback]) -> list[Trial]:

@@ -244,8 +244,8 @@ def _random_start(
     x = flat.inner(trials)
     gain = 1.0 / float(np.std(x))
     flat = replace(flat.moved({"b1": gain * b1}), f=_knots(gain * x, START_INTERVALS))
-    problem = replace(flat.problem(trials, np.inf), bend=None)
-    return replace(flat, theta=best_for(problem, flat.theta, flat.places[4], RIDGE))
+    free = Problem(flat.signals, trials, np.zeros((0, len(flat.theta))))
+    return replace(flat, theta=best_for(free, flat.theta, flat.places[4], RIDGE))
 
 
 def _random_denominator(order: int, rng: np.random.Generator, radius: float) -> FloatArray:
@@ -285,8 +285,8 @@ def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
     shifted = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
     b1 = np.concatenate([cascade.theta[b1_at], shifted.T])
     wide = cascade.moved({"b1": b1, "b2": np.zeros((phases, b2_at.shape[1]))})
-    problem = replace(wide.problem(search.known, np.inf), bend=None)
-    return replace(wide, theta=best_for(problem, wide.theta, wide.places[3].ravel()))
+    at = wide.places[3].ravel()
+    return replace(wide, theta=best_for(wide.problem(search.known, np.inf), wide.theta, at))
 
 
 def _knots(x: FloatArray, intervals: int) -> Smooth:

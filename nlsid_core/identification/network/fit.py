@@ -1,9 +1,8 @@
-"""Simulation errors of signals in a row, minimised: damped steps of Gauss and Newton.
+"""Simulation errors of signals in a row, minimised by steps of Gauss and Newton.
 
-With r = ŷ - y and J = ∂ŷ/∂θ, mean(r²) + |bend θ|² is minimised by the steps of Levenberg and
-Marquardt, (J'J + λ diag(J'J))δ = -J'r. A step ends at the bounds of θ, and those at a bound that
-would leave it stay; steps to slower filters than allowed are refused.
-Source: Marquardt 1963; Bertsekas 1982 for the bounds.
+With r = ŷ - y and J = ∂ŷ/∂θ, mean(r²) + |bend θ|² is minimised: where θ has bounds, in a region of
+trust (scipy); else by damped steps (J'J + λ diag(J'J))δ = -J'r, of which those to slower filters
+than allowed are refused. Source: Marquardt 1963; Branch, Coleman and Li 1999.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.optimize import least_squares
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
@@ -22,6 +22,7 @@ FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP, GIVE_UP_DAMPING = 1e-2, 0.2, 4.0, 1e8
 PATIENCE = 3  # steps in a row that gain less than the tolerance
 RIDGE = 1e-10  # of the largest diagonal entry: what the data do not show has no curvature
 MAX_RADIUS = 1.0 - 1e-6  # of the poles
+INSIDE = 1e-9  # of the bounds, where a search within them begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +69,14 @@ class Scaled:
 class Problem:
     """What is minimised over θ: [the free starts of every trial; the parameters].
 
-    bend: (rows, parameters) of the penalty. low, high: of the parameters. radius: of the poles.
+    bend: (rows, parameters) of the penalty. bounds: lowest and highest parameters (None: none).
+    radius: of the poles, at most.
     """
 
     signals: Signals
     trials: Sequence[Trial]
-    bend: FloatArray | None = None
-    low: FloatArray | float = -np.inf
-    high: FloatArray | float = np.inf
+    bend: FloatArray
+    bounds: tuple[FloatArray, FloatArray] | None = None
     radius: float = np.inf
 
     @property
@@ -98,43 +99,41 @@ class Problem:
                 at = np.arange(i * G, (i + 1) * G)
                 yield replace(trial, start=theta[at]), np.concatenate([at, shared])
 
-    def mean_square(self, theta: FloatArray) -> float:
-        """Of the error over the scored samples."""
-        parameters = theta[self.starts :]
-        errors = np.concatenate(
-            [
-                (self.signals.run(parameters, t)[self.signals.output] - t.y)[t.skipped :]
-                for t, _ in self.parts(theta)
-            ]
+    def errors(self, theta: FloatArray) -> FloatArray:
+        """ŷ - y at the scored samples of all trials."""
+        parameters, y = theta[self.starts :], self.signals.output
+        return np.concatenate(
+            [(self.signals.run(parameters, t)[y] - t.y)[t.skipped :] for t, _ in self.parts(theta)]
         )
-        return float(errors @ errors) / len(errors)
+
+    def mean_square(self, theta: FloatArray) -> float:
+        """Of the errors."""
+        return float(np.mean(np.square(self.errors(theta))))
+
+    def residual(self, theta: FloatArray) -> FloatArray:
+        """What the sum of squares is minimised of: the errors, and the penalty."""
+        errors, bent = self.errors(theta), self.bend @ theta[self.starts :]
+        return np.concatenate([errors / np.sqrt(len(errors)), bent])
+
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """The derivatives of the residual."""
+        blocks = []
+        for trial, at in self.parts(theta):
+            _, moved = self.signals.sensitivities(theta[self.starts :], trial)
+            J = moved[self.signals.output][:, trial.skipped :].T
+            block = np.zeros((len(J), len(theta)))
+            block[:, at] = J
+            blocks.append(block)
+        of_errors = np.concatenate(blocks)
+        none = np.zeros((len(self.bend), self.starts))
+        return np.vstack([of_errors / np.sqrt(len(of_errors)), np.hstack([none, self.bend])])
 
     def cost(self, theta: FloatArray) -> float:
-        """What is minimised; infinite where a filter is too slow."""
-        parameters = theta[self.starts :]
+        """|residual|²; infinite where a filter is too slow."""
         with np.errstate(all="ignore"):  # a wild candidate may overflow: its cost is not less
-            if self.signals.radius(parameters) > self.radius:
+            if self.signals.radius(theta[self.starts :]) > self.radius:
                 return np.inf
-            bent = 0.0 if self.bend is None else float(np.sum((self.bend @ parameters) ** 2))
-            return self.mean_square(theta) + bent
-
-    def normal(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """J'J and J'r of what is minimised."""
-        parameters, samples = theta[self.starts :], 0
-        H, gradient = np.zeros((len(theta), len(theta))), np.zeros(len(theta))
-        for trial, at in self.parts(theta):
-            sources, moved = self.signals.sensitivities(parameters, trial)
-            J = moved[self.signals.output][:, trial.skipped :]
-            r = (sources[self.signals.output] - trial.y)[trial.skipped :]
-            H[np.ix_(at, at)] += J @ J.T
-            gradient[at] += J @ r
-            samples += len(r)
-        H, gradient = H / samples, gradient / samples
-        if self.bend is not None:
-            inner = slice(self.starts, None)
-            H[inner, inner] += self.bend.T @ self.bend
-            gradient[inner] += self.bend.T @ (self.bend @ parameters)
-        return H, gradient
+            return float(np.sum(np.square(self.residual(theta))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,23 +147,41 @@ class Minimum:
 
 def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance: float) -> Minimum:
     """A local minimum from the parameters and the trials' starts."""
-    free, size = np.full(problem.starts, np.inf), len(parameters)
-    low = np.concatenate([-free, np.broadcast_to(problem.low, size)])
-    high = np.concatenate([free, np.broadcast_to(problem.high, size)])
-    theta = np.clip(problem.joined(parameters), low, high)
+    theta = problem.joined(parameters)
+    if problem.bounds is None:
+        theta = _damped(problem, theta, steps, tolerance)
+    else:
+        free = np.full(problem.starts, np.inf)
+        ends = zip((-free, free), problem.bounds, strict=True)
+        low, high = (np.concatenate(pair) for pair in ends)
+        theta = least_squares(
+            problem.residual,
+            np.clip(theta, low + INSIDE, high - INSIDE),
+            jac=problem.jacobian,
+            bounds=(low, high),
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=tolerance,
+            max_nfev=steps,
+        ).x
+    return Minimum(
+        rms=problem.mean_square(theta) ** 0.5,
+        parameters=theta[problem.starts :],
+        trials=tuple(trial for trial, _ in problem.parts(theta)),
+    )
+
+
+def _damped(problem: Problem, theta: FloatArray, steps: int, tolerance: float) -> FloatArray:
+    """Without bounds, but where poles are within the radius."""
     reached, taken, small, damping = problem.cost(theta), 0, 0, FIRST_DAMPING
     while taken < steps and small < PATIENCE and damping < GIVE_UP_DAMPING:
-        H, gradient = problem.normal(theta)
-        held = ((theta <= low) & (gradient > 0.0)) | ((theta >= high) & (gradient < 0.0))
-        moving = np.flatnonzero(~held)
-        H, gradient = H[np.ix_(moving, moving)], gradient[moving]
+        J = problem.jacobian(theta)
+        H, gradient = J.T @ J, J.T @ problem.residual(theta)
         taken, gain, diagonal = taken + 1, 0.0, np.diag(H)
         while damping < GIVE_UP_DAMPING:
-            candidate = theta.copy()
             try:
                 damped = H + np.diag(damping * diagonal + RIDGE * np.max(diagonal))
-                candidate[moving] -= cho_solve(cho_factor(damped), gradient)
-                candidate = np.clip(candidate, low, high)
+                candidate = theta - cho_solve(cho_factor(damped), gradient)
                 lower = problem.cost(candidate)
             except (LinAlgError, ValueError):
                 lower = np.inf
@@ -175,8 +192,7 @@ def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance:
                 break
             damping *= DAMPING_UP
         small = small + 1 if gain < tolerance else 0
-    trials = tuple(trial for trial, _ in problem.parts(theta))
-    return Minimum(problem.mean_square(theta) ** 0.5, theta[problem.starts :], trials)
+    return theta
 
 
 def best_for(
@@ -185,11 +201,11 @@ def best_for(
     """The parameters with those `at` as least squares give them, in which y is affine."""
     found = parameters.copy()
     found[at] = 0.0
-    H, gradient = problem.normal(problem.joined(found))
-    at_theta = problem.starts + at
-    H = H[np.ix_(at_theta, at_theta)]
+    theta = problem.joined(found)
+    J = problem.jacobian(theta)[:, problem.starts + at]
+    H = J.T @ J
     H += ridge * np.trace(H) / len(H) * np.eye(len(H))
-    found[at] = -np.linalg.solve(H, gradient[at_theta])
+    found[at] = -np.linalg.solve(H, J.T @ problem.residual(theta))
     return found
 
 

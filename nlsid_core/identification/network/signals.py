@@ -92,6 +92,15 @@ class Signals:
         return sum(node.given for node in self.nodes if isinstance(node, Signal))
 
     @cached_property
+    def parameters(self) -> int:
+        """How many there are."""
+        return 1 + max(
+            int(part.at.max(initial=-1))
+            for node in self.nodes
+            for part in (node.taps if isinstance(node, Signal) else (node,))
+        )
+
+    @cached_property
     def chained(self) -> set[int]:
         """The numbers whose derivatives another one needs, and that of y."""
         later = {
