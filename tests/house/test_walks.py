@@ -17,6 +17,7 @@ from tests.house.sources import ROOT
 # What a tube of recorded bags does not go through: the other two kinds, the live node, and the
 # claim itself, which is decided in a process of its own.
 ELSEWHERE = {
+    "nlsid_core/kernel/checking.py",
     "nlsid_core/kernel/tube.py",
     "nlsid_core/design/sampled/design.py",
     "nlsid_core/design/continuous/design.py",
