@@ -34,11 +34,14 @@ def python(module: str, arguments: Sequence[str] = ()) -> Iterator[subprocess.Po
             running.wait()
 
 
-def settings(parameters: Mapping[str, object]) -> list[str]:
-    """Arguments that start a node quietly with parameters; a string is taken as it is."""
+def settings(parameters: Mapping[str, object], level: str = "warn") -> list[str]:
+    """Arguments that start a node with parameters; a string is taken as it is.
+
+    level: of what it logs, the least.
+    """
     written = {
         name: value if isinstance(value, str) else json.dumps(value, default=str)
         for name, value in parameters.items()
     }
     given = [part for name, text in written.items() for part in ("-p", f"{name}:={text}")]
-    return ["--ros-args", "--log-level", "warn", *given]
+    return ["--ros-args", "--log-level", level, *given]

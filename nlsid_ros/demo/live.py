@@ -29,6 +29,7 @@ from nlsid_core.running.reading import Status
 from nlsid_ros.processes import isolate, python, settings
 
 FAULT = "scaled by 0.6"
+QUIET = "fatal"  # what goes wrong is in the outcome; a node that cannot start says so anyhow
 PATIENCE = 120.0  # s for nodes to find each other, on a loaded machine
 SETTLE = 1.0  # s for the last messages of a pass
 MARGIN_TOLERANCE = 1e-9
@@ -78,12 +79,12 @@ def play(funnel: Path, bag: Path, topics: list[str], out: Path) -> Path:
     given = {"bag": bag, "topics": topics, "wait_for": 2, "wait_timeout": PATIENCE}
     with ExitStack() as stack:
         for name, parameters in nodes:
-            stack.enter_context(python(f"nlsid_ros.{name}", settings(parameters)))
+            stack.enter_context(python(f"nlsid_ros.{name}", settings(parameters, QUIET)))
         rclpy.init()
         stack.callback(rclpy.shutdown)
         listening = rclpy.create_node("live_observer").count_subscribers
         _wait(lambda: bool(listening(MARGINS)))
-        player = stack.enter_context(python("nlsid_ros.bag_player", settings(given)))
+        player = stack.enter_context(python("nlsid_ros.bag_player", settings(given, QUIET)))
         _wait(lambda: player.poll() is not None)
         if player.returncode:
             raise NlsidError(f"bag_player ended with status {player.returncode}")

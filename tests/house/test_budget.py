@@ -13,7 +13,7 @@ from tests.house.sources import sources
 STATEMENTS = {
     ("nlsid_core",): 19_844,
     ("bags",): 12_953,
-    ("nlsid_ros",): 2_663,
+    ("nlsid_ros",): 2_664,
     ("tests",): 24_622,
     ("benchmarks", "examples"): 3_819,
 }
