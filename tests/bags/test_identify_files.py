@@ -289,7 +289,7 @@ def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
     model = StateAffineModel.from_document(files.load_document(tmp_path / "out" / documents.MODEL))
     assert [signal.name for signal in model.y] == ["angle 0", "angle 1"]
     page = (tmp_path / "out" / documents.REPORT).read_text()
-    assert page.count("<svg") == 4, "two outputs, residuals, the search"
+    assert page.count("<svg") == 3, "two outputs, residuals"
 
 
 def test_several_inputs_of_one_output_are_proved(coupled: Path, tmp_path: Path) -> None:
