@@ -246,8 +246,7 @@ def blown(x: Any, u: Any, w: Any) -> Any:
 @pytest.mark.slow
 def test_a_disturbance_that_is_too_strong_is_named() -> None:
     text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
-    assert "The diagonal of Q is (2e+04, 3.2e+03) and of R is (50)." in text
-    assert "No funnel of this policy can be proved: a simulated solution starts on" in text
+    assert "The diagonal of Q is (2e+04, 3.2e+03) and of R is (50)" in text
     assert re.search(r"Because of the disturbance w: take a larger goal", text)
     assert re.search(r"the disturbance w takes .* 1/s \(\d+ %\)", text)
 

@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 19_844,
     ("bags",): 12_953,
     ("nlsid_ros",): 2_664,
-    ("tests",): 24_622,
+    ("tests",): 24_621,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8
