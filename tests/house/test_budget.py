@@ -11,9 +11,9 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_844,
+    ("nlsid_core",): 19_846,
     ("bags",): 12_953,
-    ("nlsid_ros",): 2_664,
+    ("nlsid_ros",): 2_666,
     ("tests",): 24_621,
     ("benchmarks", "examples"): 3_819,
 }
