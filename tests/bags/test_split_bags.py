@@ -14,6 +14,7 @@ from bags.recordings.message_types import decode
 from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
 from tests.bag_messages import CMD, CMD_TYPE, ODOM, ODOM_TYPE, PERIOD_NS, START_NS, command
+from tests.mcap_files import three_readers
 
 ARM = "my_robot/msg/Arm"
 
@@ -31,20 +32,6 @@ def write(path: Path, count: int, **settings: object) -> list[bytes]:
             if k % 20 == 19:
                 bag.close_chunk()
     return data
-
-
-def three_readers(bag: Path, topic: str) -> list[list[bytes]]:
-    with Bag(bag) as source:
-        ours, files = [m.data for m in source.messages([topic])], source.files
-    with AnyReader([bag]) as reader:
-        wanted = [c for c in reader.connections if c.topic == topic]
-        rosbags = [bytes(data) for _, _, data in reader.messages(wanted)]
-    mcap: list[bytes] = []
-    for file in files:
-        with file.open("rb") as stream:
-            messages = make_reader(stream, validate_crcs=True).iter_messages([topic])
-            mcap += [message.data for *_, message in messages]
-    return [ours, rosbags, mcap]
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
