@@ -29,7 +29,6 @@ from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
-from nlsid_core.running.held import Held
 from nlsid_core.running.stage import Stage
 
 FORMAT: Final = "nlsid/bundle"
@@ -222,7 +221,7 @@ def _design(
     Stage(model, policy, funnel).refuse_mismatch()
     design = Design(model, policy, funnel, proof, decision, None, wiring)
     if wiring is not None:
-        Held.of_claim(design.claim, wiring.period)  # which refuses samples that come too slowly
+        _ = design.held  # which refuses samples that come too slowly for it
     if wrong := of_funnel(model.document(), funnel.document()).wrong:
         raise CertificateRejected(f"what was measured contradicts the design: {'; '.join(wrong)}")
     return design
