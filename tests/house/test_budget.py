@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_844,
-    ("bags",): 12_953,
-    ("nlsid_ros",): 2_664,
-    ("tests",): 24_621,
+    ("bags",): 12_640,
+    ("nlsid_ros",): 2_660,
+    ("tests",): 24_507,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8
