@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from bags.recordings.bag import Bag
@@ -13,22 +12,9 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.message_types import decode
 from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
+from tests.mcap_files import three_readers
 
 ARM = "my_robot/msg/Arm"
-
-
-def three_readers(bag: Path, topic: str) -> list[list[bytes]]:
-    with Bag(bag) as source:
-        ours, files = [m.data for m in source.messages([topic])], source.files
-    with AnyReader([bag]) as reader:
-        wanted = [c for c in reader.connections if c.topic == topic]
-        rosbags = [bytes(data) for _, _, data in reader.messages(wanted)]
-    mcap: list[bytes] = []
-    for file in files:
-        with file.open("rb") as stream:
-            messages = make_reader(stream, validate_crcs=True).iter_messages([topic])
-            mcap += [message.data for *_, message in messages]
-    return [ours, rosbags, mcap]
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_844,
-    ("bags",): 12_640,
-    ("nlsid_ros",): 2_660,
-    ("tests",): 24_507,
+    ("nlsid_core",): 19_699,
+    ("bags",): 12_953,
+    ("nlsid_ros",): 2_669,
+    ("tests",): 24_623,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8
