@@ -3,8 +3,8 @@
 from typing import Final
 
 import numpy as np
-from scipy.signal import correlate
 
+from bags.signals.delays import correlation
 from nlsid_core.arrays import FloatArray
 
 SAME: Final = 0.98  # correlation from which two stretches are one excitation; noise lowers it
@@ -20,7 +20,7 @@ def find_period(values: FloatArray) -> int | None:
     x = values - values.mean()
     if len(x) < 2 * LEAST_PERIOD or not x @ x > 0:
         return None
-    raw = correlate(x, x, method="fft")[len(x) - 1 :]
+    raw = correlation(x, x)
     energy = np.cumsum(x * x)
     head = energy[::-1]  # of x[:N - lag]
     tail = energy[-1] - np.concatenate([[0.0], energy[:-1]])  # of x[lag:]
