@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_699,
-    ("bags",): 12_953,
+    ("bags",): 12_954,
     ("nlsid_ros",): 2_669,
     ("tests",): 24_623,
     ("benchmarks", "examples"): 3_819,
