@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.signal import welch
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
@@ -295,6 +294,8 @@ def _excitation(samples: Samples) -> Iterator[Finding]:
     if not np.ptp(x) > 0:
         return
     period = max(float(np.median(np.diff(samples.stamp_ns))) / 1e9, 1e-9)
+    from scipy.signal import welch  # importing it takes longer than most bags take to read
+
     f, power = welch(x - x.mean(), fs=1 / period, nperseg=min(len(x), 1024))
     share = np.cumsum(power) / power.sum()
     band = float(f[np.searchsorted(share, 0.95)])

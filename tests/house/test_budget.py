@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_699,
-    ("bags",): 12_640,
+    ("bags",): 12_641,
     ("nlsid_ros",): 2_665,
     ("tests",): 24_508,
     ("benchmarks", "examples"): 3_819,
