@@ -119,17 +119,12 @@ def _paths(
                 yield replace(listed, signal=str(single)), [single]
             continue
         yield listed, elements
-        if len(owners) > 1 and _is_quaternion(owners, types) and path.steps[-1].field == "w":
+        if len(owners) > 1 and owners[-1][0] == QUATERNION and path.steps[-1].field == "w":
             for angle in ANGLES:
                 turned = replace(path, steps=(*path.steps[:-1], Step(angle)))
                 if str(turned) != last_angle and not turned.every:
                     last_angle = str(turned)
                     yield Listed(str(turned), number, "rad"), [turned] if message else []
-
-
-def _is_quaternion(owners: Sequence[tuple[str, str]], types: Typestore) -> bool:
-    owner, name = owners[-1]
-    return owner == QUATERNION and name in fields_of(QUATERNION, types)
 
 
 def _named(
