@@ -71,8 +71,8 @@ class Fetching:
         places: dict[int, list[IntArray]] = {}
         edges = [np.array([block.end - base for block in blocks], np.int64)]
         for block in blocks:
-            for channel, offsets in self._ready[block.offset].items():
-                places.setdefault(channel, []).append(block.offset - base + offsets)
+            for channel, listed in self._ready[block.offset].items():
+                places.setdefault(channel, []).append(block.offset - base + listed)
         offsets = {channel: np.concatenate(found) for channel, found in places.items()}
         return content, offsets, np.sort(np.concatenate([*offsets.values(), *edges]))
 
