@@ -1,10 +1,12 @@
 """The recorder over DDS: what is recorded is what was sent, whatever happens meanwhile."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
 import time
+from base64 import b85encode
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -99,21 +101,12 @@ def messages_on(bag: Path, topic: str) -> list[bytes]:
         return [message.data for message in source.messages([topic])]
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-@pytest.mark.parametrize("split", [{"split_time": 0.5}, {"split_size": 0.05}], ids=str)
-def test_a_split_bag_is_read_back_bit_equal_by_three_readers(
-    robot: Joints, tmp_path: Path, compression: str, split: dict[str, object]
-) -> None:
+def test_a_bag_is_read_back_bit_equal_by_three_readers(robot: Joints, tmp_path: Path) -> None:
     bag = tmp_path / "run"
-    settings = {"topics": "[/joints]", "bag": bag, "compression": compression, **split}
-    recorder = robot.records(**settings, chunk_period=0.05)
-    robot.publish(700 if "split_time" in split else 1600, every=0.0015)
+    recorder = robot.records(topics="[/joints]", bag=bag, chunk_period=0.05)
+    robot.publish(700, every=0.0015)
     robot.received("/joints", len(robot.sent))
     stop(recorder)
-    with Bag(bag) as source:
-        names = [file.name for file in source.files]
-    assert len(names) >= 2
-    assert names == [f"run_{k}.mcap" for k in range(len(names))]
     assert three_readers(bag, "/joints") == [robot.sent] * 3
 
 
@@ -296,11 +289,11 @@ def test_on_a_full_disk_all_that_came_before_is_in_a_closed_bag_and_the_node_liv
     robot: Joints, small_disk: Path
 ) -> None:
     bag = small_disk / "run"
-    settings = {"topics": "[/noise]", "bag": bag, "least_free": 0.0, "compression": "none"}
+    settings = {"topics": "[/noise]", "bag": bag, "least_free": 0.0}
     noise = robot.node.create_publisher(String, "/noise", qos.STREAM)
     recorder = robot.records(noise, **settings)
-    for k in range(120):
-        noise.publish(String(data=f"{k:08}" + "x" * 50_000))
+    for k in range(160):
+        noise.publish(String(data=f"{k:08}" + b85encode(random.randbytes(40_000)).decode()))
         time.sleep(0.02)
     robot.hears("No space left on device", RECORDER)
     assert robot.levels[RECORDER] == DiagnosticStatus.ERROR
