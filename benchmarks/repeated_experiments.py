@@ -24,7 +24,6 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.polynomial.implicit_descent import minimise_equation
 from nlsid_core.identification.polynomial.implicit_rie import (
-    Model,
     least_squares_coefficients,
 )
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
@@ -77,7 +76,7 @@ def system() -> MonotoneEquation:
     )
 
 
-def from_rest(model: Model, w: FloatArray) -> FloatArray:
+def from_rest(model: MonotoneEquation, w: FloatArray) -> FloatArray:
     """The response to w with zeros before."""
     h = model.history
     return model.simulate(np.concatenate([np.zeros(h), w]))[h:]
@@ -104,7 +103,7 @@ def identify(runs: list[Trajectory], n: int) -> tuple[MomentFit, float]:
     return fit, time.process_time() - started
 
 
-def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str, Model]:
+def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str, MonotoneEquation]:
     """What the comparators find."""
     model_class, data = Polynomial(n, (0,), Degrees(left=3), set="3.8"), Dataset(tuple(runs))
     plain = plain_moments(runs, model_class, OFFSETS)
@@ -118,7 +117,7 @@ def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str,
         if (found := minimise_equation(rows, start, steps=STEPS)) is not None
     }
     return {
-        "least_squares": rows.model(e, f, 1.0),
+        "least_squares": rows.equation(e, f),
         "sem": min(minima.values(), key=lambda model: simulation_percent(model, data)),
         **minima,
         "naive": minimise_moment_rie(plain, model_class, data, OFFSETS).model,
@@ -140,7 +139,7 @@ def measure(trials: int, seconds_left: float = math.inf) -> dict[str, Any]:
     seconds: dict[tuple[int, int], list[float]] = {}
     proved: dict[tuple[int, int], list[bool]] = {}
 
-    def score(n: int, T: int, method: str, model: Model) -> None:
+    def score(n: int, T: int, method: str, model: MonotoneEquation) -> None:
         error = 100.0 * float(np.linalg.norm(y_test - from_rest(model, w_test))) / spread
         errors.setdefault((n, T, method), []).append(error)
 

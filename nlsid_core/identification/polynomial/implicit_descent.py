@@ -27,7 +27,7 @@ from nlsid_core.identification.polynomial.implicit_rie import (
 )
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, delayed_states
 from nlsid_core.identification.polynomial.rollout import DIVERGED, Linearised, Rollout
-from nlsid_core.models import ImplicitModel, Signal
+from nlsid_core.models import ImplicitModel, MonotoneEquation, Signal
 from nlsid_core.models.monotone_equation import is_increasing
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables
@@ -182,10 +182,10 @@ def minimise_certified_implicit(
 
 def minimise_equation(
     rows: ImplicitRows, start: tuple[FloatArray, FloatArray], *, steps: int
-) -> Model | None:
+) -> MonotoneEquation | None:
     """The same of set 3.8 without the set: nothing makes the equation stable."""
     everywhere, theta = ImplicitSet(rows, None), np.concatenate(start).ravel()
     found = descend(everywhere, theta, steps=steps, inside=True)
     if found is None or not np.isfinite(everywhere.cost(found)):
         return None
-    return rows.model(*everywhere.split(found), MONOTONE)
+    return rows.equation(*everywhere.split(found))

@@ -26,6 +26,7 @@ from nlsid_core.identification.polynomial.moment_rie import identify_from_repeat
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.starts import as_implicit, linear_start
 from nlsid_core.identification.trail import Task, Trail, least_error, tried
+from nlsid_core.models import MonotoneEquation
 
 Coefficients = tuple[FloatArray, FloatArray]  # scaled e and f of an implicit model
 
@@ -88,10 +89,10 @@ def _starts(rows: ImplicitRows, task: Task) -> tuple[Callable[[], Coefficients],
     return bounded, lambda: least_squares_coefficients(rows), straight
 
 
-def _anywhere(rows: ImplicitRows, task: Task, method: Sem) -> Model:
+def _anywhere(rows: ImplicitRows, task: Task, method: Sem) -> MonotoneEquation:
     """The best of the local minima of the simulation error, which may have no proof."""
 
-    def minimised(start: Coefficients) -> Model | None:
+    def minimised(start: Coefficients) -> MonotoneEquation | None:
         return minimise_equation(rows, start, steps=method.iterations)
 
     starts = _starts(rows, task)
