@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_495,
+    ("nlsid_core",): 19_496,
     ("bags",): 12_641,
     ("nlsid_ros",): 2_665,
     ("tests",): 24_486,
