@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 19_328,
     ("bags",): 12_641,
     ("nlsid_ros",): 2_665,
-    ("tests",): 24_349,
+    ("tests",): 23_995,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
