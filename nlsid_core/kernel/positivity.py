@@ -11,7 +11,7 @@ So c >= Σ_i left[i] v_i², left[i] >= 0 being the least that any b_k leaves on 
 if something is left for the monomial 1.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, lcm
@@ -92,22 +92,6 @@ def positive(
     refuse_if(strict and 0 not in left, f"{what}: the basis needs the monomial 1", "not_positive")
     refuse_if(strict and not left[0], f"{what}: not positive, only nonnegative", "not_positive")
     return left.get(0, Fraction(0))
-
-
-def positive_on(
-    c: Polynomial, domain: Sequence[Polynomial], parts: Mapping[str, Node], ring: Ring, what: str
-) -> dict[int, Fraction]:
-    """`remainder` of c - Σ_k σ_k domain[k], σ_k sums of squares: then c >= 0 where domain >= 0.
-
-    parts: `basis`, `columns`, `squares`, and perhaps `multipliers`, each with `of`, the index
-    k of its part of the domain, increasing, and the same three members; a part without one has 0.
-    """
-    terms, last = [c], -1
-    for entry in parts["multipliers"].items(0, len(domain)) if "multipliers" in parts else []:
-        members = entry.members(f"of {WITNESS}")
-        last = members["of"].whole(last + 1, len(domain) - 1)
-        terms.append(-1 * (expanded(read_squares(members, ring), ring) * domain[last]))
-    return remainder(ring.sum(terms), read_squares(parts, ring), ring, what)
 
 
 def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[int, Fraction]:
