@@ -98,9 +98,9 @@ class Node:
         """An object with exactly these members (names separated by spaces)."""
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
-        self.require({f"'{name}' is missing": False for name in wanted if name not in self.value})
-        known = {*wanted, *allowed}
-        self.require({f"unknown member {plain(n)!r}": False for n in self.value if n not in known})
+        missing = {f"'{name}' is missing": False for name in wanted if name not in self.value}
+        others = [name for name in self.value if name not in (*wanted, *allowed)]
+        self.require(missing | {f"unknown member {plain(name)!r}": False for name in others})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
     def read(self, table: Table) -> Members:
@@ -234,11 +234,6 @@ def itself(node: Node) -> Node:
 def whole(least: int, most: int = MAX_WHOLE) -> Reader:
     """A reader of a whole number in [least, most]."""
     return lambda node: node.whole(least, most)
-
-
-def rows_of(count: int) -> Reader:
-    """A reader of rows of so many whole numbers."""
-    return lambda node: node.wholes(None, count)
 
 
 def each(reader: Callable[[Node], Any], least: int, most: int = MAX_ENTRIES) -> Reader:

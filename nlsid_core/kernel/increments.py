@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain, product
 from math import comb, prod
+from types import SimpleNamespace
 
 from .exact import MAX_ORDER, Matrix, Rows, combined, definite, scaled, transposed
 from .exact import product as times
@@ -28,15 +29,7 @@ MAX_VERTICES = 10**5  # of a box
 
 Box = list[tuple[Fraction, Fraction]]
 Entries = list[list[Terms]]  # a matrix of polynomials in θ
-
-
-@dataclass(frozen=True)
-class Linear:
-    """x⁺ = A x + B u + f, y = x_1 + D u + c, in the increment form's own state."""
-
-    B: list[Fraction]
-    D: Fraction
-    input_range: tuple[Fraction, Fraction]
+Linear = SimpleNamespace  # B, D, input_range of x⁺ = A x + B u + f, y = x_1 + D u + c
 
 
 @dataclass(frozen=True)

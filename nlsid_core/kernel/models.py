@@ -16,7 +16,7 @@ from typing import Any
 
 from . import text
 from .exact import Matrix, identity, unit
-from .files import Node, Table, Terms, each, itself, limit, one_of, refuse_if, rows_of
+from .files import Node, Table, Terms, each, itself, limit, one_of, refuse_if
 from .implicit_models import derivative, read_implicit
 from .increments import MAX_POWER, Box, Entries, Hull, Linear, Model
 from .signals import ranges, read_signal, signals
@@ -62,7 +62,8 @@ def _read_linear(node: Node) -> Model:
     node.require({"b should have one number more than a": fits, "u_range": low <= high})
     direct, *b = given["b"]
     F = [[a_i, *unit(i + 1, n + 1)[1:n]] for i, a_i in enumerate(a)]
-    linear = Linear([p + q * direct for p, q in zip(b, a, strict=True)], direct, (low, high))
+    B = [p + q * direct for p, q in zip(b, a, strict=True)]
+    linear = Linear(B=B, D=direct, input_range=(low, high))
     y, u = (given["y"],), (given["u"],)
     return Model(given["period"], y, u, F, [unit(0, n)], Hull([]), linear=linear)
 
@@ -72,7 +73,7 @@ def _read_affine(node: Node) -> Model:
     table: Table = {
         "y": signals("outputs", 1),
         "u": signals("inputs", 1),
-        "window": rows_of(2),
+        "window": lambda entry: entry.wholes(None, 2),
         "G": each(itself, 2),
         "p": itself,
         **dict.fromkeys(("y_offset", "y_scale", "u_offset", "u_scale"), (None,)),
@@ -124,7 +125,7 @@ def _read_monotone(node: Node) -> Model:
     table: Table = {
         "y": read_signal,
         "u": signals("inputs"),
-        "window": rows_of(2),
+        "window": lambda entry: entry.wholes(None, 2),
         "e": (3,),
         **dict.fromkeys(("a", "b", "u_offset"), (None,)),
         **dict.fromkeys(("c", "y_offset"), ()),

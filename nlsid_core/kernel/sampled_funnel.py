@@ -63,7 +63,8 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     steps, rooms = bases["steps"].items(len(u), len(u)), []
 
     def prove(ring: Ring, k: int) -> None:
-        at = Sample(x[k], u[k], K[k], x[k + 1], S[k], S[k + 1], A[k])
+        after = {"x_next": x[k + 1], "S_next": S[k + 1]}
+        at = Sample(x=x[k], u=u[k], K=K[k], S=S[k], A=A[k], **after)
         step = read_step(steps[k], model, at, funnel["form"], ring)
         rooms.extend([_prove_chain(step, bases, funnel, chain, k) for chain in CHAINS])
 

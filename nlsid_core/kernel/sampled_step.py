@@ -5,9 +5,9 @@ which are verified here. What they prove: `sampled_funnel`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from math import factorial, prod
+from types import SimpleNamespace
 
 from .exact import Matrix, combined, identity, product, scaled, semidefinite, transposed
 from .files import Members, Node, Table, Terms, each, itself, refuse_if
@@ -16,17 +16,8 @@ from .polynomials import Polynomial, Ring
 MAX_CURVED = 64  # degrees with a bound of their curvature
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A sample of a policy and the next state, with the shapes of both and A of the response."""
-
-    x: list[Fraction]
-    u: list[Fraction]
-    K: Matrix
-    x_next: list[Fraction]
-    S: Matrix
-    S_next: Matrix
-    A: Matrix
+# Of a policy x, u, K at a sample and the next x, of a funnel S at both and A of the response.
+Sample = SimpleNamespace
 
 
 def read_step(node: Node, model: Members, at: Sample, form: str, ring: Ring) -> Members:
