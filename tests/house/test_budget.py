@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_328,
+    ("nlsid_core",): 19_144,
     ("bags",): 12_641,
     ("nlsid_ros",): 2_665,
-    ("tests",): 23_995,
+    ("tests",): 23_994,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
