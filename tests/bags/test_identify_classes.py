@@ -24,7 +24,7 @@ from nlsid_core.identification import (
     select,
     validate,
 )
-from nlsid_core.identification.prediction import history, simulate_trial, solve_increasing_at
+from nlsid_core.identification.prediction import simulate_trial, solve_increasing_at
 from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from nlsid_core.models.monotone_equation import solve_increasing
@@ -84,12 +84,10 @@ def test_moments_stand_beside_the_biased_rie_and_least_squares(
     pairs = [*repeated.pair(2000, 1), *repeated.pair(1500, 2)]
     alone = Dataset(tuple(replace(trial, group="") for trial in pairs))
     biased = identify(alone, repeated.CLASS, comparators=())
-    assert "which noise biases" in str(biased)
     assert monotone.methods == ("least_squares", "rie")
     assert repeated.percent(monotone.model) < 0.4 * repeated.percent(biased.model)
     assert monotone["least_squares"].proof is not None, "every candidate is offered to the prover"
     assert len(monotone.history.steps) == 1
-    assert "mean squared simulation error by the moments" in str(monotone)
 
 
 def test_a_comparator_that_fails_is_left_out_and_logged(
@@ -128,7 +126,10 @@ def test_too_little_data_says_how_much_there_is_and_what_for() -> None:
         ),
         (Polynomial(80), "70 samples, 80 lags need more"),
         (Network(FilterMapFilter((20, 20))), "fewer than 99 scored samples"),
-        (Polynomial(80, degrees=Degrees(left=3), set="3.8"), "70 common samples; 81 needed"),
+        (
+            Polynomial(80, degrees=Degrees(left=3), set="3.8"),
+            "70 samples, a history of 80 needs more",
+        ),
     ):
         with pytest.raises(DataError, match=reason):
             identify(short, model_class, validation=short)
@@ -216,20 +217,6 @@ def test_many_increasing_cubics_are_inverted_at_once() -> None:
         found = solve_increasing_at(np.array(e), targets)
         one_by_one = [solve_increasing(e, target, 0.0) for target in targets.tolist()]
         np.testing.assert_allclose(found, one_by_one, rtol=1e-12, atol=1e-15)
-
-
-def test_predictions_of_a_monotone_equation_are_simulations_restarted_at_every_sample() -> None:
-    model = replace(repeated.truth(), window=((0, 3),), y_offset=0.2)
-    w = np.random.default_rng(0).uniform(-2.0, 2.0, 60)
-    trial = repeated.run(w, 0.1, 1)
-    h, horizon = history(model), 4
-    assert h == 3
-    predicted = predict(model, trial, horizon)
-    assert predicted.shape == (60 - h - horizon + 1, 1)
-    for row in range(len(predicted)):
-        rows = slice(row, row + h + horizon)
-        restarted = model.simulate(trial.u[rows], trial.y[row : row + h, 0])
-        assert predicted[row, 0] == pytest.approx(restarted[-1], abs=1e-12)
 
 
 def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[MonotoneEquation]) -> None:
