@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 19_144,
     ("bags",): 12_517,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_787,
+    ("tests",): 23_697,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
