@@ -132,7 +132,7 @@ def test_a_spurious_root_within_the_bound_makes_a_claim_false_and_is_refused() -
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
     design = design_state_funnel(
-        SampledTracking(model, policy, feedback, assumption=assumption(0.01), goal=0.2)
+        SampledTracking(model, policy, feedback, assumption=assumption(0.001), goal=0.05)
     )
     spurious, rest = [Fraction(4)], [Fraction(0)] * 2
     after, h = oracle.implicit_next(model.document(), policy.document(), 0, rest, spurious)
