@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_699,
-    ("bags",): 12_641,
+    ("bags",): 12_649,
     ("nlsid_ros",): 2_665,
-    ("tests",): 24_508,
+    ("tests",): 24_512,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8
