@@ -5,12 +5,12 @@ from html import escape
 from typing import Any
 
 from bags.designs import documents
+from nlsid_core.arrays import Json
 from nlsid_core.designs import AnyDesign
 from nlsid_core.dynamics import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.kernel import text
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.running.held import Held
 
 MOST_TERMS = 12  # of an equation that is printed
 
@@ -24,7 +24,7 @@ def equations_chapter(design: AnyDesign) -> str:
         "x are the states and u the inputs, counted from 0, in the order and in the units of the "
         "equations below; the files have no other names for them",
         *_equations(field),
-        *_bounds(field, policy, design.held),
+        *_bounds(field, policy, design.claim),
     ]
     said = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f"{_widths(funnel)}<ul>{said}</ul>"
@@ -75,14 +75,14 @@ def _term(names: tuple[str, ...], exponents: Any, coefficient: float) -> str:
     return " ".join(factors if factors and size == "1" else [size, *factors])
 
 
-def _bounds(field: VectorField, policy: ContinuousPolicy, held: Held) -> list[str]:
+def _bounds(field: VectorField, policy: ContinuousPolicy, claim: Json) -> list[str]:
     names = field.names[1:]
     limits = [f"u{int(j)} in [{low:g}, {high:g}]" for j, low, high in policy.limits.tolist()]
     pushes = [f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain)]
     inside = [f"{names[j]} in [{low:g}, {high:g}]" for j, low, high in field.validity(0)]
     planned = zip(policy.planned.min(axis=0), policy.planned.max(axis=0), strict=True)
     plan = [f"u{j} in [{low:.4g}, {high:.4g}]" for j, (low, high) in enumerate(planned)]
-    wrong = [f"x{i} to {e:g}" for i, e in enumerate(held.error.tolist()) if e]
+    wrong = [f"x{i} to {e:g}" for i, e in enumerate(claim.get("error", [])) if e]
     return [
         f"inputs are clipped to: {', '.join(limits) or 'nothing (the proof needs no limits)'}",
         f"inputs of the motion itself, at its knots: {', '.join(plan)}",
@@ -92,8 +92,8 @@ def _bounds(field: VectorField, policy: ContinuousPolicy, held: Held) -> list[st
             if inside
             else []
         ),
-        f"hold: an input is at most {held.hold:g} s old"
-        if held.hold
+        f"hold: an input is at most {claim['hold']:g} s old"
+        if "hold" in claim
         else "hold: none; the policy is applied continuously",
         *([f"measured within: {', '.join(wrong)}"] if wrong else []),
     ]
