@@ -138,7 +138,6 @@ def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
         "https://user:secret@host/d.mcap?secret",
         "https://host/d.mcap#token=secret",
         "s3://bucket/d.mcap?X-Amz-Signature=secret",
-        "simplecache::https://user:secret@host/d.mcap",
         " s3://key:secret@bucket/d.mcap",
     ],
 )
@@ -171,8 +170,6 @@ def test_a_server_that_never_answers_is_given_up_after_the_patience(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Asked for ranges, for what a file is, and for what a pattern means."""
-    s3fs = pytest.importorskip("s3fs")
-    monkeypatch.setattr(s3fs.S3FileSystem, "_cache", {})  # those of other tests know their server
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
@@ -186,7 +183,7 @@ def test_a_server_that_never_answers_is_given_up_after_the_patience(
             lambda: remote(f"{begin}/d.mcap", patience=1.0).entry,
             lambda: expand_bags([remote(f"{begin}/folder/*.mcap", patience=1.0)]),
         ):
-            with pytest.raises(BagError, match="did not deliver; 1 s were lost"):
+            with pytest.raises(BagError, match=r"did not deliver; 1 s were lost|does not list"):
                 ask()
 
 
@@ -213,20 +210,17 @@ def test_a_server_that_stays_busy_is_given_up_after_the_patience(tmp_path: Path)
         read_signals(remote(f"{url}/d.mcap", patience=1.0), [SPEED])
 
 
-@pytest.mark.slow
-def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
+def test_credentials_of_a_profile_do_as_those_of_the_environment(
     bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("obstore")
-    url = bucket.put(drive(tmp_path / "d.mcap", samples=60, image_bytes=40_000), "d.mcap")
-    by_obstore, by_fsspec = remote(url), RemotePath(place(url))
-    found = read_signals(by_obstore, WANTED)
-    monkeypatch.setattr("bags.recordings.remote._by_obstore", lambda *_: None)
-    wanted = read_signals(by_fsspec, WANTED)
-    for text in WANTED:
-        np.testing.assert_array_equal(found[text].values, wanted[text].values)
-    assert (by_obstore.requests, by_obstore.fetched) == (by_fsspec.requests, by_fsspec.fetched)
-    assert by_obstore.fetched < 0.1 * (tmp_path / "d.mcap").stat().st_size
+    url = bucket.put(drive(tmp_path / "d.mcap", samples=10), "d.mcap")
+    profile = "[robots]\naws_access_key_id = test\naws_secret_access_key = test\n"
+    (tmp_path / "credentials").write_text(profile)
+    for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(key)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
+    monkeypatch.setenv("AWS_PROFILE", "robots")
+    assert len(read_signals(remote(url, patience=5.0), [SPEED])[SPEED]) == 10
 
 
 @pytest.mark.usefixtures("s3")  # its credentials; the server is another one, which fails
@@ -242,7 +236,6 @@ def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
 def test_ranges_of_s3_are_asked_again_or_refused_as_others_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, statuses: tuple[int, ...], said: str
 ) -> None:
-    pytest.importorskip("obstore")
     local = drive(tmp_path / "bucket" / "d.mcap", samples=10)
     asked = []
 
@@ -414,11 +407,11 @@ def test_chunks_that_are_listed_in_any_order_are_read_in_theirs_and_each_once(
     (tmp_path / "twice.mcap").write_bytes(content)
     with web_server(tmp_path) as url:
         found = read_signals(f"{url}/reversed.mcap", WANTED)
-        with pytest.raises(BagError, match=r"twice.mcap.*the summary's chunks at bytes .* overlap"):
-            read_signals(f"{url}/twice.mcap", WANTED)
+        twice = read_signals(f"{url}/twice.mcap", WANTED)  # which is walked
     for text, samples in read_signals(local, WANTED).items():
         np.testing.assert_array_equal(found[text].values, samples.values)
         np.testing.assert_array_equal(found[text].stamp_ns, samples.stamp_ns)
+        np.testing.assert_array_equal(twice[text].stamp_ns, samples.stamp_ns)
 
 
 def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: Path) -> None:
