@@ -323,16 +323,6 @@ def test_a_lost_sample_has_the_commands_of_its_time_where_they_are_known() -> No
     assert [sample.missing for sample in far.flush()].count(LOST) == MOST_LOST
 
 
-def test_what_answers_is_no_product_and_has_no_lag() -> None:
-    for text in (f"{Y} * {Z}", f"{Y}|lag(1 s)", f"{Y}|delay(1 s)"):
-        with pytest.raises(BagError, match="for what drives, not for a response"):
-            Sampler([text], [U], period=0.1)
-    with pytest.raises(BagError, match="leave out linear"):
-        Expression.parse(f"{U}|lag(1 s)|linear(1 s)")
-    with pytest.raises(BagError, match="at most 4"):
-        Sampler([Y], [" * ".join([U] * 5)], period=0.1)
-
-
 @pytest.mark.parametrize("resample", ["none", "linear"])
 def test_signals_of_several_topics_and_products_give_the_same_bits(
     tmp_path: Path, resample: str
@@ -475,14 +465,26 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
 
 
-def test_signals_on_two_clocks_or_of_two_rules_are_refused() -> None:
-    with pytest.raises(BagError, match="two clocks cannot be paired: /y:data by its header time"):
-        Sampler([Y], [f"{U}|clock(log)"], period=0.1)
-    with pytest.raises(BagError, match=r"/z:data is sampled as it comes, /y:data.* on a grid"):
-        Sampler([f"{Y}|linear(1 s)", Z], [U], period=0.1)
-    for text in (f"{U}|hold(1 s)|linear(1 s)", f"{U}|clock(log)|clock(log)", f"{U}|clock(sun)"):
-        with pytest.raises(BagError):
-            Expression.parse(text)
+@pytest.mark.parametrize(
+    ("responses", "drive", "reason"),
+    [
+        ([f"{Y} * {Z}"], U, "for what drives, not for a response"),
+        ([f"{Y}|lag(1 s)"], U, "for what drives, not for a response"),
+        ([f"{Y}|delay(1 s)"], U, "for what drives, not for a response"),
+        ([Y], f"{U}|lag(1 s)|linear(1 s)", "leave out linear"),
+        ([Y], " * ".join([U] * 5), "at most 4"),
+        ([Y], f"{U}|clock(log)", "two clocks cannot be paired: /y:data by its header time"),
+        ([f"{Y}|linear(1 s)", Z], U, r"/z:data is sampled as it comes, /y:data.* on a grid"),
+        ([Y], f"{U}|hold(1 s)|linear(1 s)", "says twice when the signal is sampled"),
+        ([Y], f"{U}|clock(log)|clock(log)", "says twice when the signal is sampled"),
+        ([Y], f"{U}|clock(sun)", r"clock\(header\) or clock\(log\)"),
+    ],
+)
+def test_signals_that_are_never_one_sample_are_refused(
+    responses: list[str], drive: str, reason: str
+) -> None:
+    with pytest.raises(BagError, match=reason):
+        Sampler(responses, [drive], period=0.1)
 
 
 def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:
