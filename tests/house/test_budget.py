@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_050,
-    ("bags",): 12_510,
+    ("bags",): 12_519,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_646,
+    ("tests",): 23_650,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
