@@ -72,8 +72,8 @@ class SampledTracking:
     """The largest inlet and the tube around a policy's motion, sample by sample.
 
     feedback: the LQR that the policy was made with. assumption: about the disturbance, as `assume`
-    measures it on runs of the policy. goal, start: radii at the end and at the start, in the LQR's
-    norm (None: the largest that the box of the data allows, and the inlet's).
+    measures it on runs of the policy. goal: the radius at the end, in the LQR's norm (None: the
+    largest that the box of the data allows).
     """
 
     model: MeasuredState
@@ -81,12 +81,10 @@ class SampledTracking:
     feedback: Feedback
     assumption: DisturbanceAssumption
     goal: float | None = None
-    start: float | None = None
 
     def __post_init__(self) -> None:
-        for key in ("goal", "start"):
-            if getattr(self, key) is not None:
-                require_positive(self, key)
+        if self.goal is not None:
+            require_positive(self, "goal")
 
 
 Problem = OutputTube | SampledTracking | ContinuousTracking

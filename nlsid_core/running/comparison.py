@@ -2,12 +2,17 @@
 
 A sample in, sizes out: how far out of its set the state is, 1 on the boundary, rounded up so that a
 size of at most 1 is inside in exact arithmetic.
+
+Each kind has: lags, samples before sample 0 that it needs; last, the last `when` it covers, as its
+funnels count: samples or s; assuming and over, what it assumes and how much it covers, in words.
+`read` gives the sample as the kind takes it, and why it cannot be judged, or raises ShapeError;
+`compare` raises SolverError if the model has no next state.
 """
 
 from collections.abc import Sequence
 from enum import Enum
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -51,38 +56,6 @@ class Compared(NamedTuple):
     nominal: tuple[float, ...]
     deviation: list[float]
     level: Level | None = None
-
-
-class Comparison(Protocol):
-    """A kind's arithmetic for one run; `when`: as its funnels count, samples or s.
-
-    lags: samples before sample 0 that it needs. last: the last `when` it covers. assuming: in
-    words. over: how much it covers, in words.
-    """
-
-    period: float
-    lags: int
-    last: float
-    assuming: str
-    over: str
-
-    def restart(self) -> None:
-        """A new run."""
-
-    def read(self, t: float, y: Any, u: Any, *, needs_input: bool) -> tuple[Any, Any, str]:
-        """The sample as this kind takes it, and why it cannot be judged, empty if it can.
-
-        ShapeError if y does not fit.
-        """
-
-    def when(self, k: int, t: float) -> float:
-        """Sample k at t s after the start, as the funnels count."""
-
-    def collect(self, y: Any, u: Any) -> str:
-        """Take a sample before sample 0: how the assumption is broken if it was the last."""
-
-    def compare(self, when: float, t: float, y: Any, u: Any) -> Compared:
-        """The next sample against the sets; SolverError if the model has no next state."""
 
 
 class PlanComparison:
@@ -222,10 +195,6 @@ class SampledComparison:
         """The sample's number."""
         return k
 
-    def collect(self, _y: FloatArray, _u: FloatArray | None) -> str:
-        """There is nothing before sample 0."""
-        raise NotImplementedError
-
     def compare(self, when: float, t: float, y: FloatArray, u: FloatArray | None) -> Compared:
         """Sample k = `when` against the tube."""
         k, funnel = int(when), self._funnel
@@ -327,10 +296,6 @@ class ContinuousComparison:
         """The time in s on the funnel's own clock."""
         return max(self._t0 + t, self._t0)
 
-    def collect(self, _y: FloatArray, _u: FloatArray | None) -> str:
-        """There is nothing before sample 0."""
-        raise NotImplementedError
-
     def compare(self, when: float, t: float, y: FloatArray, u: FloatArray | None) -> Compared:
         """The state at `when` s against the set of the stage that is on."""
         on = sum(when >= funnel.tf for _, _, funnel, _ in self._stages[:-1])
@@ -359,6 +324,9 @@ class ContinuousComparison:
             tuple(nominal.tolist()),
             x_bar.tolist(),
         )
+
+
+Comparison: TypeAlias = PlanComparison | SampledComparison | ContinuousComparison
 
 
 def read_vectors(t: float, y: Any, u: Any, n: int, inputs: int) -> tuple[Any, Any, str]:

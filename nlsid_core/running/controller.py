@@ -20,7 +20,6 @@ from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
 from nlsid_core.running.observer import (
     MeasuredStateObserver,
-    Observer,
     PredictingObserver,
     StateObserver,
 )
@@ -241,7 +240,7 @@ def _interval(limits: Limits) -> str:
     return ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(*ends, strict=True))
 
 
-def _observer(model: Any, policy: Any) -> Observer:
+def _observer(model: Any, policy: Any) -> Any:
     """The observer that the policy answers."""
     if isinstance(model, DifferenceEquation):
         return PredictingObserver(model, policy.policy.L)

@@ -141,7 +141,7 @@ class Monitor:
         if self._ended:
             return self.waiting(t, y, self._ended)
         when = comparison.when(k, t - grid.start)
-        if k < 0:
+        if isinstance(comparison, PlanComparison) and k < 0:
             self._violated = comparison.collect(y, u)
             return self.waiting(t, y, f"waiting for the first {self.lags} samples")
         if when > last:

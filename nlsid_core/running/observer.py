@@ -1,32 +1,15 @@
 """Observers: from what is measured and applied to the state that a policy answers.
 
-Controller, commissioning, replay and monitor share them, so that they agree bit for bit.
+Controller, commissioning, replay and monitor share them, so that they agree bit for bit. lags:
+samples before sample 0 that give one its state. ahead: 1 if the state after a sample is that of the
+next one, 0 if it is that of the sample itself.
 """
-
-from typing import Any, Protocol
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.models.measured_state import MeasuredState
-
-
-class Observer(Protocol):
-    """One run's estimate of the state.
-
-    lags: samples before sample 0 that give it its state. ahead: 1 if the state after a sample is
-    that of the next one, 0 if it is that of the sample itself.
-    """
-
-    lags: int
-    ahead: int
-
-    def begin(self, y: list[Any], u: list[Any]) -> FloatArray:
-        """The state (n,) from the last `lags` samples, or from the one sample 0."""
-
-    def update(self, y: Any, u: Any) -> FloatArray:
-        """The state (n,) after the sample y, taken while the input u was in force."""
 
 
 class PredictingObserver:

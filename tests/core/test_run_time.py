@@ -389,7 +389,7 @@ def test_an_input_is_never_beyond_the_range_of_the_model_and_what_is_sent_is_pro
         sent.append(controller.u)
         if controller.k >= 0:
             k = controller.k
-            asked.append(plan(k, controller._observer._x))  # type: ignore[attr-defined]
+            asked.append(plan(k, controller._observer._x))
             low, high = sorted((float(policy.u[k]), asked[-1]))
             assert low <= controller.u <= high, "between the plan's input and the policy's"
     assert max(asked) > highest
@@ -423,7 +423,7 @@ def test_time_to_exit_is_when_a_steadily_falling_margin_reaches_zero() -> None:
         S = np.linalg.solve(made.funnel.S[k], [1.0, 0.0])
         assert np.isfinite(direction).all()
         x = made.policy.x[k] + 0.1 * k * made.funnel.radius[k] * S
-        monitor._comparison._observer.x = None  # type: ignore[attr-defined]
+        monitor._comparison._observer.x = None  # type: ignore[union-attr]
         said.append(monitor.update(k * PERIOD, x, made.policy(k, x)))
     for k in range(1, 9):
         assert said[k].time_to_exit == pytest.approx((10 - k) * PERIOD, rel=1e-6)

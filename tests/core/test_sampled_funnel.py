@@ -176,16 +176,6 @@ def test_a_disturbance_too_large_for_the_goal_is_infeasible_and_says_where() -> 
         )
 
 
-def test_a_start_beyond_the_inlet_is_refused() -> None:
-    base = tracked()
-    with pytest.raises(DataError, match="inlet"):
-        design_state_funnel(
-            SampledTracking(
-                base.model, base.policy, base.feedback, assumption=assumption(), start=100.0
-            )
-        )
-
-
 def test_a_motion_out_of_reach_of_the_data_is_infeasible() -> None:
     with pytest.raises(Infeasible, match="out of reach"):
         plan_motion(pendulum(), [0.0, 0.0], [1.1, 0.0], steps=5)

@@ -5,12 +5,12 @@ the tube: where starts in the inlet get to. Every step of both is one semidefini
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.problems import SampledTracking
 from nlsid_core.design.sampled.closed_loop import Frame, half_widths
@@ -18,7 +18,7 @@ from nlsid_core.design.sampled.explicit import ExplicitStep
 from nlsid_core.design.sampled.implicit import ImplicitFunnelStep
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.designs import Design
-from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.errors import CertificateRejected, Infeasible
 from nlsid_core.funnels.factor import refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
 from nlsid_core.models.measured_state import MeasuredState
@@ -35,6 +35,7 @@ INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
 ROOTS = 3.0  # radii of the tube within which the roots of an implicit step are claimed
 
 
+FunnelStep: TypeAlias = ExplicitStep | ImplicitFunnelStep
 TrackingDesign: TypeAlias = Design[MeasuredState, SampledPolicy, SampledFunnel, None]
 
 
@@ -62,7 +63,7 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
     """The largest inlet that reaches the goal, and the tube from it.
 
     Raises CertificateRejected if the assumption is not one a checker would accept,
-    Infeasible if the disturbance leaves no inlet, DataError if `start` is beyond the inlet.
+    Infeasible if the disturbance leaves no inlet.
     """
     model, policy, assumption = problem.model, problem.policy, problem.assumption
     refuse_assumption(model, assumption)
@@ -76,15 +77,11 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
         )
     implicit = isinstance(model, TrapezoidalModel)
     kind: Any = ImplicitFunnelStep if implicit else ExplicitStep
-    steps = [kind.at(model, policy, norms, k, assumption) for k in range(len(policy))]
+    samples = range(len(policy))
+    steps: list[FunnelStep] = [kind.at(model, policy, norms, k, assumption) for k in samples]
     inlet, to_goal = _inlet(steps, cap, problem.goal, progress)
     roots = ROOTS * (inlet + assumption.bound)
-    first = float(inlet[0]) if problem.start is None else problem.start
-    if not 0 < first <= inlet[0]:
-        raise DataError(
-            f"start {first:.4g} should be positive and at most the inlet {inlet[0]:.4g}"
-        )
-    tube, along = _tube(steps, first, roots, progress)
+    tube, along = _tube(steps, float(inlet[0]), roots, progress)
     funnel = SampledFunnel(
         S=norms.S,
         A=norms.A,
@@ -131,24 +128,6 @@ def assume(
     )
     refuse_assumption(model, assumption)
     return assumption
-
-
-class FunnelStep(Protocol):
-    """One step of either kind of model; what is found for a radius is its own business."""
-
-    assumption: DisturbanceAssumption
-
-    def from_radius(self, radius: float, roots: float, /) -> tuple[Any, float]:
-        """What is found from `radius`, next rates within `roots`, and the radius it needs next."""
-
-    def proof(self, found: Any, /) -> Json:
-        """The proof of what was found."""
-
-    def stated(self) -> Json:
-        """What the proof states of the step, whatever the radius."""
-
-    def bases(self) -> Json:
-        """The monomials of every step's witnesses."""
 
 
 def _inlet(

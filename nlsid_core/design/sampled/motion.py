@@ -28,12 +28,11 @@ def plan_motion(
     goal: ArrayLike,
     *,
     steps: int,
-    reserve: float = RESERVE,
 ) -> tuple[FloatArray, FloatArray]:
     """States (N + 1, n) and inputs (N, p) from `start` to `goal`, smooth and within the data box.
 
     Direct transcription: least Σ|u|² and changes of u, in units of the box, subject to
-    x_{k+1} = f(x_k, u_k), solved by sequential quadratic programs. `reserve`, relative to half the
+    x_{k+1} = f(x_k, u_k), solved by sequential quadratic programs. RESERVE, relative to half the
     box, stays free. Raises Infeasible if the goal cannot be reached so, DataError if an end is
     outside the box.
     """
@@ -42,15 +41,6 @@ def plan_motion(
     for end in ends:
         if end.shape != (n,):
             raise ShapeError(f"start and goal should have shape ({n},), one has {end.shape}")
-    straight = ends[0] + np.linspace(0.0, 1.0, steps + 1)[:, None] * (ends[1] - ends[0])
-    return _transcribed(model, straight, reserve=reserve)
-
-
-def _transcribed(
-    model: MeasuredState, given: FloatArray, *, reserve: float
-) -> tuple[FloatArray, FloatArray]:
-    """Sequential quadratic programs from the states (N + 1, n) `given`, which fix the ends."""
-    for end in (given[0], given[-1]):
         outside = (end < model.x_range[:, 0]) | (end > model.x_range[:, 1])
         if outside.any():
             i = int(np.argmax(outside))
@@ -59,9 +49,11 @@ def _transcribed(
                 "model has data"
             )
     half = np.diff(model.x_range, axis=1)[:, 0] / 2
-    x, u = given, np.tile(model.u_range.mean(axis=1), (len(given) - 1, 1))
+    way = np.linspace(0.0, 1.0, steps + 1)[:, None]
+    x: FloatArray = ends[0] + way * (ends[1] - ends[0])
+    u: FloatArray = np.tile(model.u_range.mean(axis=1), (steps, 1))
     for _ in range(ITERATIONS):
-        x, u = _subproblem(model, x, u, (given[0], given[-1]), reserve)
+        x, u = _subproblem(model, x, u, ends)
         defect = float(np.abs((x[1:] - model(x[:-1], u)) / half).max())
         if defect < SETTLED:
             return _rolled_out(model, x, u), u
@@ -119,7 +111,6 @@ def _subproblem(
     x: FloatArray,
     u: FloatArray,
     ends: Sequence[FloatArray],
-    reserve: float,
 ) -> tuple[FloatArray, FloatArray]:
     """The quadratic program linearised at (x, u), in unit variables of the box."""
     N, n, p = len(u), len(model), len(model.u)
@@ -141,7 +132,7 @@ def _subproblem(
     for end, first in zip(ends, (0, N * n), strict=True):
         rows.append(pick[first : first + n])
         right.append((end - mid_x) / half_x)
-    bound = np.full(size, 1.0 - reserve)
+    bound = np.full(size, 1.0 - RESERVE)
     free = np.r_[0:n, N * n : (N + 1) * n]  # the ends are given, whatever is kept in reserve
     bound[free] = 2.0
     changes = sp.eye(N * p, format="csr")[p:] - sp.eye(N * p, format="csr")[:-p]
