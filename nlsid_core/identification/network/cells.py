@@ -136,7 +136,8 @@ def cells_in_a_row(
         limits = [(part,) for part in FRICTIONS]
     elif made.limit == "top":
         limits = list(product(TOPS, repeat=made.cells - 1))
-    tried, steps, begun = [], [], []
+    tried, steps = [], []
+    begun: list[FloatArray] = []
     for poles in _best_poles(short, made.cells, slowest):
         for levels in limits:
             start = _start(short, poles, levels, made.limit, -scaled.y[0] / scaled.y[1])
