@@ -80,7 +80,7 @@ class Node:
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
         missing = {f"'{name}' is missing": False for name in wanted if name not in self.value}
-        others = [name for name in self.value if name not in (*wanted, *allowed)]
+        others = sorted(set(self.value).difference(wanted, allowed))
         self.require(missing | {f"unknown member {plain(name)!r}": False for name in others})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
