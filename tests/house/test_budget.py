@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_144,
+    ("nlsid_core",): 19_136,
     ("bags",): 12_517,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_697,
+    ("tests",): 23_698,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
