@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_014,
+    ("nlsid_core",): 19_006,
     ("bags",): 12_519,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_650,
+    ("tests",): 23_651,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
