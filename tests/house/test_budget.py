@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_144,
-    ("bags",): 12_517,
+    ("bags",): 12_526,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_697,
+    ("tests",): 23_701,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
