@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_144,
-    ("bags",): 12_526,
+    ("bags",): 12_521,
     ("nlsid_ros",): 2_661,
     ("tests",): 23_701,
     ("benchmarks", "examples"): 3_809,
