@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_042,
+    ("nlsid_core",): 19_006,
     ("bags",): 12_514,
     ("nlsid_ros",): 2_661,
     ("tests",): 23_651,
