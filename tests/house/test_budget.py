@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_998,
-    ("bags",): 12_519,
+    ("bags",): 12_514,
     ("nlsid_ros",): 2_661,
     ("tests",): 23_651,
     ("benchmarks", "examples"): 3_809,
