@@ -124,7 +124,7 @@ def identify(
 
         states.identify(expand_bags(bags), load_tracking_config(path), folder)
     elif instead.compare:
-        _compare(expand_bags(bags), load_config(path), folder)
+        _compare(expand_bags(bags), load_config(path))
     elif reading.count or reading.scheduler or reading.strict or any(map(is_url, bags)):
         _by_workers(bags, load_config(path), folder, reading, select=instead.select)
     else:
@@ -197,19 +197,13 @@ def _check(path: Path, bags: list[Path]) -> None:
     typer.echo(f"{path}: nothing is wrong with it for {len(bags)} bags; no message was read")
 
 
-def _compare(bags: list[Path], settings: Config, folder: Path) -> None:
+def _compare(bags: list[Path], settings: Config) -> None:
     """Score every method on the same test bags: simulation, prediction, residuals, proof."""
     from bags.chain.choosing import compare_bags
     from bags.commands import show
-    from bags.designs import documents
-    from bags.pictures.report import report_available
 
     with progress_bar("comparing") as progress:
         compared = compare_bags(bags, settings, progress=progress)
     out.print(show.comparison_table(compared))
     for refusal in compared.refusals:
         out.print(f"no model: {escape(refusal)}", soft_wrap=True)
-    if report_available():
-        folder.mkdir(parents=True, exist_ok=True)
-        compared.draw(folder / documents.COMPARISON_PLOT)
-        out.print(f"wrote {folder / documents.COMPARISON_PLOT}", soft_wrap=True)

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from bags.chain.choosing import Compared, Selected
+from bags.chain.choosing import Compared, Scored, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.commands.progress import progress_bar
@@ -20,7 +20,6 @@ from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
 from bags.monitoring.catching import Breaking, Catching, Caught
 from bags.monitoring.replay import Replay, ToJudge, replay_bag, to_judge
-from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import said_restarts

@@ -45,8 +45,6 @@ td code { white-space: nowrap } .digests td code { white-space: normal }
 ROBOT = re.compile(r"<h1>([^<]*): identified model</h1>")
 FUNNEL_CAPTION = "The funnel: the tube around the motion"
 PICTURES = {
-    documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
-    documents.COMPARISON_PLOT: "Classes and methods on the same test trials",
     documents.FREE_RUN_PLOT: "The model in free run",
     documents.FUNNEL_PLOT: FUNNEL_CAPTION,
     documents.CATCHING_PLOT: "What the funnel can catch",
