@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bags.commands import show
 from bags.monitoring.catching import (
     DELAY,
     LOST,
@@ -19,6 +18,7 @@ from bags.monitoring.catching import (
     what_it_catches,
 )
 from bags.monitoring.replay import Replay
+from bags.pictures import tables
 from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
@@ -216,7 +216,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(), "box": Caught()},
     )
     refused = Row("refused", Caught(), {}, "no such input")
-    table = show.catching_table(replace(found, rows=(*found.rows, worse, refused)))
+    table = tables.catching_table(replace(found, rows=(*found.rows, worse, refused)))
     console = Console(width=80, record=True, file=None, force_terminal=False)
     with console.capture() as said:
         console.print(table)
@@ -242,7 +242,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
-        show.say_catching(console, replace(found, rows=(*found.rows, refused)))
+        tables.say_catching(console, replace(found, rows=(*found.rows, refused)))
     assert "refused was not tried: no such input" in said.get()
 
 
@@ -336,7 +336,7 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     for caught in (c for r in zero for c in (r.funnel, *r.others.values())):
         assert not caught.after < 0.0
     console = Console(record=True, width=100)
-    show.say_catching(console, found)
+    tables.say_catching(console, found)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
 

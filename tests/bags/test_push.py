@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.chain.joint_bags import write_joint_bag
-from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
 from bags.monitoring.catching import breaking
 from nlsid_core import files
@@ -18,6 +17,7 @@ from nlsid_core.design import Goal, plan_motion
 from nlsid_core.dynamics import MeasuredPush, VectorField, measured_push
 from nlsid_core.errors import DocumentError
 from nlsid_core.proofs import check
+from tests import funnel_problem
 
 PERIOD, PUSH, FACTOR = 0.02, 0.06, 1.2  # s, m/s², of the box over the largest
 SIGNALS = [
@@ -51,8 +51,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("push")
     motion = plan_motion(FIELD, start=[0, 0], end=[0.2, 0], seconds=1, u=[0])
     end = motion.x.ends()[-1]
-    problem = FunnelProblem(FIELD, motion, goal=Goal(end, np.diag([25.0, 11.0])))
-    files.write_document(folder / "problem.json", problem.document())
+    goal = Goal(end, np.diag([25.0, 11.0]))
+    files.write_document(folder / "problem.json", funnel_problem.document(FIELD, motion, goal))
     (folder / "bags").mkdir()
     for seed in range(3):
         write_joint_bag(folder / "bags", recorded(seed))
