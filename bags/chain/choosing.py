@@ -32,19 +32,6 @@ class Selected:
     identified: Identified
 
 
-def select_bags(
-    bags: Sequence[Path],
-    config: Config,
-    out: Path,
-    *,
-    progress: Progress,
-) -> Selected:
-    """`select_trials` of bags; BagError for one that cannot be used."""
-    sections_to_try(config)
-    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
-    return select_trials(trials, config, out, progress=progress)
-
-
 def sections_to_try(config: Config) -> list[IdentificationConfig]:
     """Every combination of the options in `select`; DataError if there is none."""
     if not config.select:

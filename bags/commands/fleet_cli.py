@@ -149,7 +149,7 @@ def monitor(
         Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
     ] = None,
 ) -> None:
-    """Hold every bag against one proved design: which robots, which days, which assumption.
+    """Hold every bag against one proved design: which are inside, and what they spend.
 
     How much of what is assumed each bag spends, the worst ten, what that says of the next bag, and
     whether the newest month is like the calibration. Status 0 if all are inside with the assumption
@@ -181,7 +181,7 @@ def monitor(
         write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
     _say_counts(read, fleet.manifest, [(counts[v], v) for v in _VERDICTS if counts[v]])
-    _say_verdicts(found, table)
+    _say_verdicts(found)
     if found.worst:
         worst = named[found.worst[0].bag]
         centre = f" --config {config}" if config else ""
@@ -200,13 +200,11 @@ def monitor(
         raise typer.Exit(2)
 
 
-def _say_verdicts(found: FleetVerdict, table: Path | None) -> None:
+def _say_verdicts(found: FleetVerdict) -> None:
     from bags.fleet.bags import COPY, UNREAD
 
     if own := len(found.own):
         out.print(f"{own} of them made the design: a verdict on these says little", soft_wrap=True)
-    for key, title in (("robot", "robots"), ("day", "days")):
-        _say_groups(title, found.by(key), table)
     if found.worst:
         _say_worst(found.worst)
     for line in found.ranks:
@@ -249,34 +247,6 @@ _VERDICTS = {  # and the heads of their columns
     "copy": "copy",
     "inside": "inside",
 }
-
-
-def _say_groups(title: str, groups: Mapping[str, Sequence[Row]], table: Path | None) -> None:
-    """Those with trouble, as a table; how many have none, and how many are not shown."""
-    from bags.fleet.monitor import trouble_in
-
-    if list(groups) == ["-"]:
-        return  # the bags' names have no folders
-    troubled = {name: rows for name, rows in groups.items() if trouble_in(rows)}
-    named = [name for name in troubled if name]  # the others are listed as not read
-    out.print(f"{title} with trouble: {len(named)} of {len(set(groups) - {''})}")
-    if not named:
-        return
-    there = {row.verdict for rows in groups.values() for row in rows}
-    words = [word for word in _VERDICTS if word in there]
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    shown.add_column(title.removesuffix("s"), overflow="fold")
-    for head in ("bags", *(_VERDICTS[word] for word in words)):
-        shown.add_column(head, justify="right")
-    for name in named[:ROWS]:
-        rows = troubled[name]
-        counts = Counter(row.verdict for row in rows)
-        cells = (str(counts[word] or "") for word in words)
-        shown.add_row(_plain(name), str(len(rows)), *cells)
-    out.print(shown)
-    if (more := len(named) - ROWS) > 0:
-        rest = "--out writes every bag" if table is None else f"every bag is in {table}"
-        out.print(f"and {more} more {title} with trouble, none with more; {rest}")
 
 
 def _say_worst(worst: Sequence[Row]) -> None:

@@ -13,7 +13,6 @@ from scipy.stats import mannwhitneyu
 
 from bags.chain.training import load_held_back, load_training
 from bags.designs import documents
-from bags.fleet.bags import COPY
 from bags.fleet.rows import Row, iso
 from bags.monitoring.replay import Definitions, Replay, replay_bag
 from bags.recordings.definitions import texts_of
@@ -28,7 +27,6 @@ from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 
 RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
-TROUBLE = ("alarm", "clock")  # of a bag that is inside
 LEAST = 3  # bags of a month, and calibration trials, that are compared
 
 
@@ -159,13 +157,6 @@ class FleetVerdict:
     def _measured(self) -> list[Row]:
         return [row for row in self.rows if "spent" in row.numbers]
 
-    def by(self, key: str) -> dict[str, list[Row]]:
-        """The rows by `robot` or by `day` (empty: unknown), those with the most trouble first."""
-        found: dict[str, list[Row]] = {}
-        for row in self.rows:
-            found.setdefault(row.start[:10] if key == "day" else row.robot, []).append(row)
-        return dict(sorted(found.items(), key=lambda e: (-trouble_in(e[1]), e[0])))
-
     @property
     def ranks(self) -> list[str]:
         """What m bags say of the next, if it is exchangeable with them: of two ranks that are fixed
@@ -199,14 +190,6 @@ class FleetVerdict:
             float(test.pvalue),
             float(test.statistic) / pairs,
         )
-
-
-def trouble_in(rows: Sequence[Row]) -> int:
-    """How many of them have something to look at; a copy is looked at where it counts."""
-    return sum(
-        row.verdict not in (Status.INSIDE.value, COPY) or not row.said.keys().isdisjoint(TROUBLE)
-        for row in rows
-    )
 
 
 def calibration_spent(folder: Path, design: AnyDesign) -> tuple[float, ...]:

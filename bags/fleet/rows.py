@@ -3,11 +3,11 @@
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from bags.fleet.bags import COPY, UNREAD, Recordings, robots_of, same_as
+from bags.fleet.bags import COPY, UNREAD, Recordings, same_as
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Task, ask
 from bags.fleet.workers import Workers
@@ -20,7 +20,7 @@ from nlsid_core.progress import Progress, silent
 class Row:
     """One bag: a verdict, and what is behind it.
 
-    reason: why it is not good, or not inside. robot: whose it is, by its name. start: the bag's
+    reason: why it is not good, or not inside. start: the bag's
     first log time, ISO 8601 in UTC, empty if unknown. marks: a second copy of the recording has one
     of them too. said: what else is to be known, in words. numbers: those that are known.
     """
@@ -28,7 +28,6 @@ class Row:
     bag: str
     verdict: str
     reason: str = ""
-    robot: str = "-"
     start: str = ""
     marks: tuple[str, ...] = ()
     said: Mapping[str, str] = field(default_factory=dict)
@@ -68,7 +67,7 @@ def read_rows(
     progress: Progress = silent,
 ) -> Rows:
     """Ask of each bag; one that cannot be read is `not read`, a second of a recording a `copy`."""
-    robots, recordings = robots_of(bags), Recordings()
+    recordings = Recordings()
     rows: list[Row] = []
     known = 0
     with Manifest(manifest) as kept:
@@ -81,7 +80,7 @@ def read_rows(
             first = recordings.first(row.bag, row.marks)
             if first != row.bag:
                 row = Row(row.bag, COPY, same_as(first), start=row.start)
-            rows.append(replace(row, robot=robots[row.bag]))
+            rows.append(row)
     return Rows(tuple(rows), known)
 
 

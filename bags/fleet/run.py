@@ -60,7 +60,6 @@ def ask(
     workers: Workers,
     manifest: Manifest,
     *,
-    strict: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Answer]:
     """The answers in the order of `bags` (by name), whoever gave them and whenever they came.
@@ -68,9 +67,8 @@ def ask(
     All are there before the first is given. Until then the manifest holds what they say, so that
     memory does not.
 
-    A bag of which the worker dies is asked of again, alone, and given up when it dies again. With
-    `strict` the first bag without an answer raises BagError. Raises DataError if the workers are
-    gone for good; what was answered by then is in the manifest.
+    A bag of which the worker dies is asked of again, alone, and given up when it dies again. Raises
+    DataError if the workers are gone for good; what was answered by then is in the manifest.
     """
     answers: dict[str, Answer] = {}
     keys: dict[str, str] = {}
@@ -85,15 +83,11 @@ def ask(
             answers[name] = Answer(bag, name, kept=True)
         else:
             fresh.append(name)
-    if strict and (lost := [answer for answer in answers.values() if answer.reason]):
-        raise BagError(f"{lost[0].bag}: {lost[0].reason}")
     if known := sum(answer.kept for answer in answers.values()):
         progress(f"{known} of {len(bags)} bags are known", len(answers) / len(bags))
     asked = {name: (bags[name], keys[name]) for name in fresh}
     with closing(_asked(task, asked, workers)) as given:
         for answer in given:
-            if answer.reason and strict:
-                raise BagError(f"{answer.bag}: {answer.reason}")
             if not answer.reason:
                 manifest.keep(keys[answer.name], str(answer.bag), answer.content)
             answers[answer.name] = replace(answer, bag=bags[answer.name], content=b"")

@@ -18,11 +18,10 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
+from bags.setup.attempts import followed, say_class, say_degree, say_lags
 from bags.setup.candidates import Found, slope_window
-from bags.setup.curved import say_class
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
-from bags.setup.orders import followed, say_degree, say_lags
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED

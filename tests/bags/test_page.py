@@ -7,11 +7,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.config import load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
-from bags.commands.cli import app
 from bags.commands.page import folder_page
 from bags.designs import documents
 from bags.samples import f1tenth
@@ -19,14 +17,9 @@ from nlsid_core import designs, kernel
 from nlsid_core.errors import DocumentError
 from tests.continuous_stage import composed
 from tests.core.kernel.mutations import CORPUS
+from tests.verbs import nlsid
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "f1tenth.yaml"
-
-
-def nlsid(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [str(a) for a in arguments])
-    assert done.exit_code in (0, 1), done.output
-    return done.output
 
 
 @pytest.fixture(scope="module")

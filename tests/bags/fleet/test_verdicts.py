@@ -19,7 +19,7 @@ from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
 from bags.fleet.check import CheckBag
-from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent, trouble_in
+from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent
 from bags.fleet.rows import Row, read_rows, write_parquet
 from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
@@ -54,11 +54,9 @@ def checked(bags: Mapping[str, Path]) -> tuple[Row, ...]:
     return read_rows(CheckBag(load_config(CONFIG)), bags, workers=Workers()).rows
 
 
-def judged(
-    spent: float, month: str = "2026-01", robot: str = "robot", verdict: str = "inside"
-) -> Row:
+def judged(spent: float, month: str = "2026-01") -> Row:
     start = f"{month}-03T00:00:00+00:00"
-    return Row(f"bag_{spent}_{month}", verdict, "", robot, start, numbers={"spent": spent})
+    return Row(f"bag_{spent}_{month}", "inside", start=start, numbers={"spent": spent})
 
 
 def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
@@ -121,20 +119,6 @@ def test_drift_is_the_rank_test_of_all_orders() -> None:
     assert FleetVerdict(rows[:2], older, frozenset()).drift is None
 
 
-def test_groups_with_trouble_come_first() -> None:
-    rows = (
-        judged(0.1, robot="a"),
-        judged(0.2, robot="b", verdict="outside"),
-        judged(0.3, robot="b"),
-    )
-    found = FleetVerdict((*rows, judged(0.4, robot="c", verdict="copy")), (), frozenset())
-    assert list(found.by("robot")) == ["b", "a", "c"]
-    assert [trouble_in(own) for own in found.by("robot").values()] == [1, 0, 0]
-    assert list(found.by("day")) == ["2026-01-03"]
-    ticks = Row("d", "inside", said={"clock": "stamps go back"})
-    assert trouble_in([ticks, Row("e", "inside"), Row("f", "copy")]) == 1
-
-
 def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     design: Path, tmp_path: Path
 ) -> None:
@@ -176,7 +160,7 @@ def test_bags_of_the_design_that_are_not_recognised_are_said(
 ) -> None:
     rows = tuple(Row(name, "inside", marks=(name,), numbers={"spent": 0.5}) for name in "ab")
     for made_of, is_said in (("xy", True), ("bx", False), ("", False)):
-        fleet_cli._say_verdicts(FleetVerdict(rows, (), frozenset(made_of)), None)
+        fleet_cli._say_verdicts(FleetVerdict(rows, (), frozenset(made_of)))
         assert ("none of these is known" in capsys.readouterr().out) is is_said
 
 
@@ -325,27 +309,11 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     )
     assert "r9/2022-01/back: stamps of /cmd_vel go back in 1 place, by up to 0.225 s; " in said
     worst = lines.index("the 10 bags that spent the most, and when:")
-    assert "robots with trouble: " in said
-    assert re.search(r"^r9 +7", said, re.MULTILINE)
     assert [len(line) <= 80 for line in lines[worst : worst + 13]] == 13 * [True]
     assert "\N{HORIZONTAL ELLIPSIS}" not in said, "nothing is cut"
     _, again = fleet_command("monitor", *given, columns=80)
     assert f"12 of them known from {kept}, 3 asked of now" in again[1]
     assert [lines[0], *lines[2:]] == [again[0], *again[2:]]
-
-
-def test_a_table_of_groups_says_how_many_it_does_not_show(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    rows = tuple(
-        Row(f"d{k}", "unknown" if k < 35 else "inside", start=f"20{10 + k}-01-01T00:00")
-        for k in range(40)
-    )
-    fleet_cli._say_groups("days", FleetVerdict(rows, (), frozenset()).by("day"), None)
-    said = capsys.readouterr().out
-    assert "days with trouble: 35 of 40" in said
-    assert "and 5 more days with trouble, none with more; --out writes every bag" in said
-    assert said.count("-01-01") == 30
 
 
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
