@@ -6,18 +6,17 @@ from typing import Any, get_type_hints
 import pytest
 import yaml
 from pydantic import TypeAdapter
-from typer.testing import CliRunner
 
 from bags.chain.config import Config
 from bags.chain.sections import Section, sections_in
 from bags.chain.shipped import config_file
 from bags.chain.templates import TEMPLATES, option_texts
 from bags.chain.tracking_config import TrackingConfig
-from bags.commands.cli import app
 from bags.samples import f1tenth
 from docs.site import configuration
 from nlsid_core.identification import METHODS
 from tests.house.sources import ROOT
+from tests.verbs import nlsid
 
 CONFIG = config_file("f1tenth.yaml")
 PAGE = ROOT / "docs" / "configuration.md"
@@ -25,10 +24,8 @@ PAGE = ROOT / "docs" / "configuration.md"
 
 def check(*arguments: object, status: int = 0) -> str:
     path, *bags = arguments
-    given = ["identify", "DIR", *map(str, bags or f1tenth()), "--config", str(path), "--check"]
-    done = CliRunner().invoke(app, given)
-    assert done.exit_code == status, done.output
-    return done.output
+    given = ("identify", "DIR", *(bags or f1tenth()), "--config", path, "--check")
+    return nlsid(*given, status=status)
 
 
 def edited(path: Path, **changes: Any) -> Path:

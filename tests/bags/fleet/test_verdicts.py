@@ -31,6 +31,7 @@ from nlsid_core.running.comparison import Centre
 from tests.bag_messages import START_NS
 from tests.bags.fleet.storage import Odd, drive, web_server
 from tests.marks import slow_among
+from tests.verbs import nlsid
 
 CONFIG = Path("config/f1tenth.yaml")
 
@@ -128,12 +129,11 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
     table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
     given = ["--out", str(table), "--manifest", str(kept)]
-    done = CliRunner().invoke(app, ["fleet", "monitor", str(design.parent), pattern, *given])
-    assert done.exit_code == 1, done.output
-    assert "robot_2/cut: " in done.output
+    said = nlsid("fleet", "monitor", design.parent, pattern, *given, status=1)
+    assert "robot_2/cut: " in said
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
-    assert f"nlsid view {design.parent} {worst}" in done.output
-    assert "is no MCAP, SQLite or ROS 1 file" in done.output
+    assert f"nlsid view {design.parent} {worst}" in said
+    assert "is no MCAP, SQLite or ROS 1 file" in said
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
     assert set(rows) == {"robot_1/other", "robot_2/cut"}
@@ -192,13 +192,12 @@ def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: P
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
     where = [str(design.parent), str(fleet)]
     check, monitor = ["check", *where, "--config", str(CONFIG)], ["monitor", *where]
-    for given, status in ((check, 2), (monitor, 2)):  # one was not read
-        done = CliRunner().invoke(app, ["fleet", *given], env={"COLUMNS": "200"})
-        assert done.exit_code == status, done.output
-        assert "a[bold][" in done.output
-        assert "red]\N{REPLACEMENT CHARACTER}[2J" in done.output
-        assert "b[/bold].mcap" in done.output
-        assert "\x1b[2J" not in done.output
+    for given in (check, monitor):
+        said = nlsid("fleet", *given, status=2)  # one was not read
+        assert "a[bold][" in said
+        assert "red]\N{REPLACEMENT CHARACTER}[2J" in said
+        assert "b[/bold].mcap" in said
+        assert "\x1b[2J" not in said
 
 
 def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
@@ -244,17 +243,14 @@ def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def fleet_command(verb: str, *given: str, columns: int = 80) -> tuple[int, list[str]]:
-    done = CliRunner().invoke(app, ["fleet", verb, *given], env={"COLUMNS": str(columns)})
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.output.splitlines()
+def fleet_command(verb: str, *given: object, status: int = 0, columns: int = 80) -> list[str]:
+    return nlsid("fleet", verb, *given, status=status, columns=columns).splitlines()
 
 
 @pytest.mark.parametrize("columns", [80, 140])
 def test_check_puts_first_what_the_next_step_refuses(spoiled: Path, columns: int) -> None:
     given = ("DIR", str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
-    status, lines = fleet_command("check", *given, columns=columns)
-    assert status == 1
+    lines = fleet_command("check", *given, status=1, columns=columns)
     assert lines[0] == "15 bags: 3 not read, 2 bad, 1 copy, 0 look, 9 good"
     shown = [line.split()[:3] for line in lines if line.startswith("r")]
     assert [" ".join(words).replace("not read", "unread").split()[:2] for words in shown] == [
@@ -298,7 +294,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
 ) -> None:
     pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
     given = (str(design.parent), pattern, "--manifest", kept)
-    _, lines = fleet_command("monitor", *given, columns=80)
+    lines = fleet_command("monitor", *given, status=1)
     said = "\n".join(lines)
     assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
     assert f"0 of them known from {kept}, 15 asked of now" in lines[1]
@@ -311,7 +307,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     worst = lines.index("the 10 bags that spent the most, and when:")
     assert [len(line) <= 80 for line in lines[worst : worst + 13]] == 13 * [True]
     assert "\N{HORIZONTAL ELLIPSIS}" not in said, "nothing is cut"
-    _, again = fleet_command("monitor", *given, columns=80)
+    again = fleet_command("monitor", *given, status=1)
     assert f"12 of them known from {kept}, 3 asked of now" in again[1]
     assert [lines[0], *lines[2:]] == [again[0], *again[2:]]
 
@@ -319,8 +315,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     for k in range(2):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(held=0.25))
-    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
-    assert status == 0
+    lines = fleet_command("check", "DIR", tmp_path, "--config", CONFIG)
     assert lines == [
         "2 bags: 0 not read, 0 bad, 0 copies, 0 look, 2 good",
         "no command moves in any bag that can be used: there is little to identify from",
@@ -332,8 +327,7 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
 ) -> None:
     for k, lost in enumerate((3, 0, None)):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(lost=lost))
-    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
-    assert status == 0
+    lines = fleet_command("check", "DIR", tmp_path, "--config", CONFIG)
     assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
     assert lines[1].split() == [
         "bag",
