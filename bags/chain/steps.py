@@ -397,7 +397,6 @@ def what_a_funnel_catches(
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        remedy="another funnel.reaction_time, or a model that leaves less in its residual",
     )
 
 

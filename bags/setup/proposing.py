@@ -6,7 +6,6 @@ refused there is changed (gaps cut out, responses resampled) or said.
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -35,10 +34,8 @@ from nlsid_core.progress import silent
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
-SIMULATED: Final = "/clock"
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
-ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 
 
 def choose(
@@ -388,34 +385,12 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
             f"{said}: samples are paired by the times of logging, live of "
             "arrival, whose jitter becomes part of the model's error"
         )
-        pace = _pace(bag)
-        if abs(pace - 1.0) > ONE_PACE:
-            proposal.walls.append(
-                f"simulated time on {SIMULATED} runs at {pace:.3g} times the pace of the times of "
-                "logging: the model is one by the wall's clock, and a live monitor with "
-                "use_sim_time goes by the simulated one; record with `ros2 bag record "
-                "--use-sim-time`, or give commands a header"
-            )
 
 
 def _stamps_are_zero(bag: Bag, path: SignalPath) -> bool:
     """Whether the publisher of a signal does not fill its header stamps in."""
     stamps = read_columns(bag, {str(path): path})[path.topic].stamp_ns
     return stamps is not None and len(stamps) > 0 and not stamps.any()
-
-
-def _pace(bag: Bag) -> float:
-    """Simulated seconds in one of the times of logging; 1 without simulated time."""
-    if SIMULATED not in bag.topics:
-        return 1.0
-    paths = {part: SignalPath.parse(f"{SIMULATED}:clock.{part}") for part in ("sec", "nanosec")}
-    with suppress(BagError):  # of another type
-        columns = read_columns(bag, paths)[SIMULATED]
-        simulated = columns.values["sec"] + 1e-9 * columns.values["nanosec"]
-        logged = (columns.log_ns - columns.log_ns[:1]) / 1e9
-        if len(columns) > 1 and logged[-1] > 0.0:
-            return float((simulated[-1] - simulated[0]) / logged[-1])
-    return 1.0
 
 
 def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:

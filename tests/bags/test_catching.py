@@ -52,7 +52,6 @@ def catches(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Cat
         held_back=held_back,
         calibration=calibration_trials(train, least=72).calibration,
         ranges=np.array([np.ptp(np.concatenate([trial.y for trial in train]))]),
-        remedy="a shorter run",
     )
 
 
@@ -187,7 +186,7 @@ def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert "try more lags, another class" in poor
     (loose,) = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
     assert "the half-width is 20 times that" in loose
-    assert loose.endswith("Try a shorter run")
+    assert loose.endswith("leaves less in its residual")
     constant = replace(found, widths=(Width("speed", "m/s", 0.1, 0.0, 0.05),))
     assert "is inf of its range" in constant.warnings()[0]
 
@@ -267,7 +266,6 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        remedy="",
     )
     level, settling = made.funnel.tubes[0].follows, made.funnel.settling
     assert level is not None
@@ -297,7 +295,6 @@ def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() ->
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        remedy="",
     )
     counts = []
     for output in range(2):

@@ -189,39 +189,6 @@ def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path)
     ), "the test trial alone is monitored"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("pace", "is_said"), [(0.5, True), (1.0, False)])
-def test_simulated_time_at_another_pace_than_the_log_is_said(
-    tmp_path: Path, pace: float, is_said: bool
-) -> None:
-    kinds = standard_types().types
-    rng = np.random.default_rng(2)
-    clock_type, plain = "rosgraph_msgs/msg/Clock", "geometry_msgs/msg/Twist"
-    command = speed = 0.0
-    with BagWriter(tmp_path / "run") as writer:
-        for k in range(600):
-            log_ns = START_NS + k * 20_000_000
-            times = {"log_time_ns": log_ns, "publish_time_ns": log_ns}
-            since = int(pace * k * 20_000_000)
-            stamp = kinds["builtin_interfaces/msg/Time"](since // 10**9, since % 10**9)
-            command = float(rng.standard_normal()) if k % 10 == 0 else command
-            speed += 0.2 * (command - speed) + 0.01 * float(rng.standard_normal())
-            messages = (
-                ("/clock", clock_type, kinds[clock_type](stamp)),
-                ("/cmd_vel", plain, twist(command)),
-                ("/base_state", plain, twist(speed)),
-            )
-            for topic, kind, message in messages:
-                writer.write(
-                    topic, kind, bytes(standard_types().serialize_cdr(message, kind)), **times
-                )
-    said = nlsid(
-        "init", tmp_path, tmp_path / "run", "-u", "/cmd_vel:linear.x", "-y", "/base_state:linear.x"
-    )
-    assert ("mind: simulated time on /clock runs at 0.5 times" in said) is is_said
-    assert "has no header stamp" in said
-
-
 def test_a_delay_that_is_known_is_found(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     command = np.repeat(rng.standard_normal(60), 5)
