@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
-from bags.recordings.repair import repair
+from bags.tools.recover import repair
 from benchmarks.machine import parser, peers, tell
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_core.errors import DataError

@@ -13,6 +13,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 SILENT = 2.0  # s without a message of a publisher that is there
 LEASE = 20.0  # s: Fast DDS forgets a participant that was killed
+NAMELESS = "_NODE_NAME_UNKNOWN_"  # DDS tells of an endpoint before it tells of its node
 
 
 def several(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
@@ -34,8 +35,13 @@ def unheard(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
 
 def names(endpoints: Sequence[TopicEndpointInfo]) -> str:
     """Name the nodes of endpoints."""
-    found = (f"{e.node_namespace.rstrip('/')}/{e.node_name}" for e in endpoints)
-    return ", ".join(sorted(found))
+    return ", ".join(sorted(map(_name, endpoints)))
+
+
+def _name(endpoint: TopicEndpointInfo) -> str:
+    if endpoint.node_name == NAMELESS:
+        return "a node that has not told its name yet"
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 def namesakes(node: Node) -> str:

@@ -191,10 +191,9 @@ class PlantNode(ManagedNode):
         return np.zeros(self._inputs) if is_old else values
 
     def _on_push(self) -> tuple[bool, str]:
-        push, duration = self.values.push, self.values.push_duration
         self._push_from_ns = self._next_ns
-        self._push_until_ns = self._next_ns + round(duration * 1e9)
-        return True, f"{push:g} for {duration:g} s"
+        self._push_until_ns = self._next_ns + round(self.values.push_duration * 1e9)
+        return True, f"{self.values.push:g} for {self.values.push_duration:g} s"
 
 
 main = entry_point(PlantNode)

@@ -299,6 +299,9 @@ class TrackingController(ManagedNode):
             self._halt(reason)
             return
         self._stamped_ns = max(self._stamped_ns, stamp_ns)
+        self._on_due()  # what was due before this response, whatever it brings
+        if self._controller is None:
+            return
         u = controller.u
         if not self._accompanied:
             u = self._limits.stop_at  # until the required monitor is heard
@@ -338,12 +341,15 @@ class TrackingController(ManagedNode):
         return f"tracking, stage {self._stage} of {controller.stages}" if many else "tracking"
 
     def _on_due(self) -> None:
-        """Publish every input that is due, and wait for the next; none that is long overdue."""
+        """Publish every input that is due, and wait for the next; none that is long overdue.
+
+        A response may be here before this node's clock shows its stamp.
+        """
         self._next.cancel()
         most_ns = round(self._patient_for * 1e9)
         while self._due:
             stamp_ns, u = self._due[0]
-            ahead = stamp_ns - self.get_clock().now().nanoseconds
+            ahead = stamp_ns - max(self._stamped_ns, self.get_clock().now().nanoseconds)
             if ahead > 0:
                 arm(self._next, ahead)
                 return

@@ -21,12 +21,11 @@ from std_msgs.msg import String
 from bags.chain.config import load_config
 from bags.recordings.definitions import Definition, read_definitions
 from bags.recordings.message_types import header_stamp_ns
-from bags.recordings.part import COMPRESSIONS
 from bags.recordings.quality import Profile
-from bags.recordings.repair import repair, unfinished_bags
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, LogClock, Recent
 from bags.signals.recording import Recording
+from bags.tools.recover import repair, unfinished_bags
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
@@ -51,9 +50,6 @@ class TrajectoryRecorder(ManagedNode):
         Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
         Parameter("bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"),
         Parameter("at_once", True, "begin a bag when activated; false: wait for ~/start"),
-        Parameter("compression", "zstd", "of the chunks, one of " + ", ".join(COMPRESSIONS)),
-        Parameter("split_size", 0.0, "MB after which a new file begins; 0: never", (0.0, 1e6)),
-        Parameter("split_time", 0.0, "s after which a new file begins; 0: never", (0.0, 1e6)),
         Parameter("chunk_period", 0.5, "s of messages a kill may lose", (0.05, 0.9)),
         Parameter("least_free", 200.0, "MB left on the disk at which recording stops", (0.0, 1e12)),
         Parameter("snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", (0.0, 600.0)),
@@ -81,9 +77,6 @@ class TrajectoryRecorder(ManagedNode):
 
     def prepare(self) -> None:
         """Finish what a killed recorder left, and refuse what could not be recorded."""
-        compression, known = self.values.compression, ", ".join(COMPRESSIONS)
-        if compression not in COMPRESSIONS:
-            raise DataError(f"compression is '{compression}'; it should be one of {known}")
         for wanted in self._wanted:
             if wanted.is_pattern and wanted.msgtype:
                 raise DataError("a pattern cannot have a type; topics found by it have their own")
@@ -155,13 +148,7 @@ class TrajectoryRecorder(ManagedNode):
         values = self.values
         name = values.bag or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S")
         path = Path(name if not (values.bag and self._bags) else f"{name}_{self._bags + 1}")
-        writer = BagWriter(
-            path,
-            in_place=True,
-            compression=values.compression,
-            split_bytes=round(values.split_size * 1e6) or None,
-            split_seconds=values.split_time or None,
-        )
+        writer = BagWriter(path, in_place=True)
         self._bags += 1
         self._ended = ""
         self._recording = Recording(writer, least_free=values.least_free)

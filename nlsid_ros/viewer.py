@@ -36,8 +36,9 @@ class Viewer(ManagedNode):
         self._shown = topic.removesuffix("/margin").removeprefix("/")
         self._scene = Scene(f"live: {self._shown}", self._shown)
         self.create_subscription(JointState, topic, self._on_margin, qos.SENSOR)
-        ahead = f"/{self._shown}/forecast"
-        self.create_subscription(JointState, ahead, self._on_forecast, qos.SENSOR)
+        self.create_subscription(
+            JointState, f"/{self._shown}/forecast", self._on_forecast, qos.SENSOR
+        )
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, qos.EVENTS)
         server = serve_page(self._scene, host=self.values.host, port=self.values.port)
         self._served = ExitStack()
@@ -49,12 +50,10 @@ class Viewer(ManagedNode):
         self._served.close()
 
     def _on_forecast(self, message: JointState) -> None:
-        numbers = dict(zip(message.name, message.position, strict=False))
-        self._scene.forecast(stamp_ns_of(message), numbers)
+        self._scene.forecast(stamp_ns_of(message), _numbers(message))
 
     def _on_margin(self, message: JointState) -> None:
-        numbers = dict(zip(message.name, message.position, strict=False))
-        self._scene.sample(stamp_ns_of(message), numbers)
+        self._scene.sample(stamp_ns_of(message), _numbers(message))
 
     def _on_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -66,6 +65,10 @@ class Viewer(ManagedNode):
                 status.message,
                 names=names[0].splitlines() if names else (),
             )
+
+
+def _numbers(message: JointState) -> dict[str, float]:
+    return dict(zip(message.name, message.position, strict=False))
 
 
 main = entry_point(Viewer)

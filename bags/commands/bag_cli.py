@@ -47,7 +47,6 @@ class Format(StrEnum):
     """What a table is written as."""
 
     CSV = "csv"
-    NPZ = "npz"
     PARQUET = "parquet"
 
 
@@ -215,87 +214,44 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
         raise typer.Exit(1)
 
 
-@dataclass(frozen=True)
-class CommonGrid:
-    """One table for all signals."""
-
-    period: Annotated[
-        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
-    ] = None
-    hold: Annotated[
-        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
-    ] = None
-    max_gap: Annotated[
-        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
-    ] = None
-
-
 @bag_app.command("export")
 @flat
 def export_command(
     bag: BagArgument,
-    grid: CommonGrid,
-    source: Timed,
+    source: Source,
     target: OutOption = None,
     form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
     signals: Annotated[
         list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
     ] = None,
 ) -> None:
-    """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid.
+    """Write signals as CSV or Parquet, a table per topic in the folder BAG_tables."""
+    from bags.tools.export import export_topics
 
-    By default in the folder BAG_tables, or as the file BAG.csv.
-    """
-    from bags.signals.sampling import Grid
-    from bags.tools import export
-
-    named = Path(f"{bag.stem}.{form.value}") if grid.period is not None else _beside(bag, "tables")
-    target = target or named
-    with _opened(bag, source) as opened:
-        if grid.period is None:
-            with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
-                rows = export.export_topics(
-                    opened, target, form=form.value, signals=signals or (), progress=progress
-                )
-            for file, count in rows.counts.items():
-                out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
-            for what in rows.left_out:
-                out.print(f"left out: {what}", soft_wrap=True, markup=False)
-            _say_notes(rows.notes)
-            return
-        if not signals:
-            raise BagError("a common grid needs to know which signals: --signal")
-        did = export.export_grid(
-            opened,
-            target,
-            form=form.value,
-            signals=signals,
-            hold=grid.hold or (),
-            grid=Grid(period=grid.period, max_gap=grid.max_gap, clock=source.clock.value),
+    target = target or _beside(bag, "tables")
+    with (
+        _opened(bag, source) as opened,
+        progress_bar("exporting", after=PROGRESS_AFTER) as progress,
+    ):
+        rows = export_topics(
+            opened, target, form=form.value, signals=signals or (), progress=progress
         )
-    for what in did:
-        out.print(what, soft_wrap=True, markup=False)
-    out.print(f"wrote {target}", soft_wrap=True, markup=False)
+    for file, count in rows.counts.items():
+        out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+    for what in rows.left_out:
+        out.print(f"left out: {what}", soft_wrap=True, markup=False)
+    _say_notes(rows.notes)
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Which part of a bag is copied."""
+    """Which part of a bag is copied, and into what it is cut."""
 
     start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0
     end: Annotated[float | None, typer.Option(help="s after the first message.")] = None
     topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Into what a bag is cut."""
-
     every: Annotated[
         float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
-    ] = None
-    repeats: Annotated[
-        str | None, typer.Option(help="A signal whose repetitions become the parts.")
     ] = None
 
 
@@ -304,7 +260,6 @@ class Parts:
 def convert(
     bags: BagsArgument,
     stretch: Stretch,
-    cuts: Parts,
     source: Source,
     bag_out: OutOption = None,
 ) -> None:
@@ -320,17 +275,13 @@ def convert(
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    every, repeats = cuts.every, cuts.repeats
-    if every is not None and repeats is not None:
-        raise DataError("parts begin every so many seconds or at repeats: --every or --repeats")
-    if (every is not None or repeats is not None) and (stretch.start or stretch.end is not None):
+    every = stretch.every
+    if every is not None and (stretch.start or stretch.end is not None):
         raise DataError("take the stretch first (--start, --end), then cut that into parts")
     with ExitStack() as stack:
         opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
         if every is not None:
             parts = edit.parts_every(opened, target, every)
-        elif repeats is not None:
-            parts = edit.parts_at_repeats(opened[0], target, repeats)
         else:
             parts = [edit.stretch(opened, target, stretch.start, stretch.end)]
         progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
@@ -366,7 +317,7 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help="signal=column: /joints:position[name=elbow]=angles[3]; default: every column "
+            help="signal=column: /joints:position[name=elbow]=angle; default: every column "
             "as a number on a topic of its name.",
         ),
     ] = None,

@@ -1,28 +1,55 @@
-"""Write a bag: a rosbag2 folder of MCAP files, from messages that are already serialised."""
+"""Write a bag: a rosbag2 folder of one MCAP file, from messages that are already serialised."""
 
 import shutil
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import Any, Final
 
 from mcap.records import Attachment, Metadata
+from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import MessageDefinitionFormat
 
 from bags.recordings.definitions import Definition, standard_definition
 from bags.recordings.description import TYPE_HASH, Topic, write_metadata
-from bags.recordings.output import Reserve
-from bags.recordings.part import Part, topic_like
-from bags.recordings.quality import Profile
-from bags.recordings.storage import Channel, Raw
+from bags.recordings.mcap_records import CUSTOM_DATA
+from bags.recordings.output import Output, Reserve
+from bags.recordings.quality import KEY, Profile, offered_text
+from bags.recordings.storage import FORMATS, Channel, Raw
 from nlsid_core.errors import BagError
 
 MAX_COUNT: Final = 2**32  # an MCAP file counts the messages of a topic in 32 bits
 RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
+SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
+CHUNK_BYTES: Final = 2**20
+
+
+def topic_like(channel: Channel) -> Topic:
+    """A topic to which another bag's messages are copied as they are."""
+    definition = channel.definition
+    if definition.format != MessageDefinitionFormat.NONE:
+        encoding = "ros1msg" if channel.encoding == "ros1" else SCHEMA_ENCODINGS[definition.format]
+        schema = encoding, definition.data.encode()
+    else:
+        encoding, _, data = definition.data.partition("\n")
+        schema = encoding, data.encode("latin-1")
+    if schema == ("", b"") and channel.encoding == "cdr":
+        with suppress(BagError):  # not a standard type either: copied without its definition
+            schema = "ros2msg", standard_definition(channel.msgtype).text.encode()
+    return Topic(
+        channel.topic,
+        channel.msgtype,
+        channel.encoding,
+        schema,
+        channel.metadata,
+        channel.offered,
+    )
 
 
 class BagWriter:
-    """A bag being written: NAME/NAME.mcap and NAME/metadata.yaml.
+    """A bag being written: NAME/NAME.mcap in zstd chunks, and NAME/metadata.yaml.
 
     Normally everything is written to a temporary folder beside `path`, which gets its name when
     the bag is closed; leaving a `with` block by an exception removes it. With `in_place=True` the
@@ -32,11 +59,9 @@ class BagWriter:
     killed process loses nothing of a closed chunk; a power cut may.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
-    from a timer, limits what a kill loses. `compression` of the chunks: zstd, lz4 or none.
-    `split_bytes` and `split_seconds` (of log time) begin another file, NAME_0.mcap, NAME_1.mcap
-    and so on, at the first message beyond them.
+    from a timer, limits what a kill loses.
 
-    Raises BagError if `path` exists or a setting makes no sense; OS errors pass through.
+    Raises BagError if `path` exists; OS errors pass through.
     """
 
     def __init__(
@@ -45,19 +70,16 @@ class BagWriter:
         *,
         custom: Mapping[str, str] | None = None,
         in_place: bool = False,
-        compression: str = "zstd",
-        split_bytes: int | None = None,
-        split_seconds: float | None = None,
     ) -> None:
         self.path = Path(path)
         self.counts: dict[str, int] = {}
         self._topics: list[Topic] = []
+        self._channels: list[int] = []  # their numbers in the file
         self._numbers: dict[str, int] = {}  # topic -> its place in `_topics`, of those not copied
         self._copies: dict[tuple[object, ...], int] = {}
-        self._custom = dict(custom or {})
-        self._compression = compression
-        self._split_bytes = split_bytes
-        self._split_ns = None if split_seconds is None else round(split_seconds * 1e9)
+        self._schemas: dict[tuple[str, tuple[str, bytes]], int] = {}
+        self._custom: dict[str, str] = {}
+        self._span_ns: tuple[int, int] | None = None
         self._in_place = in_place
         if self.path.exists():
             raise BagError(f"{self.path} exists already; name another bag or move it away")
@@ -70,33 +92,26 @@ class BagWriter:
                 tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}.")
             )
             self._folder.chmod(0o755)
-        self._reserve: Reserve | None = None
-        self._parts: list[Part] = []
         try:
             self._reserve = Reserve(self._folder / RESERVE) if in_place else None
-            self._open_part()
+            self._output = Output(self._folder / f"{self.path.name}.mcap", self._reserve)
         except BaseException:
             shutil.rmtree(self._folder)
             raise
+        # Any: half of mcap's writer is not annotated
+        self._mcap: Any = Writer(
+            self._output,  # type: ignore[arg-type]  # all that it uses of a stream
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+        )
+        self._mcap.start(profile="ros2", library="nlsid")
+        self.annotate(custom or {})
+        self.close_chunk()
 
     @property
     def full(self) -> str:
         """Why the bag should be closed now, if the disk is full; otherwise empty."""
         return "" if self._reserve is None else self._reserve.spent
-
-    def _open_part(self) -> None:
-        split = self._split_bytes is not None or self._split_ns is not None
-        number = f"_{len(self._parts)}" if split else ""
-        part = Part(
-            self._folder / f"{self.path.name}{number}.mcap",
-            compression=self._compression,
-            reserve=self._reserve,
-        )
-        self._parts.append(part)
-        part.annotate(self._custom)
-        for topic in self._topics:
-            part.add_topic(topic)
-        part.close_chunk()
 
     def add_topic(
         self,
@@ -135,14 +150,28 @@ class BagWriter:
         return self._copies[key]
 
     def _add(self, topic: Topic) -> int:
-        self._parts[-1].add_topic(topic)
+        key = (topic.msgtype, topic.schema)
+        if key not in self._schemas:
+            self._schemas[key] = self._mcap.register_schema(topic.msgtype, *topic.schema)
+        channel = self._mcap.register_channel(
+            topic.name,
+            topic.encoding,
+            self._schemas[key],
+            {**topic.metadata, KEY: offered_text(topic.offered)},
+        )
+        self._channels.append(channel)
         self._topics.append(topic)
         self.counts.setdefault(topic.name, 0)
         return len(self._topics) - 1
 
     def keep(self, record: Metadata | Attachment) -> None:
         """Copy what is no message of another bag."""
-        self._parts[-1].keep(record)
+        if isinstance(record, Metadata):
+            self._mcap.add_metadata(record.name, record.metadata)
+        else:
+            self._mcap.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
 
     def write(
         self,
@@ -171,29 +200,22 @@ class BagWriter:
         self._write(number, raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
 
     def _write(self, number: int, data: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
-        part = self._parts[-1]
-        if self._is_full(part, log_ns):
-            self._open_part()
-            part.finish()
-            part = self._parts[-1]
-        part.write(number, data, log_ns, publish_ns, sequence)
+        channel = self._channels[number]
+        self._mcap.add_message(channel, log_ns, data, publish_ns, sequence=sequence)
         self.counts[self._topics[number].name] += 1
-
-    def _is_full(self, part: Part, log_time_ns: int) -> bool:
-        if part.first_ns is None:
-            return False
-        if self._split_bytes is not None and part.size >= self._split_bytes:
-            return True
-        return self._split_ns is not None and log_time_ns - part.first_ns >= self._split_ns
+        first_ns, last_ns = self._span_ns or (log_ns, log_ns)
+        self._span_ns = min(first_ns, log_ns), max(last_ns, log_ns)
 
     def annotate(self, custom: Mapping[str, str]) -> None:
         """Add to the bag's own key-value pairs; the newest of those with one key counts."""
         self._custom.update(custom)
-        self._parts[-1].annotate(custom)
+        if custom:
+            self.keep(Metadata(CUSTOM_DATA, dict(custom)))
 
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
-        self._parts[-1].close_chunk()
+        self._mcap.flush()
+        self._output.refuse_loss()
 
     def close(self) -> None:
         """Finish the file, write metadata.yaml, give the folder its name; once.
@@ -201,16 +223,22 @@ class BagWriter:
         Where that fails (a full disk without a reserve), a bag in place stays what a killed
         recorder leaves: unfinished, all its closed chunks readable.
         """
-        if self._parts[-1].closed:
+        if self._output.closed:
             return
         try:
             if self._reserve is not None:
                 self._reserve.release()
-            for part in self._parts:
-                if not part.closed:
-                    part.finish()
-            files = [part.description for part in self._parts]
-            write_metadata(self._folder, files, self._topics, self._custom)
+            self._mcap.finish()
+            self._output.sync()
+            self._output.close()
+            write_metadata(
+                self._folder,
+                f"{self.path.name}.mcap",
+                self._topics,
+                self.counts,
+                self._custom,
+                self._span_ns or (0, 0),
+            )
         except OSError:
             self.abandon()
             raise
@@ -226,9 +254,8 @@ class BagWriter:
         shutil.rmtree(self._folder)
 
     def abandon(self) -> None:
-        """Let go of the files as they are: what a killed recorder leaves."""
-        for part in self._parts:
-            part.abandon()
+        """Let go of the file as it is: what a killed recorder leaves."""
+        self._output.close()
 
     def __enter__(self) -> "BagWriter":
         return self

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.signal import correlate, correlation_lags
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
@@ -18,6 +17,13 @@ class Delay:
 
     seconds: float
     correlation: float
+
+
+def correlation(y: FloatArray, u: FloatArray) -> FloatArray:
+    """Σ_t y(t + k) u(t) at the lags k = 0 … N-1 of two signals (N,)."""
+    size = 2 * len(y)  # so long that nothing comes round
+    found: FloatArray = np.fft.irfft(np.fft.rfft(y, size) * np.fft.rfft(u, size).conj(), size)
+    return found[: len(y)]
 
 
 def delay(command: FloatArray, response: FloatArray, period: float, max_delay: float) -> Delay:
@@ -35,10 +41,8 @@ def delay(command: FloatArray, response: FloatArray, period: float, max_delay: f
     u, y = command - command.mean(), response - response.mean()
     if not (u @ u > 0 and y @ y > 0):
         raise DataError("a constant signal has no delay")
-    lags = correlation_lags(len(y), len(u))
-    wanted = (lags >= 0) & (lags <= most)
-    overlap = len(u) - lags[wanted]
-    found = correlate(y, u, method="fft")[wanted] * (len(u) / overlap)
+    overlap = len(u) - np.arange(most + 1)
+    found = correlation(y, u)[: most + 1] * (len(u) / overlap)
     found = found / np.sqrt((u @ u) * (y @ y))
     k = int(np.argmax(np.abs(found)))
     shift = 0.0

@@ -1,9 +1,9 @@
 """New bags from old ones: a stretch of time, some topics, several as one, or in parts."""
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,6 @@ from bags.recordings.bag import Bag
 from bags.recordings.message_types import are_same
 from bags.recordings.storage import NEVER
 from bags.recordings.writer import BagWriter
-from bags.signals.reader import read_signals, stamp_text
-from bags.signals.repeats import find_period
-from bags.signals.sampling import Grid
 from bags.tools.copying import Copied, copy_messages
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -22,12 +19,11 @@ from nlsid_core.progress import Progress, silent
 
 @dataclass(frozen=True)
 class Part:
-    """A new bag: of messages logged from `start_ns` to before `end_ns`. custom: data of its own."""
+    """A new bag: of messages logged from `start_ns` to before `end_ns`."""
 
     out: Path
     start_ns: int = 0
     end_ns: int = NEVER
-    custom: Mapping[str, str] = field(default_factory=dict)
 
 
 def convert(
@@ -69,10 +65,7 @@ def convert(
             raise BagError(f"{part.out} exists already; name another bag or move it away")
     starts = [part.start_ns for part in parts]
     with ExitStack() as stack:
-        writers = [
-            stack.enter_context(BagWriter(part.out, custom={**custom, **part.custom}))
-            for part in parts
-        ]
+        writers = [stack.enter_context(BagWriter(part.out, custom=custom)) for part in parts]
 
         def choose(log_ns: int) -> BagWriter | None:
             k = bisect_right(starts, log_ns) - 1
@@ -103,33 +96,10 @@ def parts_every(bags: Sequence[Bag], out: Path, every: float) -> list[Part]:
     begins = [*range(first_ns, last_ns + 1, step_ns)]
     if len(begins) > 1 and 2 * (last_ns - begins[-1]) < step_ns:
         begins.pop()
-    return _numbered(out, [*begins, last_ns + 1], {})
-
-
-def parts_at_repeats(bag: Bag, out: Path, signal: str) -> list[Part]:
-    """The repetitions of a signal, each marked as a repeat of one excitation.
-
-    Raises BagError if the signal does not repeat, and as `read_signals`.
-    """
-    logged = Grid(clock="log").path(signal, response=True)
-    samples = read_signals(bag, [logged])[logged]
-    found = find_period(samples.values)
-    if found is None:
-        raise BagError(
-            f"{bag.path}: {signal} does not repeat itself; split it by time, with --every"
-        )
-    step_ns = int(np.median(np.diff(samples.stamp_ns)))
-    count = len(samples) // found
-    edges = [int(samples.stamp_ns[k * found]) for k in range(count)]
-    edges.append(int(samples.stamp_ns[count * found - 1]) + step_ns)
-    group = f"{signal}, {count} times from {stamp_text(edges[0])}"
-    return _numbered(out, edges, {"repeat_group": group})
-
-
-def _numbered(out: Path, edges_ns: Sequence[int], custom: Mapping[str, str]) -> list[Part]:
+    ends = [*begins[1:], last_ns + 1]
     return [
-        Part(out.with_name(f"{out.name}_{k:02d}"), edges_ns[k - 1], edges_ns[k], custom)
-        for k in range(1, len(edges_ns))
+        Part(out.with_name(f"{out.name}_{k:02d}"), start_ns, end_ns)
+        for k, (start_ns, end_ns) in enumerate(zip(begins, ends, strict=True), start=1)
     ]
 
 

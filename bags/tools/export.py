@@ -1,13 +1,11 @@
-"""Signals of a bag as tables: CSV, npz or Parquet (extra `export`: pyarrow).
+"""Signals of a bag as tables: CSV or Parquet (extra `export`: pyarrow).
 
-One table per topic is written part by part and needs the memory of one chunk (npz: of the topic).
-One table on a common grid needs the memory of its columns.
+A table per topic is written part by part and needs the memory of one chunk.
 """
 
-import io
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,16 +20,12 @@ from bags.recordings.message_types import fields_of
 from bags.recordings.storage import NEVER
 from bags.signals.columns import Columns, TopicReader, expand_paths, joined_columns
 from bags.signals.expressions import Expression, Running
-from bags.signals.grid import seconds
-from bags.signals.reader import expanded, read_signals
-from bags.signals.resample import resample
-from bags.signals.sampling import Grid
+from bags.signals.reader import expanded
 from bags.signals.signal import NO_FIELD, SignalPath, numeric_paths
-from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import BagError, DataError
+from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
-FORMATS: Final = ("csv", "npz", "parquet")
+FORMATS: Final = ("csv", "parquet")
 MAX_COLUMNS: Final = 256  # of one array, when everything is exported; images are not tables
 TIMES: Final = ("log_time_ns", "publish_time_ns", "stamp_ns")
 Table = Mapping[str, Any]
@@ -96,74 +90,12 @@ def export_topics(
     return Exported(counts, tuple(left_out), (*bag.lost, *bag.disagreements))
 
 
-def export_grid(
-    bag: Bag,
-    out: Path | str,
-    *,
-    form: str,
-    signals: Sequence[str],
-    hold: Sequence[str] = (),
-    grid: Grid,
-) -> list[str]:
-    """Write a table on a common grid: t in s since the first common stamp, and signals.
-
-    Args:
-        bag: an open bag.
-        out: the new file.
-        form: one of FORMATS.
-        signals: which.
-        hold: those of `signals` that are commands; the others are put on the line between samples.
-        grid: its period, clock and max_gap are used (no max_gap: 1.5 periods).
-
-    Returns:
-        In words, what putting it on the grid did to each signal.
-
-    Raises:
-        BagError, DataError: as `read_signals` and `resample` do, and if `out` exists.
-    """
-    out = _new(out, form)
-    period = grid.period or 0.0
-    read = read_signals(bag, [grid.path(text, response=True) for text in signals])
-    if len({samples.clock for samples in read.values()}) > 1:
-        said = "; ".join(f"{name} has a {samples.clock}" for name, samples in read.items())
-        raise BagError(
-            f"{bag.path}: times of two clocks cannot share a grid: {said}; set --clock log"
-        )
-    held = {grid.path(text, response=True) for text in hold}
-    if unknown := held - read.keys():
-        raise BagError(f"hold: {min(unknown)} is not one of the signals")
-    first = max(int(s.stamp_ns[0]) for s in read.values())
-    last = min(int(s.stamp_ns[-1]) for s in read.values())
-    period_ns = round(period * 1e9)
-    if period_ns <= 0 or last - first < period_ns:
-        raise DataError(
-            f"{bag.path}: the signals overlap in {(last - first) / 1e9:g} s, less than two samples"
-        )
-    at_ns = first + period_ns * np.arange(1 + (last - first) // period_ns)
-    max_gap = 1.5 * period if grid.max_gap is None else grid.max_gap
-    table: dict[str, Any] = {"t": seconds(at_ns, first)}
-    did = []
-    for name, samples in read.items():
-        found = resample(samples, at_ns, hold=name in held, max_gap=max_gap)
-        title, rounding = name.removesuffix(f"|clock({grid.clock})"), _rounding(samples.values)
-        table[title] = found.values
-        if name not in held:
-            did.append(f"{title}: off by at most {found.error + rounding:.2g}")
-            continue
-        said = f"{title}: held; from one message to the next it changes by at most"
-        off = f"; off by at most {rounding:.2g}, as float64" if rounding else ""
-        did.append(f"{said} {found.error:.2g}{off}")
-    with _temporary(out) as file, closing(_WRITERS[form](file)) as writer:
-        writer.write(table)
-    return did
-
-
 def _new(out: Path | str, form: str) -> Path:
     """The place to write to; BagError if something is there, or for an unknown format."""
     if form not in FORMATS:
         raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
     if form == "parquet" and find_spec("pyarrow") is None:
-        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv or npz")
+        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv")
     if Path(out).exists():
         raise BagError(f"{out} exists already; take another name or move it away")
     return Path(out)
@@ -176,12 +108,6 @@ def _temporary(out: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         yield Path(folder) / out.name
         (Path(folder) / out.name).rename(out)
-
-
-def _rounding(values: FloatArray) -> float:
-    """How far integers may be from their float64: beyond 2^53 not each has one."""
-    largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values)))
-    return float(np.spacing(largest) / 2) if largest >= 2**53 else 0.0
 
 
 def _every_number(bag: Bag, left_out: list[str]) -> dict[str, dict[str, Expression]]:
@@ -348,21 +274,6 @@ class _Csv:
         self._stream.close()
 
 
-class _Npz:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._parts: list[Table] = []
-
-    def write(self, table: Table) -> None:
-        self._parts.append(table)
-
-    def close(self) -> None:
-        arrays = {n: np.concatenate([p[n] for p in self._parts]) for n in self._parts[0]}
-        stream = io.BytesIO()
-        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-        self._path.write_bytes(stream.getvalue())
-
-
 class _Parquet:
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -384,6 +295,5 @@ class _Parquet:
 
 _WRITERS: Final[Mapping[str, Callable[[Path], Any]]] = {
     "csv": _Csv,
-    "npz": _Npz,
     "parquet": _Parquet,
 }

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.signal import welch
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
@@ -23,7 +22,7 @@ from bags.signals.delays import RELATED, Delay, delay
 from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
-from bags.signals.repeats import find_period, same_excitation
+from bags.signals.repeats import same_excitation
 from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
 from bags.signals.timing import clock_relation, held
@@ -295,6 +294,8 @@ def _excitation(samples: Samples) -> Iterator[Finding]:
     if not np.ptp(x) > 0:
         return
     period = max(float(np.median(np.diff(samples.stamp_ns))) / 1e9, 1e-9)
+    from scipy.signal import welch  # importing it takes longer than most bags take to read
+
     f, power = welch(x - x.mean(), fs=1 / period, nperseg=min(len(x), 1024))
     share = np.cumsum(power) / power.sum()
     band = float(f[np.searchsorted(share, 0.95)])
@@ -302,10 +303,6 @@ def _excitation(samples: Samples) -> Iterator[Finding]:
     level = Level.LOOK if lines < LINES_FEW or band * period > BAND_LOOK else Level.GOOD
     what = f"{name}: 95 % of its power below {band:.3g} Hz, {lines} frequency lines carry power"
     yield Finding(level, "excitation", what)
-    repeat = find_period(x)
-    if repeat is not None:
-        what = f"{name} repeats every {repeat * period:.4g} s, {len(x) // repeat} times"
-        yield Finding(Level.GOOD, "repeats", what)
 
 
 def _range(samples: Samples) -> Iterator[Finding]:

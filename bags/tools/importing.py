@@ -3,6 +3,7 @@
 import csv
 import math
 import re
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,15 +29,13 @@ STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an in
 TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
-SUFFIXES: Final = (".csv", ".txt", ".dat")
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
 _TITLE: Final = re.compile(r"(?P<name>.+?)(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
-_COLUMN: Final = re.compile(r"([^\[\]]+)\[(\d{1,6})\]")
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """A signal and the column it gets: `/joint_states:position[name=elbow]=angles[3]`."""
+    """A signal and the column it gets: `/joint_states:position[name=elbow]=angle`."""
 
     path: SignalPath
     column: str
@@ -47,7 +46,7 @@ class Assignment:
         signal, equals, column = text.rpartition("=")
         if not equals or not column or signal.count("[") != signal.count("]"):
             raise BagError(
-                f"'{text}' is not signal=column, e.g. /joint_states:position[name=elbow]=angles[3]"
+                f"'{text}' is not signal=column, e.g. /joint_states:position[name=elbow]=angle"
             )
         path = SignalPath.parse(signal.strip())
         if path.every:
@@ -81,40 +80,62 @@ class Imported:
     times: str
 
 
-def column_of(tables: Mapping[str, FloatArray], text: str) -> FloatArray:
-    """`title`, or `name[column]` of a table without titles; DataError lists what there is."""
-    match = None if text in tables else _COLUMN.fullmatch(text)
-    name, index = (text, "") if match is None else match.groups("")
-    if name not in tables:
-        shapes = listed(f"{name} {'x'.join(map(str, t.shape))}" for name, t in tables.items())
-        raise DataError(f"no table '{name}'; there are: {shapes}{did_you_mean(name, tables)}")
-    values = tables[name]
-    if values.ndim == 1 and not index:
-        return values
-    if values.ndim == 1 or not index:
-        raise DataError(f"'{text}' has shape {values.shape}; name one column, as in {name}[0]")
-    if int(index) >= values.shape[1]:
-        raise DataError(f"'{text}': the table has columns 0 to {values.shape[1] - 1}")
-    found: FloatArray = values[:, int(index)]
-    return found
-
-
 def read_table(file: Path | str) -> dict[str, FloatArray]:
-    """Read the numbers of a CSV file, (rows,) or (rows, columns), by name.
+    """Read the numbers of a CSV file, (rows,) by the columns' titles in its first line.
 
-    Without a header it is one table by the file's name; with one, each column is a table by its own
-    name, an empty cell is NaN, and a column without a number is left out. Raises DataError for a
-    file that is no CSV or holds no numbers.
+    An empty cell is NaN, and a column without a number is left out. Raises DataError, with the
+    line, for lines of another length and for a text among numbers, and for a file without titles
+    or numbers.
     """
     path = Path(file)
     if path.stat().st_size > MAX_TABLE_BYTES:
         raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
-    if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"{path}: unknown kind; known are {', '.join(SUFFIXES)}")
-    found = _csv(path)
-    if not found:
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
+        first = stream.readline()
+        delimiter = next((mark for mark in (";", ",", "\t") if mark in first), ",")
+        stream.seek(0)
+        lines = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+        titles = [title.strip() for title in next(lines, [])]
+        if titles and all(_number(title) is not None for title in titles):
+            raise DataError(
+                f"{path}: its first line holds numbers; write the columns' titles there"
+            )
+        if twice := next((title for title in titles if titles.count(title) > 1), None):
+            raise DataError(f"{path}: two columns are called '{twice}'")
+        columns = [array("d") for _ in titles]
+        words: dict[str, str] = {}  # title -> the first cell that is no number
+        for cells in lines:
+            if cells and len(cells) != len(titles):
+                where = f"in line {lines.line_num}, {len(titles)} in line 1"
+                raise DataError(f"{path}: {len(cells)} cells {where}")
+            for title, column, cell in zip(titles, columns, cells, strict=False):
+                number = _number(cell)
+                if number is None:
+                    words.setdefault(title, f"'{cell}' in line {lines.line_num}")
+                    number = math.nan
+                column.append(number)
+    tables = {title: np.array(column) for title, column in zip(titles, columns, strict=True)}
+    tables = {title: column for title, column in tables.items() if not np.isnan(column).all()}
+    if not tables:
         raise DataError(f"{path} holds no table of numbers")
-    return found
+    if mixed := next((title for title in tables if title in words), None):
+        raise DataError(f"{path}: {words[mixed]}, column '{mixed}' is no number")
+    return tables
+
+
+def _number(text: str) -> float | None:
+    """The number in a cell, NaN in an empty one; None if it is no number."""
+    try:
+        return float(text) if text.strip() else math.nan
+    except ValueError:
+        return None
+
+
+def _column(tables: Mapping[str, FloatArray], title: str) -> FloatArray:
+    if title not in tables:
+        near = did_you_mean(title, tables)
+        raise DataError(f"no column '{title}'; there are: {listed(tables)}{near}")
+    return tables[title]
 
 
 def every_column(file: Path | str, rows: Rows) -> tuple[Rows, list[str], dict[str, str]]:
@@ -128,7 +149,7 @@ def every_column(file: Path | str, rows: Rows) -> tuple[Rows, list[str], dict[st
         time = next((name for name in tables if _says_when(name)), None)
         rows = replace(rows, time=time)
     said = None if rows.time is None else _unit_of(rows.time)[0]
-    columns = [name for name, table in tables.items() if name != said and table.ndim == 1]
+    columns = [name for name in tables if name != said]
     topics = [f"/{re.sub(r'^(?=[0-9])|[^A-Za-z0-9_]', '_', name)}" for name in columns]
     if twice := next((topic for topic in topics if topics.count(topic) > 1), None):
         raise DataError(f"two columns would be {twice}; name them with --signal")
@@ -147,8 +168,7 @@ def import_table(
 ) -> Imported:
     """Write a bag with one message a row.
 
-    Header stamp, log time and publish time are equal. A topic has as many messages as the shortest
-    of its columns. What is not assigned is zero or empty.
+    Header stamp, log time and publish time are equal. What is not assigned is zero or empty.
 
     Args:
         file: the table.
@@ -172,42 +192,31 @@ def import_table(
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
     for text in assignments:
         parsed = Assignment.parse(text)
-        topics.setdefault(parsed.path.topic, {})[parsed.path] = column_of(tables, parsed.column)
+        topics.setdefault(parsed.path.topic, {})[parsed.path] = _column(tables, parsed.column)
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     if not topics:
         raise BagError("nothing is assigned, so there is nothing to write")
-    most = max(len(column) for columns in topics.values() for column in columns.values())
-    times, unit = _times(most, tables, rows)
+    times, unit = _times(tables, rows)
     kept = np.arange(len(times))
     if rows.time is not None and rows.drop_repeats:
         kept = kept[np.diff(times, prepend=-np.inf) > 0]
+    stamps = _stamps(times[kept], rows.start_ns)
     streams = []
     for topic, columns in topics.items():
         if topic not in types:
             raise BagError(
                 f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
             )
-        mine = kept[kept < min(map(len, columns.values()))]
-        stamps = _stamps(times[mine], rows.start_ns)
-        columns = {path: column[mine] for path, column in columns.items()}
-        streams.append(_Stream(topic, types[topic], columns, stamps))
+        columns = {path: column[kept] for path, column in columns.items()}
+        streams.append(_Stream(topic, types[topic], columns))
     said = _said_times(times[kept], rows, unit)
     with BagWriter(out, custom=custom) as writer:
-        events = sorted(
-            (int(stamp), k, row)
-            for k, stream in enumerate(streams)
-            for row, stamp in enumerate(stream.stamps)
-        )
-        for stamp, k, row in events:
-            stream = streams[k]
-            writer.write(
-                stream.topic,
-                stream.msgtype,
-                stream.message(row),
-                log_time_ns=stamp,
-                publish_time_ns=stamp,
-            )
+        for row, stamp in enumerate(stamps.tolist()):
+            for stream in streams:
+                data = stream.message(row, stamp)
+                times_ns = {"log_time_ns": stamp, "publish_time_ns": stamp}
+                writer.write(stream.topic, stream.msgtype, data, **times_ns)
         return Imported(dict(writer.counts), said)
 
 
@@ -225,8 +234,8 @@ def _unit_of(time: str) -> tuple[str, str]:
     return time, unit if unit in UNITS and UNITS[unit].kind == "time" else ""
 
 
-def _times(count: int, tables: Mapping[str, FloatArray], rows: Rows) -> tuple[FloatArray, str]:
-    """Times of `count` rows in s, and the unit that the column has them in.
+def _times(tables: Mapping[str, FloatArray], rows: Rows) -> tuple[FloatArray, str]:
+    """Times of the rows in s, and the unit that the column has them in.
 
     Raises DataError for times that may well be in another unit than s.
     """
@@ -234,12 +243,9 @@ def _times(count: int, tables: Mapping[str, FloatArray], rows: Rows) -> tuple[Fl
         assert rows.period is not None
         if not rows.period > 0:
             raise DataError(f"a period of {rows.period:g} s")
-        return np.arange(count) * rows.period, "s"
+        return np.arange(len(next(iter(tables.values())))) * rows.period, "s"
     name, unit = _unit_of(rows.time)
-    times = column_of(tables, name)
-    if len(times) < count:
-        raise DataError(f"{count} rows but {len(times)} times")
-    times = times[:count]
+    times = _column(tables, name)
     if len(unknown := np.flatnonzero(~np.isfinite(times))):
         raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
     since_1970 = [unit for unit, least in EPOCHS.items() if len(times) and times[0] >= least]
@@ -276,9 +282,7 @@ def said_units(assignments: Sequence[str], types: Mapping[str, str]) -> str:
 class _Stream:
     """The messages of one topic, made row by row from one template."""
 
-    def __init__(
-        self, topic: str, msgtype: str, columns: Mapping[SignalPath, FloatArray], stamps: IntArray
-    ) -> None:
+    def __init__(self, topic: str, msgtype: str, columns: Mapping[SignalPath, FloatArray]) -> None:
         store = standard_types()
         if msgtype not in store.types:
             raise BagError(
@@ -287,15 +291,14 @@ class _Stream:
             )
         for path in columns:
             path.check(msgtype, store)
-        self.topic, self.msgtype, self.stamps = topic, msgtype, stamps
+        self.topic, self.msgtype = topic, msgtype
         self._columns = columns
         self._stamped = is_stamped(msgtype, store)
         self._message = _empty(msgtype)
         for path in columns:
             _make_room(self._message, path.steps)
 
-    def message(self, row: int) -> bytes:
-        stamp = int(self.stamps[row])
+    def message(self, row: int, stamp: int) -> bytes:
         if self._stamped:
             header: Any = self._message
             header.header.stamp.sec, header.header.stamp.nanosec = divmod(stamp, 10**9)
@@ -324,67 +327,6 @@ def _stamps(times: FloatArray, start_ns: int) -> IntArray:
             f"({len(back)} such rows); --drop-repeats keeps the first of rows with one time"
         )
     return stamps
-
-
-def _csv(path: Path) -> dict[str, FloatArray]:
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        first = stream.readline()
-        rest = any(line.strip() for line in stream)
-    delimiter = next((mark for mark in (";", ",", "\t") if mark in first), None)
-    cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
-    titled = not all(_is_number(cell) for cell in cells if cell)
-    if not (rest or (any(cells) and not titled)):
-        return {}  # which numpy warns of
-    table: FloatArray
-    try:
-        table = np.loadtxt(
-            path, delimiter=delimiter, skiprows=int(titled), ndmin=2, encoding="utf-8-sig"
-        )
-    except ValueError:
-        table = _csv_by_cells(path, delimiter, titled, cells)
-    if not titled:
-        return {path.stem: table[:, 0] if table.shape[1] == 1 else table}
-    if len(cells) != table.shape[1]:
-        raise DataError(f"{path}: {len(cells)} titles over {table.shape[1]} columns")
-    return {cell: table[:, k] for k, cell in enumerate(cells) if not np.isnan(table[:, k]).all()}
-
-
-def _csv_by_cells(
-    path: Path, delimiter: str | None, titled: bool, titles: Sequence[str]
-) -> FloatArray:
-    """What numpy does not read: NaN for empty cells, and all over a column without a number.
-
-    Raises DataError, with the line, for lines of another length and for a text among numbers.
-    """
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
-        if delimiter is None:
-            lines = [(number, line.split()) for number, line in enumerate(stream, start=1)]
-        else:
-            reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
-            lines = [(reader.line_num, cells) for cells in reader]
-    rows = [(number, cells) for number, cells in lines if cells][int(titled) :]
-    for number, cells in rows:
-        if len(cells) != len(titles):
-            raise DataError(f"{path}: {len(cells)} cells in line {number}, {len(titles)} in line 1")
-    table = np.full((len(rows), len(titles)), np.nan)
-    for k, title in enumerate(titles):
-        column = [(number, cells[k].strip()) for number, cells in rows]
-        texts = [(n, cell) for n, cell in column if cell and not _is_number(cell)]
-        if len(texts) == sum(cell != "" for _, cell in column):
-            continue
-        if texts:
-            where = f"line {texts[0][0]}, column '{title}'" if titled else f"line {texts[0][0]}"
-            raise DataError(f"{path}: '{texts[0][1]}' in {where} is no number")
-        table[:, k] = [float(cell) if cell else np.nan for _, cell in column]
-    return table
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _empty(msgtype: str) -> Any:

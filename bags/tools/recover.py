@@ -1,5 +1,7 @@
-"""Make a whole bag of what can be read of an unfinished or damaged one, and say what was lost."""
+"""Make a whole bag of an unfinished or damaged one: a copy that says what was lost, or in place."""
 
+import fcntl
+import tempfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from bags.recordings.bag import Bag
+from bags.recordings.description import METADATA
 from bags.recordings.message_types import decode, types_in_bag
 from bags.recordings.storage import Channel
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import RESERVE, BagWriter
 from bags.tools.copying import copy_messages
 from bags.tools.info import missing
 from nlsid_core.arrays import IntArray
@@ -88,3 +91,40 @@ def _unreadable(channel: Channel, data: bytes) -> str:
     except BagError as error:
         return str(error)
     return ""
+
+
+def unfinished_bags(folder: Path) -> list[Path]:
+    """Find bags in `folder` that were not closed and that no recorder is writing now."""
+    if not folder.is_dir():
+        return []
+    return [path for path in sorted(folder.iterdir()) if _is_unfinished(path)]
+
+
+def repair(bag: Path) -> int:
+    """Finish what a killed recorder left, with every message that can be read; how many there are.
+
+    Its file is replaced once the new one is complete. Raises BagError if nothing can be read or
+    the bag is being written.
+    """
+    if not _is_unfinished(bag):
+        raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
+    with tempfile.TemporaryDirectory(dir=bag.parent, prefix=f".{bag.name}.repair.") as folder:
+        whole = Path(folder) / bag.name
+        with Bag(bag, salvage=True) as old, BagWriter(whole, custom=old.custom) as writer:
+            copied = copy_messages([old], [writer], lambda _: writer, nearly=True)
+        for name in (f"{bag.name}.mcap", METADATA):  # without metadata.yaml it is still unfinished
+            (whole / name).replace(bag / name)
+    (bag / RESERVE).unlink(missing_ok=True)
+    return copied.messages
+
+
+def _is_unfinished(bag: Path) -> bool:
+    file = bag / f"{bag.name}.mcap"
+    if (bag / METADATA).exists() or not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:  # a recorder holds it
+            return False
+    return True

@@ -82,13 +82,8 @@ class CellNetwork:
     def __post_init__(self) -> None:
         m, n = len(self.maps), np.size(self.start)
         width = m + n + len(self.u) + 1
-        shapes = {
-            "into": (m, width),
-            "next": (n, width),
-            "output": (len(self.y), width),
-            "start": (n,),
-        }
-        freeze(self, "model", shapes)
+        into, after, output = (m, width), (n, width), (len(self.y), width)
+        freeze(self, "model", {"into": into, "next": after, "output": output, "start": (n,)})
         if not 1 <= m <= MAX_MAPS or not n or not self.y:
             raise DataError(f"{m} maps, {n} states, {len(self.y)} outputs; 1 to {MAX_MAPS} maps")
         if np.triu(self.into[:, :m]).any():
@@ -152,7 +147,10 @@ class CellNetwork:
 
         Levenberg-Marquardt steps with differences, which are exact where no knot is passed.
         """
-        spread = np.maximum(np.std(y, axis=0), np.abs(self.output[:, len(self.maps) : -1]).max())
+        gains = np.abs(self.output[:, :-1])
+        # An output that stands still has no spread, and where maps alone lead to it no direct gain.
+        gain = gains[:, len(self.maps) :].max() or gains.max() or 1.0
+        spread = np.maximum(np.std(y, axis=0), gain)
 
         def residual(x: FloatArray) -> FloatArray:
             error = (self.states(u, x)[0] - y) / spread

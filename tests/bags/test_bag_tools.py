@@ -21,7 +21,7 @@ from bags.commands.cli import app
 from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
 from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth, schunk
+from bags.samples import schunk
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
 from bags.tools.fitness import Level, check_fitness
@@ -193,17 +193,14 @@ def test_the_command_line_says_its_version_and_completes_names() -> None:
     assert "--install-completion" in CliRunner().invoke(app, ["--help"]).output
 
 
-def test_operations_are_exported_with_a_grid_and_without(bag: Path, tmp_path: Path) -> None:
+def test_operations_are_exported(bag: Path, tmp_path: Path) -> None:
     signal = f"{SPEED}|derivative(0.2 s)|to(g)"
     run("export", bag, "--out", tmp_path / "tables", "-s", signal)
-    run("export", bag, "--out", tmp_path / "grid.csv", "--period", "0.025", "-s", signal)
     with (tmp_path / "tables" / "odom.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    with (tmp_path / "grid.csv").open(encoding="utf-8") as stream:
-        grid = [float(row[signal]) for row in csv.DictReader(stream)]
     column = [float(row[signal.removeprefix(f"{ODOM}:")]) for row in rows]
     expected = read_signals(bag, [signal])[signal].values.tolist()
-    assert column[-len(expected) :] == grid == expected
+    assert column[-len(expected) :] == expected
     assert np.isnan(column[: -len(expected)]).all()
 
 
@@ -284,20 +281,6 @@ def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
     assert not (tmp_path / "ac").exists()
 
 
-def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    once = np.repeat(rng.standard_normal(12), 5)
-    bag = speed_bag(tmp_path / "runs", np.tile(once, 5), np.tile(once, 5))
-    run("convert", bag, "--out", tmp_path / "run", "--repeats", COMMAND)
-    parts = sorted(tmp_path.glob("run_*"))
-    assert [p.name for p in parts] == [f"run_{k:02d}" for k in range(1, 6)]
-    for part in parts:
-        assert read_signals(part, [COMMAND])[COMMAND].values.tolist() == once.tolist()
-    assert len({bag_origin(part)["custom"]["repeat_group"] for part in parts}) == 1
-    with pytest.raises(BagError, match="does not repeat itself"):
-        run("convert", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
-
-
 def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: Path) -> None:
     file = next(bag.glob("*.mcap"))
     damaged = tmp_path / "damaged.mcap"
@@ -319,7 +302,7 @@ def test_custom_types_survive_cutting_and_recovery(tmp_path: Path) -> None:
     assert "18558 messages, read back and compared; nothing was lost of what" in output
 
 
-@pytest.mark.parametrize("form", ["csv", "npz", "parquet"])
+@pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_exported_topics_hold_the_bags_numbers_bit_for_bit(
     bag: Path, tmp_path: Path, form: str
 ) -> None:
@@ -333,24 +316,6 @@ def test_exported_topics_hold_the_bags_numbers_bit_for_bit(
     assert len(table["pose.covariance[35]"]) == 400
 
 
-@pytest.mark.parametrize("form", ["csv", "npz", "parquet"])
-def test_a_grid_holds_commands_and_interpolates_states(
-    bag: Path, tmp_path: Path, form: str
-) -> None:
-    if form == "parquet":
-        pytest.importorskip("pyarrow")
-    out = tmp_path / f"grid.{form}"
-    options = ("--period", "0.01", "--max-gap", "0.03", "-f", form, "--hold", COMMAND)
-    output = run("export", bag, "--out", out, "-s", SPEED, "-s", COMMAND, *options)
-    assert f"{COMMAND}: held; from one message to the next it changes by at most 1\n" in output
-    assert f"{SPEED}: off by at most 7.8e-05\n" in output
-    table = table_in(out)
-    t = np.asarray(table["t"], dtype=float)
-    np.testing.assert_allclose(np.diff(t), 0.01, rtol=1e-9)
-    np.testing.assert_allclose(np.asarray(table[SPEED], float), np.sin(t), atol=1e-4)
-    assert set(np.asarray(table[COMMAND], float)) == set(range(40))
-
-
 def table_in(path: Path) -> Any:
     if path.suffix == ".csv":
         with path.open() as stream:
@@ -361,9 +326,6 @@ def table_in(path: Path) -> Any:
             else [int(row[name]) for row in rows]
             for name in rows[0]
         }
-    if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            return dict(arrays)
     from pyarrow import parquet
 
     table = parquet.read_table(path)
@@ -560,7 +522,8 @@ def test_empty_cells_are_unknown_and_columns_of_words_are_left_out(tmp_path: Pat
     ("text", "message"),
     [
         ("t,x\n0,1\n0.1,fast\n0.2,2\n", r"'fast' in line 3, column 'x' is no number$"),
-        ("0 1\n0.1 fast\n0.2 2\n", r"'fast' in line 2 is no number$"),
+        ("0,1\n0.1,2\n", r"its first line holds numbers; write the columns' titles there$"),
+        ("x,x\n0.1,2\n", r"two columns are called 'x'$"),
         ("t;x\n0;1\n\n0.1\n", r"1 cells in line 4, 2 in line 1$"),
     ],
 )
@@ -605,18 +568,16 @@ def test_times_that_no_stamp_can_say_are_refused(
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("/arm:position[0]=nothing", "no table 'nothing'; there are: log 5x3"),
-        ("/arm:position[0]=log[7]", "columns 0 to 2"),
-        ("/arm:position[0]=log", "name one column"),
-        ("/arm:posit[0]=log[0]", "Field 'posit' does not exist"),
+        ("/arm:position[0]=nothing", "no column 'nothing'; there are: a, b"),
+        ("/arm:posit[0]=a", "Field 'posit' does not exist"),
         ("/arm:position[0]", "is not signal=column"),
-        ("/other:position[0]=log[0]", "nothing is assigned to /arm"),
+        ("/other:position[0]=a", "nothing is assigned to /arm"),
     ],
 )
 def test_an_import_that_does_not_fit_is_refused_and_writes_nothing(
     tmp_path: Path, assignment: str, message: str
 ) -> None:
-    np.savetxt(tmp_path / "log.csv", np.zeros((5, 3)), delimiter=",")
+    (tmp_path / "log.csv").write_text("a,b\n0,0\n1,1\n")
     types = {"/arm": JOINT_TYPE}
     file = tmp_path / "log.csv"
     with pytest.raises(DataError, match=message):

@@ -638,16 +638,6 @@ def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) 
         "on[0]": "True",
         "on[1]": "False",
     }
-    grid = ["--period", "1e-9", "-s", "/x:n[0]", "--hold", "/x:n[0]", "--clock", "log"]
-    said = run("export", bag, "--out", tmp_path / "g.csv", *grid)[1]
-    assert "changes by at most 0; off by at most 1, as float64\n" in said
-    run("export", bag, "--out", tmp_path / "npz", "-f", "npz")
-    with np.load(tmp_path / "npz" / "x.npz") as arrays:
-        assert {str(arrays[name].dtype) for name in ("i.u", "i.s", "on[0]")} == {
-            "uint64",
-            "int8",
-            "bool",
-        }
 
 
 def test_two_topics_whose_files_would_have_one_name_do_not_share_it(tmp_path: Path) -> None:

@@ -19,11 +19,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
-from bags.recordings.repair import repair
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Recent
 from bags.tools.edit import convert, parts_every
-from bags.tools.recover import recover
+from bags.tools.recover import recover, repair
 from nlsid_core.errors import BagError
 from tests.bag_messages import START_NS, converted, speed_bag
 from tests.conftest import SHARED

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from bags.recordings.bag import Bag
@@ -13,75 +12,9 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.message_types import decode
 from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
-from tests.bag_messages import CMD, CMD_TYPE, ODOM, ODOM_TYPE, PERIOD_NS, START_NS, command
+from tests.mcap_files import three_readers
 
 ARM = "my_robot/msg/Arm"
-
-
-def write(path: Path, count: int, **settings: object) -> list[bytes]:
-    """Commands every 25 ms, with a little noise that does not compress away."""
-    rng, data = np.random.default_rng(1), []
-    with BagWriter(path, custom={"robot": "car"}, **settings) as bag:  # type: ignore[arg-type]
-        bag.add_topic(ODOM, ODOM_TYPE)
-        for k in range(count):
-            stamp = START_NS + k * PERIOD_NS
-            data.append(command(stamp, float(rng.standard_normal())))
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
-            bag.write(CMD, CMD_TYPE, data[-1], **times)
-            if k % 20 == 19:
-                bag.close_chunk()
-    return data
-
-
-def three_readers(bag: Path, topic: str) -> list[list[bytes]]:
-    with Bag(bag) as source:
-        ours, files = [m.data for m in source.messages([topic])], source.files
-    with AnyReader([bag]) as reader:
-        wanted = [c for c in reader.connections if c.topic == topic]
-        rosbags = [bytes(data) for _, _, data in reader.messages(wanted)]
-    mcap: list[bytes] = []
-    for file in files:
-        with file.open("rb") as stream:
-            messages = make_reader(stream, validate_crcs=True).iter_messages([topic])
-            mcap += [message.data for *_, message in messages]
-    return [ours, rosbags, mcap]
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_a_bag_split_by_time_is_read_back_bit_equal(tmp_path: Path, compression: str) -> None:
-    data = write(tmp_path / "run", 300, split_seconds=2.0, compression=compression)
-    assert three_readers(tmp_path / "run", CMD) == [data] * 3
-    document = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())
-    metadata = document["rosbag2_bagfile_information"]
-    assert metadata["relative_file_paths"] == [f"run_{k}.mcap" for k in range(4)]
-    assert [file["message_count"] for file in metadata["files"]] == [80, 80, 80, 60]
-    starts = [file["starting_time"]["nanoseconds_since_epoch"] for file in metadata["files"]]
-    assert starts == [START_NS + 80 * k * PERIOD_NS for k in range(4)]
-    assert {file["duration"]["nanoseconds"] for file in metadata["files"][:3]} == {79 * PERIOD_NS}
-    with (tmp_path / "run" / "run_2.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert {c.compression for c in summary.chunk_indexes} == {
-        "" if compression == "none" else compression
-    }
-    assert {channel.topic for channel in summary.channels.values()} == {ODOM, CMD}
-
-
-def test_a_bag_split_by_size_has_files_of_about_that_size(tmp_path: Path) -> None:
-    data = write(tmp_path / "run", 2000, split_bytes=20_000, compression="none")
-    assert three_readers(tmp_path / "run", CMD) == [data] * 3
-    sizes = [file.stat().st_size for file in sorted((tmp_path / "run").glob("*.mcap"))]
-    assert len(sizes) > 5
-    assert max(sizes) < 30_000
-    with Bag(tmp_path / "run") as source:
-        assert source.custom == {"robot": "car"}
-        assert source.count(CMD) == 2000
-
-
-def test_a_compression_that_does_not_exist_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="'zip'; it is one of zstd, lz4, none"):
-        BagWriter(tmp_path / "run", compression="zip")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Clocks, gaps, delays, repeats, resampling."""
+"""Clocks, gaps, delays, repeats."""
 
 from pathlib import Path
 
@@ -7,9 +7,8 @@ import pytest
 
 import bags
 from bags.signals.delays import delay
-from bags.signals.reader import Samples, read_signals
-from bags.signals.repeats import find_period, same_excitation
-from bags.signals.resample import resample
+from bags.signals.reader import read_signals
+from bags.signals.repeats import same_excitation
 from bags.signals.sampling import Grid
 from bags.signals.timing import clock_relation
 from nlsid_core.errors import BagError, DataError
@@ -58,16 +57,6 @@ def test_the_delay_of_a_response_is_found(true: float) -> None:
         delay(u, np.ones(len(u)), 0.01, 2.0)
 
 
-def test_a_period_is_found_and_none_where_there_is_none() -> None:
-    rng = np.random.default_rng(7)
-    once = np.cumsum(rng.standard_normal(150))
-    noise = 0.02 * once.std() * rng.standard_normal(600)
-    assert find_period(np.tile(once, 4) + noise) == 150
-    assert find_period(np.tile(once, 4)[:299]) is None  # not whole twice
-    assert find_period(rng.standard_normal(600)) is None
-    assert find_period(np.ones(600)) is None
-
-
 def test_repeats_are_told_from_steps_of_another_height() -> None:
     step = np.repeat([0.0, 1.0], 50)
     rng = np.random.default_rng(8)
@@ -75,30 +64,6 @@ def test_repeats_are_told_from_steps_of_another_height() -> None:
     assert not same_excitation(step, 1.2 * step)
     assert not same_excitation(step, step[:80])
     assert not same_excitation(np.ones(100), np.ones(100))
-
-
-@pytest.mark.parametrize("hold", [False, True])
-def test_resampling_is_off_by_no_more_than_its_bound(hold: bool) -> None:
-    rng = np.random.default_rng(9)
-    t = np.cumsum(rng.uniform(0.005, 0.015, 400))
-    samples = Samples("/x:y", stamps(t), np.sin(5 * t) + 0.3 * np.cos(11 * t))
-    at = np.linspace(t[3], t[-4], 1000)
-    found = resample(samples, stamps(at), hold=hold, max_gap=0.02)
-    error = np.abs(found.values - np.sin(5 * at) - 0.3 * np.cos(11 * at)).max()
-    assert error <= 1.05 * found.error
-    assert found.error < 30 * error
-    on_samples = resample(samples, samples.stamp_ns, hold=hold, max_gap=0.02)
-    np.testing.assert_allclose(on_samples.values, samples.values, atol=1e-12)
-
-
-def test_resampling_refuses_gaps_and_times_outside() -> None:
-    samples = Samples("/x:y", stamps(np.array([0.0, 0.1, 0.9, 1.0])), np.arange(4.0))
-    with pytest.raises(DataError, match=r"a gap of 0\.8 s after 1700000000\.100000000 s"):
-        resample(samples, stamps(np.array([0.5])), hold=False, max_gap=0.2)
-    with pytest.raises(DataError, match="nothing recorded at 1700000002"):
-        resample(samples, stamps(np.array([2.0])), hold=False, max_gap=0.2)
-    with pytest.raises(DataError, match="a gap of 1 s"):
-        resample(samples, stamps(np.array([2.0])), hold=True, max_gap=0.2)
 
 
 def test_stamps_that_go_back_are_sorted_on_request(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from nlsid_core.proofs import check
 from tests.state_affine_rows import problem
 
 # (outputs, degree of G_0, degree of G_1 …), and inputs in [-range, range] beside data in [-1, 1]
-CASES = [(2, 0, 0, 1.0), (2, 1, 0, 6.0), (2, 1, 1, 2.0), (1, 1, 1, 3.0)]
+CASES = [(2, 0, 0, 1.0), (2, 1, 0, 6.0), (2, 1, 1, 2.0), (1, 1, 1, 3.0), (1, 2, 0, 2.0)]
 MARKED = [CASES[0], *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[1:])]
 
 

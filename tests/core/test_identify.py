@@ -50,6 +50,7 @@ def config(tmp_path: Path) -> Path:
     content = yaml.safe_load(config_file("f1tenth.yaml").read_text())
     del content["funnel"]
     content["identification"] = STATE_AFFINE
+    content["split"] = {"test": ["trial_05"]}
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(content))
     return path

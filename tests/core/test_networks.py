@@ -302,6 +302,10 @@ def test_a_hidden_start_is_found_from_the_first_samples() -> None:
     assert after[0] == pytest.approx(states[1], abs=1e-12)
     far = replace(model, start=np.full(2, 1e12))  # so large that differences do not move it
     assert np.isfinite(far.start_from(y[:12], u[:12])).all()
+    m = len(model.maps)
+    by_maps = replace(model, output=np.where(np.arange(model.output.shape[1]) < m, model.output, 0))
+    still = np.full((12, 1), 0.3)
+    assert np.isfinite(by_maps.start_from(still, u[:12])).all(), "nothing varies, no state is seen"
 
 
 def test_the_proof_of_a_cascade_holds_on_pairs_of_solutions() -> None:

@@ -1,7 +1,7 @@
 """State-affine models: documents, simulation and certified iterates."""
 
 import json
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import Degrees, Polynomial, prove_stability
-from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.certified import certified_simulation_error
 from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 from nlsid_core.models import StateAffineModel
@@ -76,15 +75,6 @@ def test_a_model_document_round_trips_exactly(model: StateAffineModel) -> None:
     np.testing.assert_array_equal(again.simulate(u), model.simulate(u))
 
 
-@pytest.mark.slow
-def test_certified_iterates_cost_little_and_never_go_up(stacked: StateAffineRows) -> None:
-    certified = [iterate.J for iterate in certified_simulation_error(stacked, iterations=6)]
-    free = [iterate.J for iterate in robust_simulation_error(stacked.rows, iterations=6)]
-    assert all(b <= a * (1 + 1e-5) for a, b in pairwise(certified))
-    assert free[-1] <= certified[-1] * (1 + 1e-5)
-    assert certified[-1] <= 1.2 * free[-1]
-
-
 def test_several_trajectories_simulate_as_each_alone(model: StateAffineModel) -> None:
     trials = [recording(seed=seed) for seed in range(3)]
     together = model.simulate(np.stack([t.u for t in trials]))
@@ -128,7 +118,7 @@ def test_certified_iterates_refuse_degrees_they_have_no_set_for() -> None:
     many = build_state_affine_rows(
         Dataset((recording(),)), Polynomial(12, degrees=Degrees(lagged=1))
     )
-    with pytest.raises(ShapeError, match=r"2\^13 corners .* fewer delays"):
+    with pytest.raises(ShapeError, match=r"8192 vertices .* fewer delays"):
         next(certified_simulation_error(many))
 
 

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_844,
-    ("bags",): 12_953,
-    ("nlsid_ros",): 2_664,
-    ("tests",): 24_621,
+    ("nlsid_core",): 19_699,
+    ("bags",): 12_641,
+    ("nlsid_ros",): 2_665,
+    ("tests",): 24_508,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8

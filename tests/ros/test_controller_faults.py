@@ -67,6 +67,7 @@ class Driven(Robot):
     def _begun(self, message: String) -> None:
         run = Run.from_document(files.parse_document(message.data))
         self.run = f"{run.funnel} {WAITING}" if run.ended else run.name
+        self.last_ns = run.last_ns
 
     def watch(self) -> None:
         """Stand in for the monitor that is required."""
@@ -129,6 +130,14 @@ def test_every_sample_has_its_command_even_if_stamps_lead_the_clock(
     heard = due[due.index(min(robot.commands)) :]  # from the first that was matched
     assert len(heard) >= 20
     robot.spin_until(lambda: set(heard) <= robot.commands.keys())
+
+
+def test_a_plan_that_is_over_has_sent_every_command_of_it(robot: Driven) -> None:
+    """The last response may be here before this node's clock shows that a command is due."""
+    robot.begins()
+    robot.feed(125, ahead=0.3)
+    robot.hears("idle; stopped: the plan is over", NAME)
+    robot.spin_until(lambda: robot.last_ns - PERIOD_NS // 4 in robot.commands)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from nlsid_core.arrays import FloatArray
 CENTRED = 1e-6  # Newton decrement of -log det: the barrier has no unit
 NEWTON_STEPS = 100
 QUADRATIC = 0.1  # decrement below which a full Newton step stays inside
-MU_FALL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,19 +76,6 @@ def centre(
                 return z
         z = z + length * step
     return z
-
-
-def minimise_linear(
-    objective: FloatArray, inequalities: Sequence[MatrixInequality], z: FloatArray, *, gap: float
-) -> FloatArray:
-    """Minimise objective'z to within `gap`, staying strictly inside, from z inside."""
-    size = sum(inequality.order for inequality in inequalities)
-    mu = max(abs(float(objective @ z)), gap) / size
-    while True:
-        z = centre(inequalities, z, objective=objective, mu=mu)
-        if mu * size <= gap:
-            return z
-        mu *= MU_FALL
 
 
 def traceless(n: int) -> FloatArray:

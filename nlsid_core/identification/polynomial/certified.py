@@ -1,7 +1,7 @@
 """Robust simulation error whose every iterate is stable for every input, and its exact proof.
 
 Every bound is minimised inside a convex set of stable models around the iterate before, which it
-contains strictly: `BoundedSet` for one output and constant lags, `MatrixSet` for others.
+contains strictly (`MatrixSet`).
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,6 @@ from nlsid_core.identification.methods.descent import Outputs, Step, descend
 from nlsid_core.identification.methods.newton import INEQUALITY_GAP, Point, minimise
 from nlsid_core.identification.methods.rse import Bound, affordable_steps
 from nlsid_core.identification.methods.simulation_error import SimulationError
-from nlsid_core.identification.polynomial.bounded_set import BoundedSet
 from nlsid_core.identification.polynomial.matrix_set import MatrixSet
 from nlsid_core.identification.polynomial.rows import StateAffineRows
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
@@ -36,7 +35,7 @@ class CertifiedIterate:
     """A minimiser with its bound J, and the set around it."""
 
     point: Point
-    inside: BoundedSet | MatrixSet
+    inside: MatrixSet
 
     @property
     def J(self) -> float:
@@ -54,7 +53,7 @@ def certified_simulation_error(
     Raises ShapeError for degrees that there is no such set for: 2 at most for G_0 of one output
     beside constant lagged coefficients, 1 for all others, in few inputs.
     """
-    inside = _set_of(problem).start(problem)
+    inside = MatrixSet.start(problem)
     theta, linearised = problem.rows.identity, None
     previous, steps, gap = np.inf, None, GAP
     affordable = affordable_steps(problem.rows)
@@ -121,7 +120,7 @@ class _Steps:
         return np.asarray(step.theta + v * (size / step.D))
 
 
-def _steps(error: SimulationError, inside: BoundedSet | MatrixSet, theta: FloatArray) -> _Steps:
+def _steps(error: SimulationError, inside: MatrixSet, theta: FloatArray) -> _Steps:
     """In units in which the matrices are I at θ, which is strictly inside."""
     z, blocks, cones = np.concatenate([theta, inside.extra]), [], []
     for part in inside.inequalities():
@@ -130,7 +129,8 @@ def _steps(error: SimulationError, inside: BoundedSet | MatrixSet, theta: FloatA
         W = np.linalg.inv(np.linalg.cholesky(part.at(z).reshape(-1, order, order)))
         F = W @ F @ W.transpose(0, 2, 1)
         blocks += [conic.svec(F[:, k]).T for k in range(F.shape[1])]
-        cones += [conic.Cone("psd", order)] * F.shape[1]
+        kind = [conic.Cone("psd", order)] * F.shape[1]
+        cones += kind if order > 1 else [conic.Cone("nonnegative", F.shape[1])]
     return _Steps(error, np.concatenate(blocks), tuple(cones))
 
 
@@ -143,7 +143,7 @@ def descend_certified(
     error on the problem's data is never above the model's. The set is renewed while that goes on
     lowering it; steps: in all sets, at most. Raises ShapeError as `certified_simulation_error`.
     """
-    inside = _set_of(problem).of_proof(problem, model, proof)
+    inside = MatrixSet.of_proof(problem, model, proof)
     error, best = SimulationError(problem.rows), model
     theta = _left_parameters(model)
     J = error.at(theta).J
@@ -161,12 +161,8 @@ def descend_certified(
         proved = prove_stability(lower)
         if proved is None:
             break
-        best, inside = lower, _set_of(problem).of_proof(problem, lower, proved)
+        best, inside = lower, MatrixSet.of_proof(problem, lower, proved)
     return best
-
-
-def _set_of(problem: StateAffineRows) -> type[BoundedSet] | type[MatrixSet]:
-    return BoundedSet if problem.is_bounded_by_leading else MatrixSet
 
 
 def _left_parameters(model: StateAffineModel) -> FloatArray:

@@ -15,8 +15,8 @@ from nlsid_core.options import (
 
 MOST_LAGS = 100
 HIGHEST_DEGREE = 5  # in the inputs; the number of terms grows with that power of the inputs
-CERTIFIABLE_DEGREE = 2  # of the newest output's coefficient: the S-procedure bounds a quadratic
-CERTIFIABLE_AFFINE = 1  # of every coefficient if the others depend on inputs too: corners decide
+CERTIFIABLE_DEGREE = 2  # of the newest output's coefficient: then two ends bound the hull
+CERTIFIABLE_AFFINE = 1  # of every coefficient if the others depend on inputs too
 
 Ranges = tuple[tuple[float, float], ...]
 StableSet = Literal["2.11", "2.13", "2.19", "3.8"]

@@ -21,12 +21,10 @@ from scipy.linalg import LinAlgError, block_diag, solve_discrete_lyapunov
 from nlsid_core import conic, files, kernel, proofs
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import CertificateRejected, SolverError
-from nlsid_core.identification.proofs.leading_bounds import leading_bounds
 from nlsid_core.kernel import increments
 from nlsid_core.kernel.files import parse
 from nlsid_core.kernel.increments import Box
 from nlsid_core.kernel.models import read_model
-from nlsid_core.models import StateAffineModel
 
 RATE_ROOM = 0.05  # of 1 - the fastest rate found, given up for a well conditioned P
 SLOWEST = 1e-8  # 1 - rate below which nothing is claimed
@@ -71,7 +69,6 @@ class Leaf:
 
     box: Box
     E: Matrices
-    ends: Json | None = None  # what the kernel takes E from, if not from the box alone
     N: FloatArray | None = None
     margin: float = -np.inf
 
@@ -118,8 +115,6 @@ def prove_stability(model: Any) -> StabilityProof | None:
         layer = _layers(search, root)
         if layer is not None and not search.form.E.ray and not form.E.box:
             return _by_weights(model, search, root, layer)
-        if isinstance(model, StateAffineModel) and _is_bounded(model):
-            return _decided(model, _by_programs(search, _between_ends(model, root)))
         return _decided(model, _by_programs(search, root))
     except (kernel.Rejected, LinAlgError, SolverError):
         return None
@@ -135,27 +130,6 @@ def storage_on(form: increments.Model) -> StabilityProof | None:
         return _by_programs(search, search.leaf(form.E.box))
     except (kernel.Rejected, LinAlgError, SolverError):
         return None
-
-
-def _is_bounded(model: StateAffineModel) -> bool:
-    """One output, a leading coefficient of degree 2 at most, constant factors of the lags."""
-    return (
-        len(model.y) == 1
-        and not any(g.exponents.any() for g in model.G[1:])
-        and bool((model.G[0].exponents.sum(axis=1) <= 2).all())
-    )
-
-
-def _between_ends(model: StateAffineModel, root: Leaf) -> Leaf:
-    """The leaf with the tightest bounds of G_0 as its vertices; itself if G_0 is not positive."""
-    found = leading_bounds(model)
-    if found is None:
-        return root
-    (low, high), (below, above) = found
-    lagged = [float(g.coefficients.sum()) for g in model.G[1:]]
-    ends = {"low": low, "high": high}
-    ends |= {"low_weights": below.tolist(), "high_weights": above.tolist()}
-    return Leaf(root.box, np.array([[[low, *lagged]], [[high, *lagged]]]), ends)
 
 
 def _decided(model: Any, found: StabilityProof | None) -> StabilityProof | None:
@@ -507,5 +481,5 @@ def _replaced(tree: Tree, changed: dict[int, Any]) -> Tree:
 def _written(tree: Tree) -> Json:
     if isinstance(tree, Leaf):
         assert tree.N is not None
-        return {"N": tree.N.tolist()} | ({} if tree.ends is None else {"ends": tree.ends})
+        return {"N": tree.N.tolist()}
     return {"split": tree.variable, "parts": [_written(part) for part in tree.parts]}

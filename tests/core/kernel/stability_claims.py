@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,15 +82,8 @@ def constant() -> StateAffineModel:
     return state_affine((CONSTANT, lead), (CONSTANT, lagged), outputs=2)
 
 
-def ends() -> StateAffineModel:
-    """G_0 = 0.35 - w + w² on a wide box: positive there, but not its Bernstein coefficients."""
-    return state_affine(
-        ([[0, 0], [1, 0], [2, 0]], [0.35, -1.0, 1.0]), (CONSTANT, [-0.05]), most=0.7
-    )
-
-
 def split() -> StateAffineModel:
-    """The same with a lagged coefficient that depends on the input: no bounds of G_0 will do."""
+    """G_0 = 0.35 - w + w² on a wide box: positive there, but not its Bernstein coefficients."""
     return state_affine(
         ([[0, 0], [1, 0], [2, 0]], [0.35, -1.0, 1.0]),
         ([[0, 0], [1, 0]], [-0.05, 0.01]),
@@ -142,7 +136,6 @@ MODELS: dict[str, Callable[[], Any]] = {
     "moving_lags": moving_lags,
     "two_outputs": two_outputs,
     "constant": constant,
-    "ends": ends,
     "split": split,
     "cascade": two_phases,
     "network": network,
@@ -153,6 +146,10 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 @cache
 def _written(name: str) -> str:
+    if name == "ends":  # which the kernel decides, and no search makes
+        folder = Path(__file__).parent / "corpus" / "stability" / name
+        parts = [(folder / file).read_text() for file in ("model.json", "claim.proof.json")]
+        return json.dumps([json.loads(part) for part in parts])
     model = MODELS[name]()
     proof = prove_stability(model)
     assert proof is not None, name

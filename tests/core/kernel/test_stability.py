@@ -344,7 +344,7 @@ def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str,
         proofs.check(path)
 
 
-@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split", "ends"}))
+@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split"}))
 def test_a_proof_that_is_written_by_the_prover_is_the_same_every_time(name: str) -> None:
     model = MODELS[name]()
     first, second = (prove_stability(model) for _ in range(2))
