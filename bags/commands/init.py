@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import takewhile
 from pathlib import Path
 
 import typer
@@ -121,18 +120,13 @@ def _settle(console: Console, proposal: Proposal) -> None:
 
 
 def said_briefly(bags: Sequence[Path]) -> str:
-    """The bags in a command: by name if they are few, else their folder or a pattern, else MANY."""
+    """The bags in a command: by name if they are few, else their folder, else MANY."""
     if len(bags) <= NAMED:
         return " ".join(shlex.quote(str(bag)) for bag in bags)
-    folder, meant = bags[0].parent, set(expand_bags(bags))
-    letters = takewhile(
-        lambda column: len(set(column)) == 1, zip(*(b.name for b in bags), strict=False)
-    )
-    begin = f"{folder}/{''.join(column[0] for column in letters)}"
-    for given, star in ((str(folder), ""), (begin, "*")):
-        with suppress(BagError):
-            if set(expand_bags([Path(f"{given}{star}")])) == meant:
-                return f"{shlex.quote(given)}{star}"
+    folder = bags[0].parent
+    with suppress(BagError):
+        if set(expand_bags([folder])) == set(expand_bags(bags)):
+            return shlex.quote(str(folder))
     return MANY
 
 

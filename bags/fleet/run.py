@@ -118,28 +118,29 @@ def _asked(
                 if next(reversed(running)).done():
                     break  # in this process: said at once
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            broken = False
+            died = []
             for future in done:
                 name = running.pop(future)
                 error = _error(future)
                 if error is None:
                     yield future.result()
-                elif not isinstance(error, BrokenExecutor):
-                    yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
+                elif isinstance(error, BrokenExecutor):
+                    died.append(name)
                 else:
-                    broken = True
-                    deaths[name] += 1
-                    if deaths[name] < DEATHS:
-                        suspects.append(name)
-                    else:
-                        yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
-            if broken:
-                suspects.extend(running.values())
-                for name in running.values():
-                    deaths[name] += 1
-                running.clear()
-                workers.close(executor)
-                executor = workers.open()
+                    yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
+            if not died:
+                continue
+
+            died += running.values()
+            running.clear()
+            workers.close(executor)
+            executor = workers.open()
+            for name in died:
+                deaths[name] += 1
+                if deaths[name] < DEATHS:
+                    suspects.append(name)
+                else:
+                    yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
     finally:
         workers.close(executor)
 

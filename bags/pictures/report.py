@@ -107,6 +107,7 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     listed = "".join(_recordings(data, use) for use, data in parts.items())
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
     methods = tables.methods_table(fit, test, columns)
+    left_out = f" and the first {chosen.transient}" if chosen.transient else ""
     calibrated = ", calibration trials for neither: they scale the tube"
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
@@ -118,7 +119,7 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 <h2>How well it simulates</h2>
 {tables.html(lambda console: console.print(methods))}
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
-simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
+simulation starts from{left_out}, ŷ simulated with the recorded input.
 Trials: {counts}; test trials were only used
 for this table and the pictures below{calibrated if "calibration" in parts else ""}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
@@ -184,10 +185,6 @@ def _equation(m: Model) -> str:
     if isinstance(m, ImplicitModel):
         return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
     return f"y = G₂ f(G₁ u): {m}; {signals}"
-
-
-def _left_out(chosen: Candidate[Model]) -> str:
-    return f" and the first {chosen.transient}" if chosen.transient else ""
 
 
 def _residuals(chosen: Candidate[Model], test: Dataset) -> str:
