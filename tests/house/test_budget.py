@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_699,
-    ("bags",): 12_138,
+    ("bags",): 12_129,
     ("nlsid_ros",): 2_665,
-    ("tests",): 24_261,
+    ("tests",): 24_254,
     ("benchmarks", "examples"): 3_819,
 }
 ARGUMENTS, FIELDS = 6, 8
