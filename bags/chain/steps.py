@@ -290,12 +290,12 @@ def absent_from(names: Sequence[str], config: Config) -> list[str]:
 
 
 def refuse_absent(names: Sequence[str], config: Config) -> None:
-    """Raise DataError for the first name in the split that none of the trials has.
+    """Raise DataError for names in the split that none of the trials has.
 
-    Its trial would be trained on without a word.
+    Their trials would be trained on without a word.
     """
     if absent := absent_from(names, config):
-        raise DataError(absent[0])
+        raise DataError("; ".join(absent))
 
 
 def with_parts(names: Sequence[str], config: Config) -> list[str]:

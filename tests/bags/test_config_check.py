@@ -74,10 +74,10 @@ def test_a_plan_that_no_controller_could_drive_is_refused(
 
 def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(tmp_path: Path) -> None:
     path = edited(tmp_path / "a.yaml", split=None)
-    assert "split: nothing to score on" in check(path, *f1tenth(), status=1)
+    assert "none of the bags is a test trial" in check(path, *f1tenth(), status=1)
     path = edited(tmp_path / "b.yaml", split={"test": ["trial_05"]})
     only = [bag for bag in f1tenth() if bag.name == "trial_05"]
-    assert "split.test: names every bag" in check(path, *only, status=1)
+    assert "all of the bags are test trials" in check(path, *only, status=1)
 
 
 def test_wrong_keys_end_with_status_1(tmp_path: Path) -> None:
