@@ -19,7 +19,7 @@ from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.names import did_you_mean, listed
-from bags.signals.grid import filled_samples, read_dataset, said_restarts, skipped_samples
+from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials, check_apart
@@ -398,14 +398,6 @@ def what_a_funnel_catches(
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
     )
-
-
-def what_a_monitor_would_not_judge(
-    model_path: Path, config: Config, design: OutputTubeDesign
-) -> list[str]:
-    """The test trials beside a model that a monitor of it would not judge as one run, and why."""
-    _, test = _trials_beside(model_path, config, design.model)
-    return [] if test is None else said_restarts(test)
 
 
 def _trials_beside(

@@ -106,11 +106,7 @@ def _proof_in(path: Path) -> Path:
 
 def tube(folder: Path, settings: Config) -> None:
     """Design a tube around the model in a folder, and what it catches."""
-    from bags.chain.steps import (
-        design_funnel_files,
-        what_a_funnel_catches,
-        what_a_monitor_would_not_judge,
-    )
+    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
     from bags.pictures import tables
@@ -130,8 +126,6 @@ def tube(folder: Path, settings: Config) -> None:
     else:
         tables.say_catching(out, catching)
         written += write_catching(folder, catching)
-    for line in what_a_monitor_would_not_judge(model, settings, design):
-        tables.warn(out, line)
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bags.signals.grid import said_restarts
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.designs import AnyDesign
@@ -217,7 +218,8 @@ class Catching:
 
     trials: how many were held back. shares: of each calibration trial, the part of what the funnel
     assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
-    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p).
+    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p). restarts: which
+    of them a monitor would not judge as one run, and why.
     """
 
     widths: tuple[Width, ...]
@@ -227,6 +229,7 @@ class Catching:
     shares: tuple[tuple[str, float], ...]
     errors: tuple[tuple[FloatArray, FloatArray], ...]
     half_widths: tuple[FloatArray, ...]
+    restarts: tuple[str, ...] = ()
 
     @property
     def beyond(self) -> list[str]:
@@ -381,6 +384,7 @@ def what_it_catches(
         tuple(sorted(shares.items(), key=lambda entry: -entry[1])),
         tuple((run.t, run.residuals.error) for run in clean),
         tuple(run.widths for run in clean),
+        tuple(said_restarts(held_back)),
     )
 
 
