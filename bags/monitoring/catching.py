@@ -218,8 +218,8 @@ class Catching:
 
     trials: how many were held back. shares: of each calibration trial, the part of what the funnel
     assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
-    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p). restarts: which
-    of them a monitor would not judge as one run, and why.
+    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p).
+    restarts: which of them a monitor would not judge as one run, and why.
     """
 
     widths: tuple[Width, ...]
