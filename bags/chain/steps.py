@@ -246,10 +246,10 @@ def split(dataset: Dataset, named: SplitConfig) -> Trials:
         test = dataset.select(chosen["test"])
     else:
         train, test = _cut(train, named.share)
-    others = {
-        use: dataset.select(chosen[use]) for use in ("validation", "calibration") if chosen[use]
-    }
-    return Trials(train, test, **others)
+    validation, calibration = (
+        dataset.select(chosen[use]) if chosen[use] else None for use in USES[1:]
+    )
+    return Trials(train, test, validation, calibration)
 
 
 def _cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:
