@@ -14,12 +14,7 @@ from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
-from nlsid_core.models import (
-    DifferenceEquation,
-    ImplicitModel,
-    MonotoneEquation,
-    StateAffineModel,
-)
+from nlsid_core.models import StateAffineModel
 
 MODEL_BEGINS, MODEL_ENDS = "<!-- model begins -->", "<!-- model ends -->"
 FUNNEL_BEGINS, FUNNEL_ENDS = "<!-- funnel begins -->", "<!-- funnel ends -->"
@@ -114,7 +109,7 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 <style>{STYLE}</style>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <h1>{escape(robot)}: identified model</h1>
-{MODEL_BEGINS}<p>{escape(_equation(chosen.model))}</p>
+{MODEL_BEGINS}<p>{escape(_about(chosen.model))}</p>
 {_stability(chosen)}
 <h2>How well it simulates</h2>
 {tables.html(lambda console: console.print(methods))}
@@ -159,32 +154,13 @@ def _stability(chosen: Candidate[Model]) -> str:
     )
 
 
-def _equation(m: Model) -> str:
+def _about(model: Model) -> str:
+    """What it is, and of which signals."""
     outputs, inputs = (
         ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
-        for part in (m.y, m.u)
+        for part in (model.y, model.u)
     )
-    signals = f"y = {outputs}, u = {inputs}, one sample = {m.period:g} s"
-    if isinstance(m, DifferenceEquation):
-        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
-        drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
-        return f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, {signals}"
-    if isinstance(m, StateAffineModel):
-        terms = sum(len(g.exponents) for g in m.G) + len(m.p.exponents)
-        return (
-            f"0 = sum G_k(w) y(t-k) + p(w), {len(m)} lags, {terms} terms in w = the last "
-            f"{len(m.window)} inputs; {signals}"
-        )
-    if isinstance(m, MonotoneEquation):
-        e = " ".join(f"{c:+.4g} y{power}" for c, power in zip(m.e, ("", "²", "³"), strict=True))
-        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
-        return (
-            f"{e.removeprefix('+')} = {m.c:+.4g} {past} + {len(m.window)} inputs (y, u minus their "
-            f"offsets); {signals}"
-        )
-    if isinstance(m, ImplicitModel):
-        return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
-    return f"y = G₂ f(G₁ u): {m}; {signals}"
+    return f"{model}; y = {outputs}, u = {inputs}"
 
 
 def _residuals(chosen: Candidate[Model], test: Dataset) -> str:

@@ -355,7 +355,7 @@ def test_bags_that_cannot_be_split_as_they_are_named_are_refused(
     named: dict[str, str], reason: str
 ) -> None:
     with pytest.raises(DataError, match=reason):
-        split(four_trials(), SplitConfig(**{use: tuple(n.split()) for use, n in named.items()}))
+        split(four_trials(), SplitConfig.model_validate({u: n.split() for u, n in named.items()}))
 
 
 def four_trials() -> Dataset:

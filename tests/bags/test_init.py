@@ -585,11 +585,11 @@ def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
-def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
-    """A real pseudo-terminal: the second command, then what follows it best."""
+def test_on_a_terminal_the_likeliest_signals_are_asked_about(tmp_path: Path) -> None:
+    """A real pseudo-terminal: what the speed command drives, and yes."""
     keyboard, terminal = os.openpty()
-    command = [sys.executable, "-m", "bags.commands.cli", "init", str(tmp_path)]
-    os.write(keyboard, b"99\n2\n\n")
+    command = [sys.executable, "-m", "bags.commands.cli", "init", str(tmp_path), "-u", CMD]
+    os.write(keyboard, b"y\n")
     done = subprocess.run(
         [*command, *map(str, f1tenth()[:6])],
         stdin=terminal,
@@ -601,8 +601,8 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
     os.close(terminal)
     os.close(keyboard)
     assert done.returncode == 0, done.stderr
-    assert "What drives the robot?" in done.stdout
-    assert "1 to " in done.stdout
+    assert f"{CMD} drives and {SPEED} answers?" in done.stdout
+    assert "/steering_command:position[name=steering] drives " in done.stdout
     settings = load_config(tmp_path / "robot.yaml")
     assert settings.signals.excitation[0].path == CMD
     assert settings.signals.response[0].path == SPEED
