@@ -24,9 +24,11 @@ from benchmarks.recorded import is_proved
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.identification import Model, Polynomial, simulation_percent
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.moment_rie import minimise_moment_rie
+from nlsid_core.identification.polynomial.moment_rie import (
+    identify_from_repeats,
+    minimise_moment_rie,
+)
 from nlsid_core.identification.polynomial.moments import offsets_of, plain_moments
-from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.repeats import compare_repeats
 from nlsid_core.progress import silent
@@ -90,7 +92,7 @@ def bias_removed(train: Dataset, test: Dataset, lags: int) -> dict[str, float | 
     unbiased = identify_from_repeats(repeated, model_class, accept_untested_repeats=True)
     offsets = offsets_of(repeated.trajectories)
     plain = plain_moments(repeated.trajectories, model_class, offsets)
-    naive = minimise_moment_rie(plain, model_class, repeated.trajectories[0], offsets)
+    naive = minimise_moment_rie(plain, model_class, repeated, offsets)
     pairs = [compare_repeats(*pair) for group in groups for pair in combinations(group, 2)]
     return {
         "rie_moments": simulation_percent(unbiased.model, test),

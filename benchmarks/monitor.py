@@ -49,20 +49,17 @@ from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.designs import Design
 from nlsid_core.identification import Polynomial, identify
 from nlsid_core.models import DifferenceEquation, Signal
-from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 
-LAGS, FUNNELS, ROUNDS = 6, 10, 40
+LAGS, ROUNDS = 6, 40
 SOURCE, MARGIN, ECHO = "/benchmark", "/funnel_monitor/margin", "/benchmark/echo"
 STATE, COMMAND = "/benchmark/state:position[0]", "/benchmark/command:position[0]"
 OUTSIDE, OUT = 100.0, 100  # a response no funnel holds, and how many of them end a run
 ASKED = {
     "update_us_p50": 20.0,
     "update_us_p99": 50.0,
-    "update10_us_p50": 20.0,
-    "update10_us_p99": 50.0,
     "missed": 0.0,
     "latency_ms_p99": 1.0,
     "error_ms": 5.0,
@@ -71,33 +68,21 @@ ASKED = {
 
 
 def updates() -> dict[str, float]:
-    """Microseconds per update on F1TENTH trials, n = 6, for one funnel and for ten."""
+    """Microseconds per update on F1TENTH trials, n = 6."""
     speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
     data = read_dataset(f1tenth(), responses=[speed], excitations=[command], grid=Grid(max_gap=0.1))
     model = identify(data, Polynomial(LAGS)).model
-    designs = [
-        design_output_tube(
-            OutputTube(model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5 + 0.1 * i)
-        )
-        for i in range(FUNNELS)
-    ]
-    result = {}
-    for label, count in (("update", 1), ("update10", FUNNELS)):
-        bank = Monitor.of_several(model, [(d.policy, d.funnel) for d in designs[:count]])
-        times = []
-        for trial in data.trajectories[:ROUNDS]:
-            bank.restart()
-            rows = zip(
-                trial.t.tolist(), trial.y[:, 0].tolist(), trial.u[:, 0].tolist(), strict=True
-            )
-            for k, (t, y, u) in enumerate(rows):
-                started = time.perf_counter_ns()
-                bank.readings(t, y, u)
-                if k >= LAGS:
-                    times.append(time.perf_counter_ns() - started)
-        for percent in (50, 99):
-            result[f"{label}_us_p{percent}"] = float(np.percentile(times, percent)) / 1e3
-    return result
+    problem = OutputTube(model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5)
+    monitor, times = design_output_tube(problem).monitor(), []
+    for trial in data.trajectories[:ROUNDS]:
+        monitor.restart()
+        rows = zip(trial.t.tolist(), trial.y[:, 0].tolist(), trial.u[:, 0].tolist(), strict=True)
+        for k, (t, y, u) in enumerate(rows):
+            started = time.perf_counter_ns()
+            monitor.update(t, y, u)
+            if k >= LAGS:
+                times.append(time.perf_counter_ns() - started)
+    return {f"update_us_p{p}": float(np.percentile(times, p)) / 1e3 for p in (50, 99)}
 
 
 def timing_funnel(rate: int) -> OutputTubeDesign:

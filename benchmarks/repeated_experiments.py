@@ -13,7 +13,6 @@ Published: Tables 3.1 and 3.2; from the printed system they do not come out.
 import math
 import statistics
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,19 +20,21 @@ import numpy as np
 from benchmarks.machine import parser, tell
 from benchmarks.recorded import proved as is_proved
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Degrees, Polynomial
+from nlsid_core.identification.polynomial.implicit_descent import minimise_equation
+from nlsid_core.identification.polynomial.implicit_rie import (
+    least_squares_coefficients,
+)
+from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
 from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
 from nlsid_core.identification.polynomial.moments import Offsets, plain_moments, repeated_moments
-from nlsid_core.identification.polynomial.monotone import (
-    least_squares_equation,
-    minimise_monotone_simulation_error,
-    simulate_banded,
-)
+from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.models import MonotoneEquation, Signal
 
 ORDERS, LENGTHS, TEST = (1, 8, 15, 22), (500, 5_000, 50_000), 50_000
 NOISE = 0.05
+STEPS = 100  # of simulation error minimisation
 OFFSETS = Offsets(0.0, np.zeros(1))
 METHODS = (
     "proposed",
@@ -98,44 +99,30 @@ def identify(runs: list[Trajectory], n: int) -> tuple[MomentFit, float]:
     started = time.process_time()
     model_class = Polynomial(n, (0,), Degrees(left=3), set="3.8")
     moments = repeated_moments([runs], model_class, OFFSETS)
-    fit = minimise_moment_rie(moments, model_class, runs[0], OFFSETS)
+    fit = minimise_moment_rie(moments, model_class, Dataset(tuple(runs)), OFFSETS)
     return fit, time.process_time() - started
 
 
-def models(
-    runs: list[Trajectory], clean: list[Trajectory], n: int, proposed: MonotoneEquation
-) -> dict[str, MonotoneEquation]:
-    """What the comparators find; SEM may start from the proposed model too."""
-    model_class = Polynomial(n, (0,), Degrees(left=3), set="3.8")
+def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str, MonotoneEquation]:
+    """What the comparators find."""
+    model_class, data = Polynomial(n, (0,), Degrees(left=3), set="3.8"), Dataset(tuple(runs))
     plain = plain_moments(runs, model_class, OFFSETS)
     exact = plain_moments(clean, model_class, OFFSETS)
-    squares = least_squares_equation(plain, model_class, runs[0], OFFSETS)
-    zero = replace(
-        squares, e=np.array([1.0, 0.0, 1.0]), a=0.0 * squares.a, b=0.0 * squares.b, c=0.0
-    )
+    rows = build_implicit_rows(data, model_class)
+    e, f = squares = least_squares_coefficients(rows)
+    starts = {"zero": (np.array([[1.0], [0.0], [1.0]]), 0.0 * f), "least_squares": squares}
     minima = {
-        name: minimise_monotone_simulation_error(start, runs)
-        for name, start in (("zero", zero), ("least_squares", squares), ("proposed", proposed))
+        f"sem_{name}": found
+        for name, start in starts.items()
+        if (found := minimise_equation(rows, start, steps=STEPS)) is not None
     }
     return {
-        "least_squares": squares,
-        "sem": min(minima.values(), key=lambda model: training_error(model, runs)),
-        "sem_zero": minima["zero"],
-        "sem_least_squares": minima["least_squares"],
-        "naive": minimise_moment_rie(plain, model_class, runs[0], OFFSETS).model,
-        "noiseless": minimise_moment_rie(exact, model_class, runs[0], OFFSETS).model,
+        "least_squares": rows.equation(e, f),
+        "sem": min(minima.values(), key=lambda model: simulation_percent(model, data)),
+        **minima,
+        "naive": minimise_moment_rie(plain, model_class, data, OFFSETS).model,
+        "noiseless": minimise_moment_rie(exact, model_class, data, OFFSETS).model,
     }
-
-
-def training_error(model: MonotoneEquation, runs: list[Trajectory]) -> float:
-    """Sum of squares on the runs; infinite where the model cannot be simulated."""
-    total = 0.0
-    for run in runs:
-        simulated = simulate_banded(model, run)
-        if simulated is None:
-            return float("inf")
-        total += float(np.sum((simulated - run.y[:, 0]) ** 2))
-    return total
 
 
 def measure(trials: int, seconds_left: float = math.inf) -> dict[str, Any]:
@@ -170,7 +157,7 @@ def measure(trials: int, seconds_left: float = math.inf) -> dict[str, Any]:
                 proved.setdefault((n, T), []).append(is_proved(fit.model, fit.proof))
                 score(n, T, "proposed", fit.model)
                 if max(LENGTHS) == T:
-                    for method, model in models(runs, exact, n, fit.model).items():
+                    for method, model in models(runs, exact, n).items():
                         score(n, T, method, model)
         print(f"trial {trial + 1} of {trials}", flush=True)
     found: dict[str, Any] = {"trials": trials}

@@ -43,6 +43,7 @@ from nlsid_core.identification import Degrees, FilterMapFilter, Network, Polynom
 from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 
 FACTOR = 1.5
 CHECKS = 5  # repetitions; the median is reported
@@ -251,7 +252,7 @@ def measure(case: Case) -> dict[str, float | int]:
     keys["follows"] = int(fading.follows is not None)
     settling = made.funnel.settling
     lasting = replace(made.funnel, tubes=(fading,))
-    monitor = Monitor(model, None, lasting)
+    monitor = Monitor([Stage(model, None, lasting)])
     outside, busy = 0, float("inf")
     for trial in case.judged:
         monitor.restart()
@@ -297,7 +298,7 @@ def lasting(samples: int) -> dict[str, float]:
     case = f1tenth_case(Polynomial(4))
     model = identify(case.train, case.model_class).model
     made = design_output_tube(OutputTube(model, case.train, case.calibration))
-    monitor, k = Monitor(model, None, made.funnel), 0
+    monitor, k = Monitor([Stage(model, None, made.funnel)]), 0
     tenths: list[list[float]] = [[] for _ in range(10)]
     grown = [0.0] * 10
     while k < samples:

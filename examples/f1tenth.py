@@ -1,7 +1,7 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
 from bags.samples import f1tenth
-from nlsid import Grid, Monitor, OutputTube, Polynomial, Status, design, identify, read_bags
+from nlsid import Grid, OutputTube, Polynomial, Status, design, identify, read_bags
 from nlsid_core.identification import simulation_percent
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
@@ -18,7 +18,7 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
 
     inside = 0
     for trial in test:
-        monitor = Monitor(tube.model, tube.policy, tube.funnel)
+        monitor = tube.monitor()
         samples = zip(trial.t, trial.y[:, 0], trial.u[:, 0], strict=False)
         readings = [monitor.update(t, y, u) for t, y, u in samples]
         inside += all(r.status in (Status.INSIDE, Status.UNKNOWN) for r in readings)

@@ -1,7 +1,7 @@
 """`Design`: what a robot runs and is held against, and what is proved of it: one folder."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -22,6 +22,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.stage import Stage
 
 # The files in a design's folder; a claim calls each by its name without the ending.
 MODEL = "model.json"
@@ -173,10 +174,11 @@ class Design(Generic[D, P, F, S]):
         return self.wired.period if isinstance(self.model, VectorField) else self.model.period
 
     @property
-    def held(self) -> Held:
-        """How the proof lets the policy be applied."""
-        is_continuous = isinstance(self.funnel, ContinuousFunnel)
-        return Held.of_claim(self.claim) if is_continuous else Held()
+    def held(self) -> Held | None:
+        """How a policy of equations is applied; None where the model says it."""
+        if not isinstance(self.model, VectorField):
+            return None
+        return Held.of_claim(self.claim, self.period)
 
     @property
     def has_plan(self) -> bool:
@@ -210,36 +212,22 @@ class Design(Generic[D, P, F, S]):
             for digest in trained | calibrated
         }
 
-    def monitor(self, centre: Centre) -> Monitor:
+    def monitor(self, centre: Centre = Centre.COMMAND) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
         if self.funnel is None:
             raise DocumentError("nothing is proved of this policy: no funnel to hold a robot to")
-        stages: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
-        if self.parts:
-            held = [stage.held for stage in self.stages]
-            return Monitor.of_stages(stages, period=self.period, held=held)
-        return Monitor(*stages[0], centre=centre, period=self._pace, held=self.held)
+        return Monitor(self._held_stages, centre=centre)
 
     def controller(self, limits: Limits, settling: float) -> Controller:
         """A controller for one run; `settling`: s to wait for a state where it may start."""
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
-        if self.funnel is None:
-            return Controller.unproved(self.model, self.policy, limits=limits, period=self._pace)
-        stages: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
-        held = self.stages[0].held
-        if self.parts:
-            return Controller.of_stages(
-                stages, limits=limits, settling=settling, period=self.period, held=held
-            )
-        return Controller(
-            *stages[0], limits=limits, settling=settling, period=self._pace, held=held
-        )
+        return Controller(self._held_stages, limits, settling)
 
     @property
-    def _pace(self) -> float | None:
-        """The period that only somebody's wiring says; None where the model says it."""
-        return self.period if isinstance(self.model, VectorField) else None
+    def _held_stages(self) -> list[Stage]:
+        stages = [replace(stage, wiring=self.wiring) for stage in self.stages]
+        return [Stage(s.model, s.policy, s.funnel, s.held) for s in stages]
 
 
 AnyDesign: TypeAlias = Design[Any, Any, Any, Any]

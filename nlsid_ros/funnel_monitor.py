@@ -70,7 +70,7 @@ class FunnelMonitor(ManagedNode):
         Parameter(
             "nominal",
             Centre.COMMAND.value,
-            "what the tube is around: command, motion (command, begun in motion) or profile",
+            "what the tube is around: command or profile",
         ),
         Parameter(
             "stale_after",
@@ -116,7 +116,7 @@ class FunnelMonitor(ManagedNode):
         """Refuse what makes no sense."""
         nominal = self.values.nominal
         if nominal not in [centre.value for centre in Centre]:
-            raise DataError(f"nominal is '{nominal}'; it should be command, motion or profile")
+            raise DataError(f"nominal is '{nominal}'; it should be command or profile")
         wiring_of(self.values)
         expected_of(self.values)
         self._watch: Watch | None = None

@@ -214,10 +214,10 @@ class MonitorConfig(Section):
     """What the monitor compares with, and how long it waits."""
 
     nominal: Annotated[
-        Literal["command", "motion", "profile"],
+        Literal["command", "profile"],
         Key(
-            "what the tube is around: the model driven by the received commands, the same where "
-            "runs begin in motion, or the policy's plan",
+            "what the tube is around: the model driven by the received commands, or the policy's "
+            "plan",
             example="command",
         ),
     ] = "command"

@@ -29,7 +29,7 @@ from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
-from nlsid_core.running.monitor import refuse_mismatch
+from nlsid_core.running.stage import Stage
 
 FORMAT: Final = "nlsid/bundle"
 PROOF: Final = "proof"  # the role of the file that names the others
@@ -218,10 +218,10 @@ def _design(
     policies, models = KINDS.get(type(funnel), ((), ()))
     if nouns or type(policy) not in policies or type(model) not in models:
         raise DocumentError(f"{', '.join(parts)}: these files are no design of one funnel")
-    refuse_mismatch(model, policy, funnel)
+    Stage(model, policy, funnel).refuse_mismatch()
     design = Design(model, policy, funnel, proof, decision, None, wiring)
     if wiring is not None:
-        design.held.refuse(wiring.period)
+        _ = design.held  # which refuses samples that come too slowly for it
     if wrong := of_funnel(model.document(), funnel.document()).wrong:
         raise CertificateRejected(f"what was measured contradicts the design: {'; '.join(wrong)}")
     return design

@@ -10,7 +10,7 @@ from nlsid_core.documents import load as load_noun
 from nlsid_core.errors import DocumentError
 from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.running.monitor import refuse_mismatch
+from nlsid_core.running.stage import Stage
 
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
@@ -56,7 +56,7 @@ def load_unproved(folder: Path | str, *, wiring: Wiring | None = None) -> AnyDes
     policy: Any = load_noun(folder / POLICY)
     is_continuous = isinstance(policy, ContinuousPolicy)
     model: Any = load_noun(folder / (VECTOR_FIELD if is_continuous else MODEL))
-    refuse_mismatch(model, policy, None)
+    Stage(model, policy, None).refuse_mismatch()
     return Design(model, policy, None, wiring=wiring)
 
 

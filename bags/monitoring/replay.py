@@ -130,13 +130,13 @@ class Replay:
     @property
     def span(self) -> float:
         """S of the run, from the first sample after those that start it to the last."""
-        stamps = [r.t for r in self.readings if not r.starts]
+        stamps = [r.t for r in self.readings if not r.waits]
         return stamps[-1] - stamps[0] + self.period if stamps else 0.0
 
     @property
     def starting(self) -> int:
         """Of how many samples the run's start is made."""
-        return sum(1 for _ in takewhile(lambda reading: reading.starts, self.readings))
+        return sum(1 for _ in takewhile(lambda reading: reading.waits, self.readings))
 
     @property
     def judged_span(self) -> float:
@@ -163,7 +163,7 @@ class Replay:
     @property
     def said_filled(self) -> str:
         """The same in words, of how many; empty if there is none."""
-        count = sum(not reading.starts for reading in self.readings)
+        count = sum(not reading.waits for reading in self.readings)
         return said_filled(self.filled, count)
 
     @property
@@ -220,14 +220,14 @@ class Replay:
         for reading in self.readings:
             if reading.reason == LOST:
                 continue  # the next one that came says how many
-            starts = before is not None and before.starts and reading.starts
+            starts = before is not None and before.waits and reading.waits
             if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
                 if lost > 0:
                     said = "1 sample is" if lost == 1 else f"{lost} samples are"
                     first, last = before.t + self.period, before.t + lost * self.period
                     yield Stretch(first, last, lost, (f"{said} missing",)), True
-            why = () if reading.starts else (reading.reason,)
+            why = () if reading.waits else (reading.reason,)
             unknown = reading.status is Status.UNKNOWN
             yield Stretch(reading.t, reading.t, 1, why) if unknown else None, _unjudged(reading)
             before = reading
@@ -292,7 +292,7 @@ def _filled(reading: Reading) -> bool:
 
 
 def _unjudged(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
+    return reading.status is Status.UNKNOWN and not reading.waits and not _filled(reading)
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,11 @@ from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.regressors import lagged, signal_scale
-from nlsid_core.models import MonotoneEquation, StateAffineModel
+from nlsid_core.models import StateAffineModel
 
 SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
 LINEAR_ITERATES = 10  # of the robust simulation error, for the linear model of other classes
 LONGER = 4  # times the lags, of the model that is reduced
-BEND = 1e-3  # the cubic part, at one spread, of the equation that a linear model begins as
 WELL_CONDITIONED = 1e8  # G_0 of a model that determines its outputs
 LONGEST_RESPONSE = 400  # samples of its impulse response
 SHOWN = 1e-8  # relative singular value of a state that the impulse response shows
@@ -183,27 +182,6 @@ def linear_start(
     model = problem.model(last.theta, last.p)
     assert isinstance(model, StateAffineModel), "delays are given"
     return model if np.linalg.cond(model.G[0].coefficients[0]) < WELL_CONDITIONED else None
-
-
-def as_monotone(model: StateAffineModel, model_class: Polynomial) -> MonotoneEquation:
-    """The linear model of one output as an equation of the class."""
-    first = float(model.G[0].coefficients.ravel()[0])
-    p = _by_monomial(model)
-    degree, scale = len(model.window), float(model.y_scale[0])
-    units = np.eye(degree, dtype=np.int64)
-    b = [-p.get(tuple(unit), np.zeros(1))[0] / first * scale for unit in units.tolist()]
-    return MonotoneEquation(
-        e=np.array([1.0, 0.0, BEND / scale**2 if model_class.degrees.left == 3 else 0.0]),
-        a=np.array([-float(g.coefficients.ravel()[0]) / first for g in model.G[1:]]),
-        b=np.array(b) / model.u_scale[[i for i, _ in model.window]],
-        c=float(-p.get((0,) * degree, np.zeros(1))[0] / first * scale),
-        window=model_class.window(len(model.u)),
-        y_offset=float(model.y_offset[0]),
-        u_offset=model.u_offset,
-        period=model.period,
-        y=model.y[0],
-        u=model.u,
-    )
 
 
 def as_implicit(model: StateAffineModel, rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:

@@ -15,19 +15,16 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.funnels.protocol import AnyFunnel
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.policies.protocol import AnyPolicy
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
-from nlsid_core.running.held import Held
-from nlsid_core.running.monitor import Dynamics, refuse_mismatch
 from nlsid_core.running.observer import (
     MeasuredStateObserver,
     Observer,
     PredictingObserver,
     StateObserver,
 )
+from nlsid_core.running.stage import Stage
 
 Input = TypeVar("Input", float, FloatArray)
 
@@ -95,85 +92,35 @@ class Controller:
     input, not quite a period where the input is that of the next sample, so that a sample off the
     grid still finds it in force.
 
-    model, policy, funnel, period, held: as for `Monitor`. Raises CertificateMismatch if the parts
-    do not belong together, DataError if the limits cut off an input of the plan, or if the hold
-    that is proved is too short for the period.
+    stages: of a composition one after another, `stage` is which; see `Monitor`. Without a funnel
+    nothing is proved of the policy: it runs from any state, to be commissioned. Raises
+    CertificateMismatch if the parts do not belong together, DataError if the limits cut off an
+    input of the plan.
     """
 
-    def __init__(
-        self,
-        model: Dynamics,
-        policy: AnyPolicy,
-        funnel: AnyFunnel,
-        *,
-        limits: Limits,
-        settling: float,
-        period: float | None = None,
-        held: Held | None = None,
-    ) -> None:
-        self._follow([(model, policy, funnel)], limits, settling, period, held)
-
-    @classmethod
-    def of_stages(
-        cls,
-        stages: Sequence[tuple[Dynamics, AnyPolicy, AnyFunnel]],
-        *,
-        limits: Limits,
-        settling: float,
-        period: float,
-        held: Held,
-    ) -> "Controller":
-        """The policies of a composition, one stage after another; `stage` is which.
-
-        held: of the first stage, its errors. None has a hold: what is held into the next stage is
-        covered by no proof.
-        """
-        controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period, held)
-        return controller
-
-    @classmethod
-    def unproved(
-        cls, model: Dynamics, policy: AnyPolicy, *, limits: Limits, period: float | None = None
-    ) -> "Controller":
-        """A policy of which nothing is proved, to be commissioned: it runs from any state."""
-        controller = cls.__new__(cls)
-        controller._follow([(model, policy, None)], limits, 0.0, period, Held())
-        return controller
-
-    def _follow(
-        self,
-        stages: list[tuple[Any, Any, Any]],
-        limits: Limits,
-        settling: float,
-        period: float | None,
-        held: Held | None,
-    ) -> None:
-        for parts in stages:
-            refuse_mismatch(*parts)
-        stages = [
-            (model, policy.plan(model) if isinstance(policy, TubePolicy) else policy, funnel)
-            for model, policy, funnel in stages
-        ]
-        model, policy, funnel = stages[0]
-        self._stages, self.limits, self._settling = stages, limits, settling
-        self._continuous, self._held = isinstance(model, VectorField), Held()
-        if self._continuous:
-            if period is None or not period > 0.0:
-                raise DataError(
-                    "a continuous funnel names no time between samples: `period` should be s "
-                    f"above 0, is {period}"
-                )
-            self._held = Held.given(held)
-            self._held.refuse(period)
-            self.period, self._origin = period, float(policy.t[0])
-            self._end = stages[-1][1].last - (1.0 - TOLERANCE) * period  # an input is held so long
+    def __init__(self, stages: Sequence[Stage], limits: Limits, settling: float = 0.0) -> None:
+        self._stages: list[tuple[Any, Any, Any]] = []
+        for model, policy, funnel, _ in stages:
+            planned: Any = policy
+            if isinstance(policy, TubePolicy):
+                planned = policy.plan(model)  # type: ignore[arg-type]
+            self._stages.append((model, planned, funnel))
+        for each in stages:
+            each.refuse_mismatch()
+        model, policy, funnel = self._stages[0]
+        self.limits, self._settling = limits, settling
+        self._continuous = isinstance(model, VectorField)
+        self._held = stages[0].applied if self._continuous else None
+        if self._held is not None:
+            self.period, self._origin = self._held.period, float(policy.t[0])
+            held_so_long = (1.0 - TOLERANCE) * self.period  # each input
+            self._end = self._stages[-1][1].last - held_so_long
         else:
             self.period, self._origin = float(model.period), 0.0
             self._end = policy.last if funnel is None else min(policy.last, funnel.last)
         self._observer = _observer(model, policy)
         self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
-        for _, planned, _ in stages:
+        for _, planned, _ in self._stages:
             limits.refuse(np.size(planned.planned[0]))
             self._refuse_cut(planned.planned)
         self.ended = ""
@@ -239,7 +186,7 @@ class Controller:
         if funnel is not None:
             nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
             size = funnel.start_size(x - nominal)
-            if self._continuous:
+            if self._held is not None:
                 size += self._held.reach(funnel.shape(self._origin))
         if size <= 1.0:
             self.k = 1 - self._observer.ahead
@@ -278,7 +225,7 @@ class Controller:
     def _overdue(self, t: float) -> str:
         """Whether the input before this sample was held for longer than is proved."""
         age, self._answered = t - self._answered, t
-        return self._held.overdue(age, t) if self.k >= 1 else ""
+        return "" if self._held is None or self.k < 1 else self._held.overdue(age, t)
 
     def _refuse_cut(self, planned: FloatArray) -> None:
         cut = planned[self.limits.clip(planned) != planned]

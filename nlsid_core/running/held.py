@@ -1,4 +1,4 @@
-"""How a proof lets a continuous policy be applied: how old its input is, how wrong its state."""
+"""How a continuous policy is applied: how often, how old its input is, how wrong its state."""
 
 from dataclasses import dataclass, field
 
@@ -15,40 +15,36 @@ ON_TIME = 1.0 + 1e-9  # of the hold: rounding of stamps
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """hold: s, how old the input is at most; 0 if the proof is about a policy that acts
-    continuously. error: (n,) bounds on how much each state is measured wrong; empty for none.
+    """period: s between samples. What the proof allows: hold, s, how old the input is at most, 0 if
+    it is about a policy that acts continuously; error, (n,) bounds on how much each state is
+    measured wrong, empty for none.
+
+    Raises DataError if the hold does not cover such samples, some of them late.
     """
 
+    period: float
     hold: float = 0.0
     error: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    @classmethod
-    def of_claim(cls, claim: Json) -> "Held":
-        """What the claim of a continuous funnel says; DocumentError if it is none."""
-        hold = files.member(claim, "hold", (int, float), source="claim") if "hold" in claim else 0
-        if "error" not in claim:
-            return cls(float(hold))
-        return cls(float(hold), files.array(claim, "error", (None,), source="claim"))
-
-    @classmethod
-    def given(cls, held: "Held | None") -> "Held":
-        """`held`; DataError if it is None, of a continuous funnel, whose file does not say it."""
-        if held is None:
-            raise DataError(
-                "a continuous funnel does not say how its policy may be applied, its claim does: "
-                "give `held`, Held.of_claim(design.claim)"
-            )
-        return held
-
-    def refuse(self, period: float) -> None:
-        """DataError if the hold does not cover samples so many s apart, some of them late."""
-        needed = (1.0 + TOLERANCE) * period
+    def __post_init__(self) -> None:
+        if not self.period > 0.0:
+            raise DataError(f"the period should be s above 0, is {self.period}")
+        needed = (1.0 + TOLERANCE) * self.period
         if self.hold and needed > self.hold * ON_TIME:
             raise DataError(
-                f"samples come every {period:g} s, and the funnel is proved for inputs of at most "
-                f"{self.hold:g} s, which leaves no {TOLERANCE:g} periods for one that is late: "
-                f"sample every {slowest(self.hold):.12g} s, or design it with hold={needed:.12g}"
+                f"samples come every {self.period:g} s, and the funnel is proved for inputs of at "
+                f"most {self.hold:g} s, which leaves no {TOLERANCE:g} periods for one that is "
+                f"late: sample every {slowest(self.hold):.12g} s, or design it with "
+                f"hold={needed:.12g}"
             )
+
+    @classmethod
+    def of_claim(cls, claim: Json, period: float) -> "Held":
+        """What the claim of a continuous funnel says; DocumentError if it is none."""
+        stated = {"hold": 0.0, "error": []} | claim
+        hold = files.member(stated, "hold", (int, float), source="claim")
+        error = files.array(stated, "error", (None,), source="claim")
+        return cls(period, float(hold), error)
 
     def overdue(self, age: float, t: float) -> str:
         """How an input that is `age` s old at t (s) is older than is proved; empty if it is not."""
@@ -56,13 +52,14 @@ class Held:
             return ""
         return f"the input was held for {age:.6g} s at t = {t:g} s; proved for {self.hold:g} s"
 
-    def assuming(self, period: float) -> str:
+    @property
+    def assuming(self) -> str:
         """What is assumed of an input that is held for a period, in words."""
         wrong = ", ".join(f"x{i} within {e:g}" for i, e in enumerate(self.error.tolist()) if e)
         measured = f"; measured to: {wrong}" if wrong else ""
         if not self.hold:
-            held = f"the policy is applied continuously; here each input is held for {period:g} s"
-            return held + measured
+            here = f"here each input is held for {self.period:g} s"
+            return f"the policy is applied continuously; {here}{measured}"
         return f"each input is at most {self.hold:g} s old{measured}"
 
     def reach(self, P: FloatArray) -> float:

@@ -2,11 +2,12 @@
 
 import math
 import re
+from collections import deque
 from collections.abc import Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
-FADES: Final = "the start fades"
+TREND: Final = 10  # samples over which the margin's fall is taken
 _NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 
 
@@ -65,11 +66,6 @@ class Reading(NamedTuple):
         return self.status is Status.UNKNOWN and self.reason.startswith("waiting for ")
 
     @property
-    def starts(self) -> bool:
-        """Whether it is of the samples that a run's measured start is made of."""
-        return self.waits and FADES not in self.reason
-
-    @property
     def numbers(self) -> dict[str, float]:
         """What is published of it, by name; `nominal[1]` where several signals are measured."""
         values = {
@@ -86,6 +82,21 @@ class Reading(NamedTuple):
             values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
             values[f"measured[{i}]"] = self.measured[i]
         return values
+
+
+class Trend:
+    """How a run's margin falls over the last samples."""
+
+    def __init__(self) -> None:
+        self._margins: deque[tuple[float, float]] = deque(maxlen=TREND)
+
+    def exit_after(self, t: float, margin: float) -> float:
+        """S until the margin, now at t s, is 0 if it goes on falling as it did; else inf."""
+        before, earlier = self._margins[0] if self._margins else (t, margin)
+        self._margins.append((t, margin))
+        if not margin > 0.0:
+            return 0.0
+        return margin * (t - before) / (earlier - margin) if earlier > margin else math.inf
 
 
 def cause(text: str) -> str:

@@ -10,7 +10,6 @@ and CUSUM of the innovation, an alarm that nothing rests on. Source: docs/certif
 
 import copy
 import math
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -27,11 +26,9 @@ from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
-from nlsid_core.running.reading import FADES, Level, Reading, Status, unsaid
-from nlsid_core.running.start import start_in_motion
+from nlsid_core.running.reading import Level, Reading, Status, Trend, unsaid
 from nlsid_core.running.stepping import Stepper
 
-TREND = 10  # samples over which the margin's fall is taken
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
@@ -43,29 +40,17 @@ WATCHED = "watched as well, not needed for the tube's sentence"
 
 
 class TubeRun:
-    """Samples (t, y, u) of one run against funnels of one model; `readings` once per sample.
+    """Samples (t, y, u) of one run against a funnel of its model; `update` once per sample.
 
-    lags: samples that start a run. in_motion: begin at `start_in_motion`, without the outputs.
-    Raises DataError if the funnels start in different ways, or no such start is known.
+    lags: samples that start a run. Raises DataError on a funnel that is not one of the model.
     """
 
-    def __init__(
-        self, model: StableModel, funnels: Sequence[TubeFunnel], *, in_motion: bool = False
-    ) -> None:
+    def __init__(self, model: StableModel, funnel: TubeFunnel) -> None:
         self._stepper = Stepper(model)
-        self.period, self.lags = model.period, funnels[0].settling
-        if any(funnel.settling != self.lags for funnel in funnels):
-            raise DataError("the funnels start after different numbers of samples")
+        self.period, self.lags = model.period, funnel.settling
         if self.lags < self._stepper.lags:
             raise DataError(f"a run of this model starts after {self._stepper.lags} samples")
-        self._funnels = tuple(funnels)
-        self._moving = start_in_motion(model, funnels) if in_motion else None
-        if self._moving is not None:
-            self.lags = self._moving.samples
-        tubes = [tube for funnel in funnels for tube in funnel.tubes]
-        self._tubes = tubes
-        places = iter(range(len(tubes)))
-        self._rows = [[next(places) for _ in funnel.tubes] for funnel in funnels]
+        self._tubes = tubes = funnel.tubes
         p, n = len(self._stepper.y), self._stepper.order
         if any(tube.L.shape != (n, p) for tube in tubes):
             raise DataError("the funnel is not one of this model")
@@ -87,25 +72,23 @@ class TubeRun:
         follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
-        self._responses = [funnel.response for funnel in funnels]
-        self._assumed = [r.half_widths.tolist() if r else [] for r in self._responses]
-        for i, response in enumerate(self._responses):
-            if response is not None and len(response.half_widths) != p:
-                raise DataError("the funnel's response is not one of this model")
-            if response is not None and response.follows is not None:
-                follow[len(tubes) + i] = response.follows
+        response = funnel.response
+        self._assumed: list[float] = [] if response is None else response.half_widths.tolist()
+        if response is not None and len(response.half_widths) != p:
+            raise DataError("the funnel's response is not one of this model")
+        if response is not None and response.follows is not None:
+            follow[len(tubes)] = response.follows
         if any(level.inputs > len(self._stepper.u) for level in follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
         self._follow = follow
-        self._cusums = [funnel.cusum for funnel in funnels]
+        self._cusum = funnel.cusum
         self._names = [signal.name for signal in self._stepper.y]
         self._units = [tube.energy_unit(self._stepper.y) for tube in tubes]
-        boxed = [f for f in funnels if f.y_box is not None and f.u_box is not None]
-        self._boxes = [
-            (np.array(f.y_box).T, np.array(f.u_box).T, np.tile(np.array(f.y_box), (n // p, 1)).T)
-            for f in boxed
-        ]
-        self._assuming = [assuming(funnel.tubes) for funnel in funnels]
+        y_box, u_box = funnel.y_box, funnel.u_box
+        self._box: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        if y_box is not None and u_box is not None:
+            self._box = y_box.T, u_box.T, np.tile(y_box, (n // p, 1)).T
+        self._assuming = assuming(tubes)
         self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
         self._carried = self._linear.carried if self._linear is not None else None
         self.restart()
@@ -121,16 +104,16 @@ class TubeRun:
         self._ended = why
         self._start: list[tuple[FloatArray, FloatArray]] = []
         self._x: FloatArray | None = None
-        self._fading = 0 if self._moving is None else self._moving.samples
         self._spent = np.zeros(len(self._tubes))
         self._largest, self._hidden = np.zeros(self._stepper.order), np.zeros_like(self._widths)
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
         self._g: dict[int, list[float]] = {}
-        self._sums = [CusumMeter(len(self._names), c.drift) if c else None for c in self._cusums]
-        self._fall: list[deque[tuple[float, float]]] = [deque(maxlen=TREND) for _ in self._funnels]
+        cusum = self._cusum
+        self._sums = None if cusum is None else CusumMeter(len(self._names), cusum.drift)
+        self._trend = Trend()
 
-    def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
+    def update(self, t: float, y: Any, u: Any) -> Reading:
         """What is said of the sample at t (s): outputs y (p,) and inputs u (n_u,), or numbers.
 
         NaN, or None for u, is a sample without a measurement.
@@ -145,13 +128,9 @@ class TubeRun:
         fault = self._fault(t, measured, applied)
         if fault:
             return self._unknown(t, measured, self._without(applied, fault) or fault)
-        if self._x is None or self._fading:
+        if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
-
-    def ahead(self, funnel: int = 0) -> "Ahead":
-        """What follows from here while funnel number `funnel` keeps what it assumes."""
-        return Ahead(self, funnel)
 
     def missing(self, t: float, reason: str, *, doubted: bool = False) -> Reading:
         """The reading at t (s) where no sample came; the run goes on with the next one.
@@ -166,7 +145,7 @@ class TubeRun:
         """The reading at t (s) where nobody measured the outputs: a step with e = 0 under u."""
         nothing = np.full(len(self._names), np.nan)
         fault = self._take(t) or self._without(np.array(u, dtype=np.float64, ndmin=1), reason)
-        return self._unknown(t, nothing, fault or reason)[0]
+        return self._unknown(t, nothing, fault or reason)
 
     def _take(self, t: float) -> str:
         """Count the sample stamped t; a new run starts where some before it did not come."""
@@ -228,25 +207,15 @@ class TubeRun:
             self._begin(refused)
             return refused
         self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
-        self._fading = max(self._fading - 1, 0)
         self._follow_command(u)
         return ""
 
-    def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
-        if any(((u < low) | (u > high)).any() for _, (low, high), _ in self._boxes):
+    def _collect(self, t: float, y: FloatArray, u: FloatArray) -> Reading:
+        if self._box is not None and not _within(u, self._box[1]):
             away = f"outside the box in which the tube is proved, at t = {t:g} s"
             self._begin(away)
             return self._unknown(t, y, away)
         self._follow_command(u)
-        if self._moving is not None:
-            if self._x is None:
-                self._x = np.tile(self._moving.x, (len(self._tubes) + 1, 1))
-                self._stepper.rest(u)
-            if refused := self._without(u, ""):
-                return self._unknown(t, y, f"{refused}, at t = {t:g} s")
-            self._k = 0
-            ended = f", after {self._ended}" if self._ended else ""
-            return self._unknown(t, y, f"{STARTING} {self.lags} samples: {FADES}{ended}")
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
@@ -263,14 +232,8 @@ class TubeRun:
             outputs, after = stepper.advance(x, u)
         except (DataError, SolverError) as error:
             return x, x, str(error)
-        for (y_low, y_high), (u_low, u_high), (x_low, x_high) in self._boxes:
-            inside = (
-                ((y_low <= outputs) & (outputs <= y_high)).all()
-                and ((u_low <= u) & (u <= u_high)).all()
-                and ((x_low <= x) & (x <= x_high)).all()
-            )
-            if not inside:
-                return outputs, after, "outside the box in which the tube is proved"
+        if self._box is not None and not all(map(_within, (outputs, u, x), self._box)):
+            return outputs, after, "outside the box in which the tube is proved"
         return outputs, after, ""
 
     def _follow_command(self, u: FloatArray) -> None:
@@ -279,7 +242,7 @@ class TubeRun:
             now = u.tolist()
             self._g = {j: meter.update(now) for j, meter in self._meters.items()}
 
-    def _judge(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
+    def _judge(self, t: float, y: FloatArray, u: FloatArray) -> Reading:
         assert self._x is not None
         outputs, after, refused = self._advance(self._stepper, self._x, u)
         if refused:
@@ -317,7 +280,7 @@ class TubeRun:
             reason = f"{what} is not finite at t = {t:g} s"
             self._begin(reason)
             if np.isfinite(simulated).all() and (sizes > 1.0).any():
-                away = Reading(
+                return Reading(
                     t,
                     Status.OUTSIDE,
                     -math.inf,
@@ -327,7 +290,6 @@ class TubeRun:
                     level=Level.NONE,
                     reason=f"outside the tube; {reason}",
                 )
-                return [away] * len(self._funnels)
             return self._unknown(t, y, reason)
         if not (hidden <= MOST_ROUNDING * widths).all():
             most = f"rounding can hide {float(hidden.max()):.2g}"
@@ -337,8 +299,8 @@ class TubeRun:
             )
         measured = tuple(y.tolist())
         away, innovations = deviation.tolist(), e.tolist()
-        judged = _Judged(t, sizes.tolist(), spent, peaks, level, widths, nominal, measured, away)
-        return [self._reading(i, judged, innovations[rows[0]]) for i, rows in enumerate(self._rows)]
+        judged = _Judged(sizes.tolist(), spent, peaks, level, widths, away, innovations[0])
+        return self._reading(t, judged, nominal, measured)
 
     def _hides(self, simulated: FloatArray) -> FloatArray:
         """(tubes, p) what rounding can hide of the outputs' distance from these simulated (p,)."""
@@ -360,11 +322,11 @@ class TubeRun:
         room = np.array([max(g[j][0], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
         return room, self._widths * np.sqrt(room)[:, None]
 
-    def _response(self, i: int, away: list[float]) -> tuple[float, str]:
-        """The most of what is assumed of funnel i's output error that is used, and of which."""
+    def _response(self, away: list[float]) -> tuple[float, str]:
+        """The most of what is assumed of the output error that is used, and of which."""
         used, worst = 0.0, 0
-        g = self._g.get(len(self._tubes) + i)
-        for j, width in enumerate(self._assumed[i]):  # none without a response
+        g = self._g.get(len(self._tubes))
+        for j, width in enumerate(self._assumed):  # none without a response
             error = away[j]
             bound = width * (1.0 if g is None else math.sqrt(max(g[j], TINY))) * (1.0 - ROUNDING)
             part = abs(error) / bound
@@ -380,9 +342,9 @@ class TubeRun:
             f"is assumed ({WATCHED})"
         )
 
-    def _alarm(self, i: int, innovation: list[float]) -> str:
-        """What CUSUM says of funnel i's first observer; empty if it does not alarm."""
-        cusum, sums = self._cusums[i], self._sums[i]
+    def _alarm(self, innovation: list[float]) -> str:
+        """What CUSUM says of the first observer; empty if it does not alarm."""
+        cusum, sums = self._cusum, self._sums
         if cusum is None or sums is None:
             return ""
         z = [e / size for e, size in zip(innovation, cusum.deviation.tolist(), strict=True)]
@@ -394,16 +356,19 @@ class TubeRun:
             f"side, above {cusum.threshold:.4g}; nothing is proved of this"
         )
 
-    def _reading(self, i: int, judged: "_Judged", innovation: list[float]) -> Reading:
-        """Of funnel i: the narrowest margin and the most that is used over the tubes that last.
-
-        innovation: of the funnel's first observer.
-        """
-        t, sizes, spent, peaks, level, widths, nominal, measured, away = judged
-        alarm = self._alarm(i, innovation)
-        lasting = self._lasting(i, self._k)
+    def _reading(
+        self,
+        t: float,
+        judged: "_Judged",
+        nominal: tuple[float, ...],
+        measured: tuple[float, ...],
+    ) -> Reading:
+        """The narrowest margin and the most that is used over the tubes that last."""
+        sizes, spent, peaks, level, widths, away, innovation = judged
+        alarm = self._alarm(innovation)
+        lasting = self._lasting(self._k)
         if not lasting:
-            covered = self._samples[self._rows[i][0]]
+            covered = self._samples[0]
             return Reading(
                 t,
                 Status.UNKNOWN,
@@ -416,7 +381,7 @@ class TubeRun:
         margin = 1.0 - size
         most = max(lasting, key=spent.__getitem__)
         sharpest = max(lasting, key=peaks.__getitem__)
-        response, exceeded = self._response(i, away)
+        response, exceeded = self._response(away)
         reason = ""
         status = Status.INSIDE
         if not spent[most] <= 1.0:
@@ -444,13 +409,13 @@ class TubeRun:
             status,
             margin,
             used,
-            self._exit(i, t, margin),
+            self._trend.exit_after(t, margin),
             self._names[row.index(size)],
             nominal,
             measured,
             Level.TUBE if size <= 1.0 else Level.NONE,
             reason,
-            self._assuming[i],
+            self._assuming,
             away + innovation,
             alarm,
             self._narrowest(widths, lasting) if self._follow else (),
@@ -468,21 +433,12 @@ class TubeRun:
             self._reach = np.stack(parts, axis=1)
         return np.asarray(self._reach[steps - 1])
 
-    def _lasting(self, i: int, k: int) -> list[int]:
-        """The tubes of funnel i whose proof covers k samples."""
-        return [j for j in self._rows[i] if (ends := self._samples[j]) is None or k <= ends]
+    def _lasting(self, k: int) -> list[int]:
+        """The tubes whose proof covers k samples."""
+        return [j for j, ends in enumerate(self._samples) if ends is None or k <= ends]
 
-    def _exit(self, i: int, t: float, margin: float) -> float:
-        """S until the margin is 0 if it goes on falling as over the last samples."""
-        before, earlier = self._fall[i][0] if self._fall[i] else (t, margin)
-        self._fall[i].append((t, margin))
-        if not margin > 0.0:
-            return 0.0
-        return margin * (t - before) / (earlier - margin) if earlier > margin else math.inf
-
-    def _unknown(self, t: float, y: FloatArray, reason: str) -> list[Reading]:
-        measured = tuple(y.tolist())
-        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * len(self._funnels)
+    def _unknown(self, t: float, y: FloatArray, reason: str) -> Reading:
+        return Reading(t, Status.UNKNOWN, measured=tuple(y.tolist()), reason=reason)
 
 
 class Ahead:
@@ -492,8 +448,8 @@ class Ahead:
     it never says anything again. The run goes on as if this were not there.
     """
 
-    def __init__(self, run: TubeRun, funnel: int) -> None:
-        self._run, self._funnel = run, funnel
+    def __init__(self, run: TubeRun) -> None:
+        self._run = run
         self._x, self._k, self._spent, self._g = run._x, run._k, run._spent, run._g
         self._stepper, self._meters = run._stepper.ahead(), copy.deepcopy(run._meters)
         self.steps, self._total = 0, np.zeros(len(run._rho))
@@ -516,7 +472,7 @@ class Ahead:
         )
         self._total = run._rho * self._total + np.maximum(g, 1.0)
         left = np.minimum(left, run._peak * self._total * (1.0 + OUTWARD))
-        lasting = run._lasting(self._funnel, self._k + self.steps)
+        lasting = run._lasting(self._k + self.steps)
         if not lasting or not (left[lasting] >= 0.0).all():
             self.ended = self.ended or "what the tube assumes is broken, or over"
         if self.ended:
@@ -532,17 +488,16 @@ class _Judged(NamedTuple):
     """One sample against all tubes. sizes, widths: of each tube's outputs; spent, level: of it.
 
     peaks: the sample's own energy as a part of the tube's peak. away: the output error.
+    innovation: of the first observer.
     """
 
-    t: float
     sizes: list[list[float]]
     spent: list[float]
     peaks: list[float]
     level: FloatArray
     widths: FloatArray
-    nominal: tuple[float, ...]
-    measured: tuple[float, ...]
     away: list[float]
+    innovation: list[float]
 
 
 def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
@@ -550,11 +505,16 @@ def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
     for trial in trials:
         most = np.spacing(np.abs(trial.y).max(axis=0))
         refuse_coarse(most, funnel.half_widths, trial.name)
-        run = TubeRun(model, [funnel])
+        run = TubeRun(model, funnel)
         for k in range(min(len(trial), run.lags + 1)):
-            [reading] = run.readings(k * model.period, trial.y[k], trial.u[k])
+            reading = run.update(k * model.period, trial.y[k], trial.u[k])
         if reading.reason.startswith(COARSE):
             raise DataError(f"{trial.name}: {reading.reason}; measure from a place nearby")
+
+
+def _within(values: FloatArray, box: FloatArray) -> bool:
+    """Whether all values (..., n) are in the box (2, n)."""
+    return bool(((box[0] <= values) & (values <= box[1])).all())
 
 
 def assuming(tubes: Sequence[Tube]) -> str:

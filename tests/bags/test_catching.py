@@ -25,7 +25,6 @@ from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.design.tube import energy, innovations
-from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD, synthetic_dataset
 from tests.core.kernel.tube_claims import dataset
@@ -289,7 +288,7 @@ def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() ->
     made = follower("two_outputs")
     calibration, held_back = dataset(made.model, 100), dataset(made.model, 200, 4)
     ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
-    monitor = Monitor(made.model, None, made.funnel)
+    monitor = made.monitor()
     found = what_it_catches(
         made,
         held_back=held_back,

@@ -367,18 +367,6 @@ def test_a_recording_that_hardly_outlasts_the_start_says_how_little_was_judged(
     assert not any("start the run" in line for line in replay_lines(whole))
 
 
-def test_while_a_start_in_motion_fades_nothing_is_judged_and_the_verdict_says_so(
-    chain: Path,
-) -> None:
-    proved = documents.load(chain / documents.FUNNEL)
-    whole = replay(chain, trial("05"))
-    moving = replay_bag(proved, trial("05"), centre=Centre.MOTION)
-    assert moving.first_bad is None
-    assert moving.verdict == Status.UNKNOWN.value
-    assert moving.reason.endswith(": the start fades")
-    assert 0.0 < moving.judged_span < whole.judged_span == whole.span < moving.span
-
-
 @pytest.mark.parametrize("name", TEST)
 def test_every_test_trial_is_inside_with_the_assumption_kept(chain: Path, name: str) -> None:
     result = replay(chain, trial(name))

@@ -84,12 +84,10 @@ def test_moments_stand_beside_the_biased_rie_and_least_squares(
     pairs = [*repeated.pair(2000, 1), *repeated.pair(1500, 2)]
     alone = Dataset(tuple(replace(trial, group="") for trial in pairs))
     biased = identify(alone, repeated.CLASS, comparators=())
-    assert "which noise biases" in str(biased)
     assert monotone.methods == ("least_squares", "rie")
     assert repeated.percent(monotone.model) < 0.4 * repeated.percent(biased.model)
     assert monotone["least_squares"].proof is not None, "every candidate is offered to the prover"
     assert len(monotone.history.steps) == 1
-    assert "mean squared simulation error by the moments" in str(monotone)
 
 
 def test_a_comparator_that_fails_is_left_out_and_logged(
@@ -128,7 +126,10 @@ def test_too_little_data_says_how_much_there_is_and_what_for() -> None:
         ),
         (Polynomial(80), "70 samples, 80 lags need more"),
         (Network(FilterMapFilter((20, 20))), "fewer than 99 scored samples"),
-        (Polynomial(80, degrees=Degrees(left=3), set="3.8"), "70 common samples; 81 needed"),
+        (
+            Polynomial(80, degrees=Degrees(left=3), set="3.8"),
+            "70 samples, a history of 80 needs more",
+        ),
     ):
         with pytest.raises(DataError, match=reason):
             identify(short, model_class, validation=short)

@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import Degrees, Polynomial
+from nlsid_core.identification.polynomial.moment_rie import identify_from_repeats
 from nlsid_core.identification.polynomial.moments import offsets_of, repeated_moments
-from nlsid_core.identification.polynomial.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
 from tests.repeated import CLASS, OFFSETS, pair
 

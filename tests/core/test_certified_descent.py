@@ -11,10 +11,7 @@ from nlsid_core.identification import Degrees, LeastSquares, Polynomial, Rie, Se
 from nlsid_core.identification.polynomial.implicit_descent import ImplicitSet
 from nlsid_core.identification.polynomial.implicit_rie import least_squares_coefficients
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
-from nlsid_core.identification.polynomial.moment_rie import Problem
-from nlsid_core.identification.polynomial.moments import Offsets, offsets_of, plain_moments
-from nlsid_core.identification.polynomial.monotone_descent import MonotoneSet
-from nlsid_core.identification.starts import as_implicit, as_monotone, linear_start
+from nlsid_core.identification.starts import as_implicit, linear_start
 from tests.repeated import CLASS, run, truth
 
 
@@ -141,24 +138,19 @@ def test_the_sensitivities_are_those_of_the_simulation() -> None:
             set="2.11",
         ),
     )
-    implicit = ImplicitSet(rows, 1.0)
-    at = np.concatenate(least_squares_coefficients(rows)).ravel()
-    offsets = offsets_of(data.trajectories)
-    moments = plain_moments(data.trajectories, CLASS, offsets)
-    monotone = MonotoneSet(
-        Problem.of(moments, 2, 1.0), CLASS, Offsets(offsets.y, offsets.u), data.trajectories
+    problem, theta = (
+        ImplicitSet(rows, 1.0),
+        np.concatenate(least_squares_coefficients(rows)).ravel(),
     )
-    c = np.concatenate([truth().e[1:], [-truth().c], -truth().a, -truth().b]) / truth().e[0]
-    for problem, theta in ((implicit, at), (monotone, c)):
-        direction = np.random.default_rng(0).normal(size=theta.size) * np.abs(theta)
-        found = problem.outputs(theta)
-        moved = [problem.outputs(theta + s * 1e-6 * direction) for s in (1.0, -1.0)]
-        assert found is not None
-        assert moved[0] is not None
-        assert moved[1] is not None
-        change = (moved[0].r - moved[1].r) / 2e-6
-        np.testing.assert_allclose(found.J @ direction, change, atol=1e-6 * np.abs(change).max())
-        assert problem.cost(theta) == pytest.approx(float(found.r @ found.r))
+    direction = np.random.default_rng(0).normal(size=theta.size) * np.abs(theta)
+    found = problem.outputs(theta)
+    moved = [problem.outputs(theta + s * 1e-6 * direction) for s in (1.0, -1.0)]
+    assert found is not None
+    assert moved[0] is not None
+    assert moved[1] is not None
+    change = (moved[0].r - moved[1].r) / 2e-6
+    np.testing.assert_allclose(found.J @ direction, change, atol=1e-6 * np.abs(change).max())
+    assert problem.cost(theta) == pytest.approx(float(found.r @ found.r))
 
 
 def test_a_linear_model_begins_as_itself_in_the_other_classes() -> None:
@@ -167,8 +159,9 @@ def test_a_linear_model_begins_as_itself_in_the_other_classes() -> None:
     assert start is not None
     trial = data.trajectories[0]
     expected = start.simulate(trial.u, trial.y[:2])[:, 0]
-    straight = as_monotone(start, Polynomial(2, (0, 1), set="3.8"))
-    np.testing.assert_allclose(straight.simulate(trial.u, trial.y[:2, 0]), expected, atol=1e-9)
+    straight = build_implicit_rows(data, Polynomial(2, (0, 1), set="3.8"))
+    same = straight.model(*as_implicit(start, straight), 1.0).simulate(trial.u, trial.y[:2, 0])
+    np.testing.assert_allclose(same, expected, atol=1e-9)
     rows = build_implicit_rows(data, Polynomial(2, (0, 1), Degrees(left=3), set="2.11"))
     found = ImplicitSet(rows, 1.0).outputs(np.concatenate(as_implicit(start, rows)).ravel())
     assert found is not None

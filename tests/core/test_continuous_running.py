@@ -20,6 +20,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from tests.continuous_stage import stage, write_run
 
 HELD = 0.02  # s
@@ -43,10 +44,8 @@ def driven(
 
 def test_a_held_policy_stays_inside_and_ends_before_an_input_would_act_beyond_the_proof() -> None:
     field, policy, funnel = stage()
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
-    )
-    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
+    controller = Controller([Stage(field, policy, funnel, Held(HELD))], LIMITS, 1.0)
+    monitor = Monitor([Stage(field, policy, funnel, Held(HELD))])
     states, said = driven(controller, monitor, 0.15)
     assert set(said) == {Status.INSIDE}
     assert controller.ended == "the proof is over"
@@ -59,9 +58,7 @@ def test_a_held_policy_stays_inside_and_ends_before_an_input_would_act_beyond_th
 def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() -> None:
     field, policy, funnel = stage()
     x = np.array([0.1])
-    reading = Monitor(field, policy, funnel, period=HELD, held=Held()).update(
-        0.0, x, policy(0.0, x)
-    )
+    reading = Monitor([Stage(field, policy, funnel, Held(HELD))]).update(0.0, x, policy(0.0, x))
     assert (
         reading.assuming == "the policy is applied continuously; here each input is held for 0.02 s"
     )
@@ -73,16 +70,14 @@ def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() ->
     funnel = replace(
         funnel, vector_field=policy.vector_field, policy=files.digest(policy.document())
     )
-    reading = Monitor(pushed, policy, funnel, period=HELD, held=Held()).update(
-        0.0, x, policy(0.0, x)
-    )
+    reading = Monitor([Stage(pushed, policy, funnel, Held(HELD))]).update(0.0, x, policy(0.0, x))
     assert reading.assuming.endswith("held for 0.02 s, and w stays in its box")
 
 
 def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
     field, policy, funnel = stage()
-    held = Held.of_claim({"hold": 0.025})
-    monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+    proved = Stage(field, policy, funnel, Held.of_claim({"hold": 0.025}, HELD))
+    monitor = Monitor([proved])
     for k, (t, used) in enumerate([(0.0, 0.0), (HELD, 0.8), (2.24 * HELD, 0.992)]):
         reading = monitor.update(t, [t], policy(t, np.array([t])))
         assert (reading.status, reading.assuming) == (
@@ -90,15 +85,13 @@ def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
             "each input is at most 0.025 s old",
         ), k
         assert reading.assumption == pytest.approx(used)
-    monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+    monitor = Monitor([proved])
     for t in (0.0, 0.8 * HELD, 2.2 * HELD):  # on the grid, and the last 0.028 s apart
         reading = monitor.update(t, [t], policy(t, np.array([t])))
     assert reading.status is Status.ASSUMPTION_VIOLATED
     said = "held for 0.028 s at t = 0.044 s; proved for 0.025 s"
     assert said in reading.reason
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=held
-    )
+    controller = Controller([proved], LIMITS, 1.0)
     for t in (0.0, 0.8 * HELD, 2.2 * HELD):
         assert controller.ended == ""
         controller.update(t, np.array([t]))
@@ -109,33 +102,24 @@ def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
 def test_a_hold_without_room_for_a_late_sample_is_refused_and_what_is_advised_is_not(
     period: float,
 ) -> None:
-    field, policy, funnel = stage()
-
-    def run(period: float, hold: float) -> None:
-        held = Held(hold)
-        Monitor(field, policy, funnel, period=period, held=held)
-        Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=period, held=held)
-
     with pytest.raises(DataError, match=rf"every {period} s.*inputs of at most 0.025 s") as refusal:
-        run(period, 0.025)
+        Held(period, 0.025)
     advised = re.search(r"sample every (\S+) s, or design it with hold=(\S+)$", str(refusal.value))
     assert advised
-    run(float(advised[1]), 0.025)
-    run(period, float(advised[2]))
+    Held(float(advised[1]), 0.025)
+    Held(period, float(advised[2]))
 
 
 def test_a_state_that_may_be_wrong_is_inside_only_if_all_that_it_may_be_is() -> None:
     field, policy, funnel = stage()
-    held = Held(error=np.array([0.03]))
+    held = Held(HELD, error=np.array([0.03]))
     for x, status in ((0.16, Status.INSIDE), (0.18, Status.OUTSIDE)):
-        monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+        monitor = Monitor([Stage(field, policy, funnel, held)])
         reading = monitor.update(0.0, [x], policy(0.0, np.array([x])))
         assert (reading.status, x) == (status, x)
         assert reading.margin == pytest.approx(1 - (x + 0.03) / 0.2)
         assert reading.assuming.endswith("measured to: x0 within 0.03")
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=0.05, period=HELD, held=held
-    )
+    controller = Controller([Stage(field, policy, funnel, held)], LIMITS, 0.05)
     for k in range(5):
         controller.update(k * HELD, np.array([0.18]))
     assert "not at the start of the plan" in controller.ended
@@ -143,15 +127,11 @@ def test_a_state_that_may_be_wrong_is_inside_only_if_all_that_it_may_be_is() -> 
 
 def test_a_push_is_outside_and_another_input_is_not_the_policys() -> None:
     field, policy, funnel = stage()
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
-    )
-    _, said = driven(
-        controller, Monitor(field, policy, funnel, period=HELD, held=Held()), 0.0, push=0.5
-    )
+    controller = Controller([Stage(field, policy, funnel, Held(HELD))], LIMITS, 1.0)
+    _, said = driven(controller, Monitor([Stage(field, policy, funnel, Held(HELD))]), 0.0, push=0.5)
     assert said[20] is Status.INSIDE
     assert said[21] is Status.OUTSIDE
-    monitor, x = Monitor(field, policy, funnel, period=HELD, held=Held()), np.array([0.0])
+    monitor, x = Monitor([Stage(field, policy, funnel, Held(HELD))]), np.array([0.0])
     reading = monitor.update(0.0, x, policy(0.0, x) + 0.1)
     assert reading.status is Status.ASSUMPTION_VIOLATED
     assert "u0 1.1 is not the policy's 1" in reading.reason
@@ -172,7 +152,7 @@ def test_what_cannot_be_judged_ends_the_run(
     t: float, x: list[float], u: list[float] | None, reason: str
 ) -> None:
     field, policy, funnel = stage()
-    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
+    monitor = Monitor([Stage(field, policy, funnel, Held(HELD))])
     assert monitor.update(0.0, [0.0], [1.0]).status is Status.INSIDE
     for reading in (monitor.update(t, x, u), monitor.update(2 * HELD, [0.0], [1.0])):
         assert reading.status is Status.UNKNOWN
@@ -181,7 +161,7 @@ def test_what_cannot_be_judged_ends_the_run(
 
 def test_after_the_end_nothing_is_claimed() -> None:
     field, policy, funnel = stage()
-    monitor = Monitor(field, policy, funnel, period=0.25, held=Held())
+    monitor = Monitor([Stage(field, policy, funnel, Held(0.25))])
     for k in range(4):
         assert monitor.update(0.25 * k, [0.25 * k], [1.0]).status is Status.INSIDE
     assert monitor.update(1.0, [1.0], None).status is Status.INSIDE
@@ -195,7 +175,7 @@ def test_after_the_end_nothing_is_claimed() -> None:
 def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     """At 0.8 s of the first stage 0.15 m is outside, at the second's start it is inside."""
     first, second = stage(), stage(1.0, 0.3)
-    monitor = Monitor.of_stages([first, second], period=0.2, held=[Held(), Held()])
+    monitor = Monitor([Stage(*first, Held(0.2)), Stage(*second, Held(0.2))])
     said, stages = [], []
     for k in range(11):
         t = 0.2 * k
@@ -210,50 +190,37 @@ def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     assert outside == [4]
     assert stages == ["stage 1 of 2"] * 5 + ["stage 2 of 2"] * 6
     assert set(said) == {Status.INSIDE, Status.OUTSIDE}
-    controller = Controller.of_stages(
-        [first, second], limits=LIMITS, settling=1.0, period=HELD, held=Held()
-    )
+    both = [Stage(*first, Held(HELD)), Stage(*second, Held(HELD))]
+    controller = Controller(both, LIMITS, 1.0)
     assert (controller.stage, controller.stages) == (1, 2)
-    states, said = driven(
-        controller, Monitor.of_stages([first, second], period=HELD, held=[Held(), Held()]), 0.1
-    )
+    states, said = driven(controller, Monitor(both), 0.1)
     assert controller.ended == "the proof is over"
     assert controller.stage == 2
     assert len(states) == round(2.0 / HELD) + 1
     assert set(said) == {Status.INSIDE}
     with pytest.raises(CertificateMismatch, match="do not follow"):
-        Monitor.of_stages([second, first], period=HELD, held=[Held(), Held()])
+        Monitor(both[::-1])
 
 
 def test_a_clipped_policy_is_proved_as_it_is_and_other_limits_end_the_run() -> None:
     field, policy, funnel = stage(limit=1.2)
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD, held=Held()
-    )
+    controller = Controller([Stage(field, policy, funnel, Held(HELD))], LIMITS, 1.0)
     assert controller.update(0.0, np.array([-0.15])) == pytest.approx(1.2)
     narrow = Limits(lowest=-1.1, highest=1.1, stop_rate=1.0)
-    controller = Controller(
-        field, policy, funnel, limits=narrow, settling=1.0, period=HELD, held=Held()
-    )
+    controller = Controller([Stage(field, policy, funnel, Held(HELD))], narrow, 1.0)
     controller.update(0.0, np.array([-0.15]))
     assert "is not proved" in controller.ended
     with pytest.raises(DataError, match="beyond the limits"):
         Controller(
-            field,
-            policy,
-            funnel,
-            limits=Limits(lowest=0.0, highest=0.5, stop_rate=1.0),
-            settling=1.0,
-            period=HELD,
-            held=Held(),
+            [Stage(field, policy, funnel, Held(HELD))],
+            Limits(lowest=0.0, highest=0.5, stop_rate=1.0),
+            1.0,
         )
 
 
 def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
     field, policy, funnel = stage()
-    controller = Controller(
-        field, policy, funnel, limits=LIMITS, settling=0.1, period=HELD, held=Held()
-    )
+    controller = Controller([Stage(field, policy, funnel, Held(HELD))], LIMITS, 0.1)
     for k in range(10):
         controller.update(k * HELD, np.array([0.5]))
     assert "not at the start of the plan after 0.1 s" in controller.ended
@@ -261,37 +228,34 @@ def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
 
 def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limits() -> None:
     field, policy, _ = stage()
-    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    unproved = Stage(field, policy, None, Held(HELD))
+    controller = Controller([unproved], LIMITS)
     x, samples = np.array([3.0]), 0
     while not controller.ended:
         x = x + HELD * controller.update(samples * HELD, x)
         samples += 1
     assert (controller.ended, samples) == ("the proof is over", round(1.0 / HELD) + 1)
     assert x[0] == pytest.approx(1.0, abs=0.1)
-    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    controller = Controller([unproved], LIMITS)
     controller.update(0.0, np.array([-9.0]))
     assert "is not proved: it is beyond" in controller.ended
     other = VectorField.from_function(lambda x, u: [u[0] - x[0]], 1, 1)
     with pytest.raises(CertificateMismatch, match="policy was made for another model"):
-        Controller.unproved(other, policy, limits=LIMITS, period=HELD)
+        Controller([unproved._replace(model=other)], LIMITS)
 
 
 def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
     field, policy, funnel = stage()
-    with pytest.raises(DataError, match="names no time between samples"):
-        Monitor(field, policy, funnel, held=Held())
-    with pytest.raises(DataError, match="names no time between samples"):
-        Controller(field, policy, funnel, limits=LIMITS, settling=1.0)
-    for unsaid in (
-        lambda: Monitor(field, policy, funnel, period=HELD),
-        lambda: Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD),
-    ):
-        with pytest.raises(DataError, match="does not say how its policy may be applied"):
-            unsaid()
+    unsaid = [Stage(field, policy, funnel)]
+    for running in (lambda: Monitor(unsaid), lambda: Controller(unsaid, LIMITS)):
+        with pytest.raises(DataError, match="names no time between samples, nor how its policy"):
+            running()
+    with pytest.raises(DataError, match="period should be s above 0"):
+        Held(0.0)
     with pytest.raises(CertificateMismatch, match="another policy"):
-        Monitor(field, stage(limit=2.0)[1], funnel, period=HELD, held=Held())
+        Monitor([Stage(field, stage(limit=2.0)[1], funnel, Held(HELD))])
     with pytest.raises(ShapeError):
-        Monitor(field, policy, funnel, period=HELD, held=Held()).update(0.0, [0.0, 0.0], [1.0])
+        Monitor([Stage(field, policy, funnel, Held(HELD))]).update(0.0, [0.0, 0.0], [1.0])
 
 
 def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
@@ -326,7 +290,7 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
     write_run(tmp_path / "bag", design, samples)
     replayed = [entry.reading for entry in replay_messages(design, tmp_path / "bag")]
     assert replayed[0].reason == "waiting for the controller to announce its start"
-    monitor = Monitor(field, policy, funnel, period=HELD, held=Held())
+    monitor = Monitor([Stage(field, policy, funnel, Held(HELD))])
     direct = [monitor.update(k * period_ns / 1e9, x, u) for k, (x, u) in enumerate(samples)]
     assert [r.margin for r in replayed[1:]] == [r.margin for r in direct]
     assert {r.status for r in replayed[1:]} == {Status.INSIDE}

@@ -10,7 +10,6 @@ from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
-from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.plants import ModelPlant
 from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD
@@ -32,8 +31,8 @@ def closed_loop(
 ) -> tuple[Controller, list[Reading]]:
     """A run on the design's own model, pushed for four samples in the middle."""
     plant = ModelPlant(design.model)
-    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=30.0)
-    monitor = Monitor(design.model, design.policy, design.funnel, centre=Centre.PROFILE)
+    controller = design.controller(WIDE, 30.0)
+    monitor = design.monitor(centre=Centre.PROFILE)
     rng = np.random.default_rng(4)
     n = len(design.model)
     history: list[tuple[float, float]] = []
@@ -73,7 +72,7 @@ def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
     design: OutputTubeDesign,
 ) -> None:
     assert design.policy is not None
-    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
+    controller = design.controller(WIDE, 1.0)
     for k in range(12):
         assert controller.update(k * PERIOD, 3.0) == design.policy.u[0]
     assert "not at the start of the plan after 1 s" in controller.ended
@@ -86,7 +85,7 @@ def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
 def test_a_state_that_cannot_be_used_ends_the_run(
     design: OutputTubeDesign, t: float, y: float, reason: str
 ) -> None:
-    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
+    controller = design.controller(WIDE, 1.0)
     for k in range(3):
         controller.update(k * PERIOD, 3.0)
     u = controller.u

@@ -18,6 +18,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.forecast import Forecast, linear_form, reach
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
 from tests.core.kernel.tube_claims import HIGH, LONG, LOW, MODELS, design
 from tests.marks import slow_among
@@ -70,7 +71,7 @@ def forecasts(
     model: Any, funnel: TubeFunnel, y: FloatArray, u: FloatArray
 ) -> Iterator[tuple[int, Forecast]]:
     """That of every third judged sample k, for the AHEAD after it."""
-    monitor = Monitor(model, None, funnel)
+    monitor = Monitor([Stage(model, None, funnel)])
     for k in range(len(y) - AHEAD):
         reading = monitor.update(k * model.period, y[k], u[k])
         if reading.status is not Status.UNKNOWN and k % 3 == 0:
@@ -124,7 +125,7 @@ def test_a_linear_forecast_is_reached_at_every_sample() -> None:
     A, C = linear.A, linear.C[0]
     lags, zero = funnel.settling, np.zeros((AHEAD, 1))
     for h in range(1, AHEAD + 1):
-        monitor, stepper = Monitor(model, None, funnel), Stepper(model)
+        monitor, stepper = Monitor([Stage(model, None, funnel)]), Stepper(model)
         x = stepper.begin(np.zeros((lags, 1)), np.zeros((lags, 1)))[None]
         u = np.zeros(1)
         for k in range(lags + 1):
@@ -153,7 +154,7 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
     assert tube.peak is not None
     p, lags = len(tube.R), funnel.settling
     u = np.zeros((lags + 3, len(Stepper(model).u)))
-    monitors = [Monitor(model, None, f) for f in (funnel, alone(name, peak=False)[1])]
+    monitors = [Monitor([Stage(model, None, f)]) for f in (funnel, alone(name, peak=False)[1])]
     stepper = Stepper(model)
     x = stepper.begin(np.zeros((lags, p)), u[:lags])[None]
     for k in range(lags + 1):
@@ -219,7 +220,7 @@ def exact_reach(tube: Any, linear: Any) -> list[list[Fraction]]:
 def test_forecasting_leaves_the_run_where_it_is(name: str) -> None:
     model, funnel = alone(name)
     y, u = attack(model, funnel, "random", 60, seed=3)
-    looking, plain = Monitor(model, None, funnel), Monitor(model, None, funnel)
+    looking, plain = Monitor([Stage(model, None, funnel)]), Monitor([Stage(model, None, funnel)])
     for k in range(len(y)):
         expected = plain.update(k * model.period, y[k], u[k])
         assert str(looking.update(k * model.period, y[k], u[k])) == str(expected)
@@ -228,21 +229,21 @@ def test_forecasting_leaves_the_run_where_it_is(name: str) -> None:
 
 def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:
     model, funnel = alone("linear")
-    monitor = Monitor(model, None, funnel)
+    monitor = Monitor([Stage(model, None, funnel)])
     waiting = monitor.forecast(np.zeros((3, 1)))
     assert (len(waiting.t), waiting.reason) == (0, "no run has begun")
     for k in range(20):
         monitor.update(k * model.period, [100.0 * (k == 19)], np.zeros(1))
     assert monitor.forecast(np.zeros((3, 1))).reason == "what the tube assumes is broken, or over"
     model, funnel = alone("implicit_box")
-    monitor = Monitor(model, None, funnel)
+    monitor = Monitor([Stage(model, None, funnel)])
     for k in range(20):
         monitor.update(k * model.period, np.zeros(1), np.zeros(1))
     assert "outside the box" in monitor.forecast(np.full((3, 1), 50.0)).reason
 
 
 def test_around_a_plan_there_is_no_forecast(planned: OutputTubeDesign) -> None:
-    monitor = Monitor(planned.model, planned.policy, planned.funnel, centre=Centre.PROFILE)
+    monitor = planned.monitor(centre=Centre.PROFILE)
     with pytest.raises(DataError, match="around the model's simulation"):
         monitor.ahead()
 

@@ -21,6 +21,7 @@ from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.running.held import Held, slowest
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from tests.core.kernel import refusals
 from tests.falling_pendulum import tracking
 from tests.forged_held import HELD_FORGERIES, forged_held
@@ -84,7 +85,7 @@ def test_a_hold_is_only_proved_of_what_starts_inside(held: FunnelDesign) -> None
     assert "every solution that starts in it at a time from 0 to 1 s" in str(held.verdict)
     assert "not before the solution's start" in str(held.verdict)
     period = slowest(HOLD)
-    monitor = Monitor(held.model, held.policy, held.funnel, period=period, held=Held(HOLD))
+    monitor = Monitor([Stage(held.model, held.policy, held.funnel, Held(period, HOLD))])
     outside = held.funnel.nominal(0.0) + np.array([2.0, 0.0])
     said = [monitor.update(0.0, outside, held.policy(0.0, outside))]
     for t in period * np.arange(1, 5):

@@ -11,6 +11,7 @@ from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.level import CHANGE, VALUE, CommandLevel, LevelMeter, Term
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from tests.core.kernel.tube_claims import MODELS, dataset, design
 from tests.marks import slow_among
 
@@ -121,7 +122,7 @@ def test_an_assumption_that_follows_is_kept_by_the_calibration_trials_and_broken
 ) -> None:
     made = design(name)
     for seed, noise, kept in ((100, 0.0, True), (100, 2.0, False)):
-        monitor, trial = Monitor(made.model, None, made.funnel), dataset(MODELS[name](), seed, 1)
+        monitor, trial = made.monitor(), dataset(MODELS[name](), seed, 1)
         recorded = trial.trajectories[0]
         rng = np.random.default_rng(0)
         spread = noise * np.ptp(recorded.y, axis=0)
@@ -138,7 +139,7 @@ def test_a_level_that_overflows_starts_a_new_run_and_is_never_inside() -> None:
     recorded = dataset(MODELS["following"](), 100, 1).trajectories[0]
     fading = CommandLevel((Term((0,), scale=1e-160, fading=0.9),), np.array([[1e-300]]))
     tubes = tuple(replace(tube, follows=fading) for tube in made.funnel.tubes)
-    monitor = Monitor(made.model, None, replace(made.funnel, tubes=tubes, response=None))
+    monitor = Monitor([Stage(made.model, None, replace(made.funnel, tubes=tubes, response=None))])
     rows = zip(recorded.t.tolist(), recorded.y + 100.0, recorded.u + 1.0, strict=True)
     said = [monitor.update(t, y, u) for t, y, u in rows]
     assert {reading.status for reading in said} == {Status.UNKNOWN}
@@ -156,8 +157,8 @@ def test_a_shift_that_breaks_no_assumption_raises_the_alarm_and_only_that() -> N
     clean, alarmed = (
         [monitor.update(t, y, u) for t, y, u in zip(r.t.tolist(), r.y, r.u, strict=True)]
         for monitor, r in (
-            (Monitor(made.model, None, lasting), recorded),
-            (Monitor(made.model, None, lasting), biased),
+            (Monitor([Stage(made.model, None, lasting)]), recorded),
+            (Monitor([Stage(made.model, None, lasting)]), biased),
         )
     )
     assert not any(r.alarm for r in clean)

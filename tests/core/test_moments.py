@@ -14,6 +14,7 @@ from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moment_rie import (
     Layout,
     MomentFit,
+    identify_from_repeats,
     minimise_moment_rie,
 )
 from nlsid_core.identification.polynomial.moments import (
@@ -21,11 +22,6 @@ from nlsid_core.identification.polynomial.moments import (
     offsets_of,
     plain_moments,
     repeated_moments,
-)
-from nlsid_core.identification.polynomial.monotone import (
-    identify_from_repeats,
-    least_squares_equation,
-    minimise_monotone_simulation_error,
 )
 from nlsid_core.polynomial import Polynomial, variables
 from tests.repeated import CLASS, NOISE, OFFSETS, pair, percent, run, total
@@ -156,7 +152,8 @@ def test_sizes_are_those_of_the_structure() -> None:
 
 def test_without_bias_removal_the_model_is_far_worse(fit: MomentFit) -> None:
     runs = pair(4000, 1)
-    naive = minimise_moment_rie(plain_moments(runs, CLASS, OFFSETS), CLASS, runs[0], OFFSETS)
+    moments = plain_moments(runs, CLASS, OFFSETS)
+    naive = minimise_moment_rie(moments, CLASS, Dataset(runs), OFFSETS)
     assert percent(naive.model) > 3.0 * percent(fit.model)
 
 
@@ -175,10 +172,9 @@ def test_responses_without_a_common_signal_are_refused() -> None:
     first = run(w, NOISE, 1)
     opposite = replace(first, y=-first.y, name="opposite")
     offsets = offsets_of([first, opposite])
+    moments = repeated_moments([[first, opposite]], CLASS, offsets)
     with pytest.raises(DataError, match="nothing in common"):
-        minimise_moment_rie(
-            repeated_moments([[first, opposite]], CLASS, offsets), CLASS, first, offsets
-        )
+        minimise_moment_rie(moments, CLASS, Dataset((first,)), offsets)
 
 
 @pytest.mark.slow
@@ -197,19 +193,11 @@ def test_the_error_falls_with_more_data() -> None:
 def test_the_bound_is_above_the_simulation_error_without_noise() -> None:
     trial = run(np.random.default_rng(4).uniform(-2, 2, 2000), 0.0, 4)
     small = Equation(1, (0,), Degrees(left=3), set="3.8")  # a model that cannot be exact
-    found = minimise_moment_rie(plain_moments([trial], small, OFFSETS), small, trial, OFFSETS)
+    moments = plain_moments([trial], small, OFFSETS)
+    found = minimise_moment_rie(moments, small, Dataset((trial,)), OFFSETS)
     simulated = found.model.simulate(trial.u, trial.y[:1, 0])
     error = float(np.mean((simulated - trial.y[:, 0])[1:] ** 2))
     assert 0 < error <= found.bound
-
-
-def test_direct_minimisation_reaches_the_noise_and_least_squares_does_not() -> None:
-    runs = pair(3000, 2)
-    plain = plain_moments(runs, CLASS, OFFSETS)
-    squares = least_squares_equation(plain, CLASS, runs[0], OFFSETS)
-    start = replace(squares, e=np.array([1.0, 0.0, 1.0]), a=np.zeros(2), b=np.zeros(1), c=0.0)
-    direct = minimise_monotone_simulation_error(start, runs)
-    assert percent(direct) < 1.0 < percent(squares)
 
 
 def test_moments_hold_their_class() -> None:

@@ -13,13 +13,14 @@ from nlsid_core.funnels.tube import Tube
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.stage import Stage
 from tests.conftest import PERIOD
 
 ROUNDING = 1e-9  # relative: the monitor evaluates in floating point
 
 
 def make_monitor(design: OutputTubeDesign, centre: Centre = Centre.COMMAND) -> Monitor:
-    return Monitor(design.model, design.policy, design.funnel, centre=centre)
+    return design.monitor(centre=centre)
 
 
 def run(design: OutputTubeDesign, y: np.ndarray, u: np.ndarray) -> list[Reading]:
@@ -221,4 +222,4 @@ def test_parts_that_do_not_belong_together_are_refused(
         OutputTube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
     )
     with pytest.raises(CertificateMismatch, match="another policy"):
-        Monitor(design.model, other.policy, design.funnel)
+        Monitor([Stage(design.model, other.policy, design.funnel)])

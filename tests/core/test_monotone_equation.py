@@ -9,14 +9,10 @@ import pytest
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification import LeastSquares, Polynomial, Rie, Sem, identify, prove_stability
-from nlsid_core.identification.polynomial.moment_rie import MomentFit
-from nlsid_core.identification.polynomial.monotone import (
-    identify_from_repeats,
-    simulate_banded,
-)
+from nlsid_core.identification.polynomial.moment_rie import MomentFit, identify_from_repeats
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.monotone_equation import is_increasing, solve_increasing
-from tests.repeated import CLASS, NOISE, pair, percent, run, truth
+from tests.repeated import CLASS, pair, percent, run, truth
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +56,6 @@ def test_simulation_solves_the_equation_and_documents_round_trip() -> None:
     again = MonotoneEquation.from_document(json.loads(json.dumps(model.document())))
     assert again.document() == model.document()
     np.testing.assert_array_equal(again.simulate(u), model.simulate(u))
-
-
-def test_the_banded_simulation_is_the_models_own() -> None:
-    trial = run(np.random.default_rng(3).uniform(-2, 2, 500), NOISE, 3)
-    own = truth().simulate(trial.u, trial.y[:2, 0])
-    banded = simulate_banded(truth(), trial)
-    assert banded is not None
-    assert np.abs(banded - own).max() < 1e-11
 
 
 def test_the_truth_is_found_and_proved(fit: MomentFit) -> None:

@@ -23,6 +23,7 @@ from nlsid_core.identification.prediction import history, simulate_trial
 from nlsid_core.models import BlockCascade, DifferenceEquation
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
 from nlsid_core.running.tubes import WATCHED
 from tests import implicit_models
@@ -39,7 +40,7 @@ def run(monitor: Monitor, trial: Trajectory) -> list[Reading]:
 
 def monitor_of(name: str) -> Monitor:
     made = design(name)
-    return Monitor(made.model, None, made.funnel)
+    return made.monitor()
 
 
 def trial_of(name: str, samples: int = 300, seed: int = 300) -> Trajectory:
@@ -112,7 +113,7 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
     for part, status in ((0.99, Status.INSIDE), (1.01, Status.ASSUMPTION_VIOLATED)):
         y = trial.y.copy()
         y[k] += part * most - innovation
-        reading = run(Monitor(made.model, None, wide), replace(trial, y=y))[k]
+        reading = run(Monitor([Stage(made.model, None, wide)]), replace(trial, y=y))[k]
         assert reading.status is status
         assert ("one sample's innovation energy" in reading.reason) == (part > 1.0)
         assert (f"assumed ({WATCHED})," in reading.reason) == (part > 1.0)
@@ -136,7 +137,7 @@ def test_a_reason_has_units_and_says_what_the_tube_does_not_rest_on() -> None:
         f"energy {number}{squared} above the level {number}{squared} at t", energies[0]
     )
     wide = replace(tube, level=1e6 * tube.level, peak=replace(tube.peak, level=1e6))
-    alone = Monitor(made.model, None, replace(made.funnel, tubes=(wide,), cusum=None))
+    alone = Monitor([Stage(made.model, None, replace(made.funnel, tubes=(wide,), cusum=None))])
     reasons = [r.reason for r in run(alone, replace(trial, y=y))]
     beside = next(reason for reason in reasons if "from the simulation" in reason)
     said = f"is {number} {re.escape(unit)} from the simulation, above {number} {re.escape(unit)}"
@@ -303,7 +304,7 @@ def test_where_float64_has_no_digits_for_a_tube_nothing_is_judged_and_none_is_de
     tubes = [replace(tube, half_widths=1e-3 * tube.half_widths) for tube in made.funnel.tubes]
     elsewhere = replace(made.funnel, model=files.digest(far.document()), tubes=tuple(tubes))
     for trial in quiet[:2]:
-        readings = run(Monitor(far, None, elsewhere), trial)
+        readings = run(Monitor([Stage(far, None, elsewhere)]), trial)
         assert {reading.status for reading in readings} == {Status.UNKNOWN}
         assert "float64 cannot tell where the simulation is" in readings[-1].reason
 
@@ -334,20 +335,19 @@ def test_a_stuck_sensor_is_caught(name: str) -> None:
 def test_an_energy_is_over_and_the_fading_tube_lasts() -> None:
     made, trial = design("linear"), trial_of("linear", 100)
     lasting, ending = (replace(made.funnel, tubes=(tube,)) for tube in made.funnel.tubes)
-    both = Monitor.of_several(made.model, [(None, lasting), (None, ending)])
-    rows = zip(trial.t, trial.y, trial.u, strict=True)
-    readings = [both.readings(float(t), y, u) for t, y, u in rows]
-    assert all(first.status is Status.INSIDE for first, _ in readings[3:])
-    assert readings[42][1].status is Status.INSIDE
-    assert readings[43][1].status is Status.UNKNOWN
-    assert "covers 40 samples" in readings[43][1].reason
-    alone = run(Monitor(made.model, None, lasting), trial)
-    assert [first for first, _ in readings] == alone, "the same bit for bit beside another"
+    assert all(
+        r.status is Status.INSIDE
+        for r in run(Monitor([Stage(made.model, None, lasting)]), trial)[3:]
+    )
+    readings = run(Monitor([Stage(made.model, None, ending)]), trial)
+    assert readings[42].status is Status.INSIDE
+    assert readings[43].status is Status.UNKNOWN
+    assert "covers 40 samples" in readings[43].reason
 
 
 def test_a_funnel_of_another_model_is_refused() -> None:
     with pytest.raises(CertificateMismatch, match="another model"):
-        Monitor(MODELS["monotone"](), None, design("linear").funnel)
+        Monitor([Stage(MODELS["monotone"](), None, design("linear").funnel)])
 
 
 def test_a_funnel_reads_back_as_it_was_written() -> None:

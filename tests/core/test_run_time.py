@@ -32,6 +32,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.grid import Grid
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from tests.tracked import PERIOD, STEPS, designed, run
 
 WIDE = Limits(lowest=-1e300, highest=1e300, stop_rate=1.0)
@@ -77,7 +78,7 @@ def overflowing() -> tuple[StateModel, SampledPolicy, SampledFunnel]:
 def test_an_estimate_that_is_no_number_is_outside_and_ends_the_run() -> None:
     """The robot stands at 50 m, the tube ends at 1 m; NaN is not greater than 1."""
     model, policy, funnel = overflowing()
-    monitor = Monitor(model, policy, funnel)
+    monitor = Monitor([Stage(model, policy, funnel)])
     first = monitor.update(0.0, [1e3], policy(0, np.array([1e3])))
     assert first.status is Status.INSIDE
     with np.errstate(over="ignore", invalid="ignore"):
@@ -92,7 +93,7 @@ def test_an_estimate_that_is_no_number_is_outside_and_ends_the_run() -> None:
 
 def test_a_controller_never_sends_an_input_that_is_no_number() -> None:
     model, policy, funnel = overflowing()
-    controller = Controller(model, policy, funnel, limits=WIDE, settling=1.0)
+    controller = Controller([Stage(model, policy, funnel)], WIDE, 1.0)
     before = controller.update(0.0, np.array([1.0]))
     assert np.isfinite(before).all()
     controller._observer.begin([np.array([1e3])], [])
@@ -181,7 +182,7 @@ def test_a_robot_outside_by_thousands_of_levels_is_outside_however_steep_the_tub
     assert rounded(STEEP, deviation) <= LEVEL, "what a comparison of x'Px would see"
     assert value(STEEP, deviation) > 5000 * Fraction(LEVEL)
     funnel = replace(funnel, policy=files.digest(policy.document()))
-    monitor = Monitor(model, policy, funnel, centre=Centre.PROFILE)
+    monitor = Monitor([Stage(model, policy, funnel)], centre=Centre.PROFILE)
     for k in (-2, -1):
         monitor.update(k * 0.1, 0.0, 0.0)
     reading = monitor.update(0.0, float(start[0]), 0.0)
@@ -202,7 +203,7 @@ def test_a_disturbance_above_its_bound_by_less_than_rounding_is_not_kept() -> No
     assumed = DisturbanceAssumption("peak", S * y, 0.0, 1.5, ())
     for bound, status in ((S * y, Status.ASSUMPTION_VIOLATED), (S * y * 1.0001, Status.INSIDE)):
         narrow = replace(funnel, S=np.full((4, 1, 1), S), assumption=replace(assumed, bound=bound))
-        monitor = Monitor(model, policy, narrow)
+        monitor = Monitor([Stage(model, policy, narrow)])
         monitor.update(0.0, [0.0], [0.0])
         assert monitor.update(0.1, [y], policy(1, np.array([y]))).status is status
 
@@ -273,7 +274,7 @@ def test_what_float64_cannot_hold_is_refused_by_the_monitor_and_at_design(
         refuse_unmonitorable(far)
     monkeypatch.setattr(factor, "MOST_ROUNDING", 1e-20)
     with pytest.raises(DataError, match="too ill-conditioned"):
-        Monitor(model, policy, funnel)
+        Monitor([Stage(model, policy, funnel)])
     with pytest.raises(DataError, match="too ill-conditioned"):
         design_output_tube(
             OutputTube(design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0)
@@ -304,7 +305,7 @@ def test_a_lost_first_message_does_not_shift_the_plan() -> None:
 def test_a_quarter_of_a_period_late_each_time_is_not_on_the_grid() -> None:
     """Each stamp is within the tolerance of the one before; the plan ends 6 samples early."""
     made, recorded = designed(), run()
-    monitor = Monitor(made.model, made.policy, made.funnel)
+    monitor = made.monitor()
     said = [
         monitor.update(1.249 * k * PERIOD, y, u)
         for k, (y, u) in enumerate(zip(recorded.y, recorded.u, strict=True))
@@ -317,7 +318,7 @@ def test_a_quarter_of_a_period_late_each_time_is_not_on_the_grid() -> None:
 def test_a_controller_holds_stamps_against_its_start_too() -> None:
     made, recorded = designed(), run()
     limits = Limits(lowest=-9.0, highest=9.0, stop_rate=50.0)
-    controller = Controller(made.model, made.policy, made.funnel, limits=limits, settling=1.0)
+    controller = made.controller(limits, 1.0)
     for k in range(3):
         controller.update(1.249 * k * PERIOD, recorded.y[k])
     assert "from when the next one" in controller.ended
@@ -325,7 +326,7 @@ def test_a_controller_holds_stamps_against_its_start_too() -> None:
 
 def test_stamps_that_scatter_without_drifting_stay_on_the_grid() -> None:
     made, recorded = designed(), run()
-    monitor, rng = Monitor(made.model, made.policy, made.funnel), np.random.default_rng(0)
+    monitor, rng = made.monitor(), np.random.default_rng(0)
     for k, (y, u) in enumerate(zip(recorded.y, recorded.u, strict=True)):
         jitter = 0.2 * rng.uniform(-1.0, 1.0) if k else 0.0
         assert monitor.update((k + jitter) * PERIOD, y, u).status is Status.INSIDE
@@ -356,7 +357,7 @@ def test_a_controller_stops_where_the_proof_ends_though_the_plan_goes_on(
     assert design.policy is not None
     assert len(design.policy) > samples
     limits = Limits(lowest=-1.0, highest=1.0, stop_rate=1.0)
-    controller = Controller(design.model, design.policy, funnel, limits=limits, settling=30.0)
+    controller = Controller([Stage(design.model, design.policy, funnel)], limits, 30.0)
     model, n = design.model, len(design.model)
     plan = design.policy.plan(model)
     y_rest = plan.y[0]
@@ -377,7 +378,7 @@ def test_an_input_is_never_beyond_the_range_of_the_model_and_what_is_sent_is_pro
     assert policy is not None
     plan, (lowest, highest) = policy.plan(model), model.u_range
     funnel = wide_start(design.funnel)
-    controller = Controller(model, policy, funnel, limits=WIDE, settling=30.0)
+    controller = Controller([Stage(model, policy, funnel)], WIDE, 30.0)
     n = len(model)
     y_rest = plan.y[0]
     sent, asked = [], []
@@ -404,7 +405,7 @@ def test_a_command_between_the_plans_and_the_policys_is_one_the_proof_covers(
     plan, funnel, n = policy.plan(model), wide_start(design.funnel), len(model)
     y_rest = plan.y[0]
     for part, kept in ((0.0, True), (0.4, True), (1.0, True), (1.2, False), (-0.2, False)):
-        monitor = Monitor(model, policy, funnel, centre=Centre.PROFILE)
+        monitor = Monitor([Stage(model, policy, funnel)], centre=Centre.PROFILE)
         for k in range(n):
             monitor.update((k - n) * model.period, y_rest - 0.01, float(policy.u[0]))
         x = model.state_after([y_rest - 0.01] * n, [float(policy.u[0])] * n)
@@ -415,7 +416,7 @@ def test_a_command_between_the_plans_and_the_policys_is_one_the_proof_covers(
 
 def test_time_to_exit_is_when_a_steadily_falling_margin_reaches_zero() -> None:
     made = designed()
-    monitor = Monitor(made.model, made.policy, made.funnel)
+    monitor = made.monitor()
     direction = np.linalg.solve(made.funnel.S[0], [1.0, 0.0])
     said = []
     for k in range(9):

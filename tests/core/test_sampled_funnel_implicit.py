@@ -16,6 +16,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected, Infeasib
 from nlsid_core.proofs import check
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from nlsid_core.running.stage import Stage
 from tests import forged_tracking
 from tests.implicit_funnels import STEPS, designed
 from tests.implicit_pendulum import PERIOD, truth
@@ -194,7 +195,7 @@ def test_the_monitor_flags_a_step_that_ends_at_a_root_beyond_the_proved_ones() -
     assert design.funnel.roots is not None
     narrow = replace(design.funnel, roots=1e-9 * design.funnel.roots)
     for funnel, status in ((design.funnel, Status.INSIDE), (narrow, Status.ASSUMPTION_VIOLATED)):
-        monitor = Monitor(design.model, design.policy, funnel)
+        monitor = Monitor([Stage(design.model, design.policy, funnel)])
         x = design.policy.x[0] + np.linalg.solve(funnel.S[0], [0.1 * funnel.tube[0], 0.0])
         u = design.policy(0, x)
         assert monitor.update(0.0, x, u).status is Status.INSIDE
@@ -210,7 +211,7 @@ def test_the_monitor_reads_unknown_where_the_model_has_no_next_state() -> None:
         truth(), exponents=np.array([[0, 2, 0], [0, 0, 1]]), coefficients=np.array([[1e3], [1.0]])
     )  # w = v + 10 (v² + w²) has no root from v = 1 on
     other = resigned(design, model=model)
-    monitor = Monitor(other.model, other.policy, other.funnel)
+    monitor = other.monitor()
     start = other.policy.x[0] + np.array([0.0, 1.0])
     monitor.update(0.0, start, other.policy(0, start))
     reading = monitor.update(PERIOD, start, np.zeros(1))

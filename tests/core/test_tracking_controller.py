@@ -18,7 +18,6 @@ from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.running.controller import Controller, Limits
-from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from tests.tracked import PERIOD, STEPS, designed
 
@@ -64,7 +63,7 @@ def test_every_input_is_the_policys_and_the_run_stays_inside() -> None:
     y, u = run(made.model, controller)
     assert controller.ended == "the plan is over"
     assert len(y) == STEPS + 1
-    monitor = Monitor(made.model, made.policy, made.funnel)
+    monitor = made.monitor()
     said = [monitor.update(k * PERIOD, y[k], u[k]) for k in range(STEPS + 1)]
     assert {reading.status for reading in said} == {Status.INSIDE}
 
@@ -146,7 +145,7 @@ def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_sta
     judged = [e for e in stamped if e.reading.status is not Status.UNKNOWN]
     expected = []
     for y, u in runs:
-        monitor = Monitor(made.model, made.policy, made.funnel)
+        monitor = made.monitor()
         expected += [monitor.update(k * PERIOD, y[k], u[k]).margin for k in range(len(y))]
     assert [e.reading.margin for e in judged] == expected
     assert {e.reading.status for e in judged} == {Status.INSIDE}

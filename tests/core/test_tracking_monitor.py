@@ -11,13 +11,14 @@ from nlsid_core.design.sampled.design import assume
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.stage import Stage
 from tests.tracked import PERIOD, designed, run, tracked
 
 
 def readings(recorded: Trajectory) -> list[Reading]:
     """What the monitor says of every sample."""
     design = designed()
-    monitor = Monitor(design.model, design.policy, design.funnel)
+    monitor = design.monitor()
     return [
         monitor.update(float(t), y, u)
         for t, y, u in zip(recorded.t, recorded.y, recorded.u, strict=True)
@@ -87,7 +88,7 @@ def test_a_bad_sample_reads_unknown_from_then_on(
     t: float, y: list[float], u: list[float] | None, reason: str
 ) -> None:
     design = designed()
-    monitor = Monitor(design.model, design.policy, design.funnel)
+    monitor = design.monitor()
     recorded = run()
     monitor.update(0.0, recorded.y[0], recorded.u[0])
     reading = monitor.update(t, y, u)
@@ -101,7 +102,7 @@ def test_a_bad_sample_reads_unknown_from_then_on(
 
 def test_after_the_horizon_nothing_is_claimed() -> None:
     design, recorded = designed(), run()
-    monitor = Monitor(design.model, design.policy, design.funnel)
+    monitor = design.monitor()
     for t, y, u in zip(recorded.t, recorded.y, recorded.u, strict=True):
         monitor.update(float(t), y, u)
     reading = monitor.update(float(recorded.t[-1]) + PERIOD, recorded.y[-1], recorded.u[-1])
@@ -112,12 +113,12 @@ def test_after_the_horizon_nothing_is_claimed() -> None:
 def test_a_funnel_of_another_policy_is_refused() -> None:
     design = designed()
     with pytest.raises(CertificateMismatch):
-        Monitor(design.model, designed(goal=0.3).policy, design.funnel)
+        Monitor([Stage(design.model, designed(goal=0.3).policy, design.funnel)])
 
 
 def test_a_state_of_another_size_is_an_error() -> None:
     design = designed()
-    monitor = Monitor(design.model, design.policy, design.funnel)
+    monitor = design.monitor()
     with pytest.raises(ShapeError):
         monitor.update(0.0, [0.0, 0.0, 0.0], [0.0])
 

@@ -123,17 +123,6 @@ def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(
         assert numbers["low"] < 0.0 < numbers["high"], "the car stands still, as it is told"
 
 
-def test_of_a_robot_in_motion_nothing_is_said_until_the_start_has_faded(
-    stack: ExitStack, tube: Path
-) -> None:
-    robot = Car(stack, tube, nominal="motion")
-    fades = "samples: the start fades"
-    robot.drive_until(lambda: robot.has_said(fades), lambda k: 0.3 if k < 3 else 0.0)
-    robot.drive_until(lambda: robot.has_said("inside"))
-    assert robot.k > 20
-    assert not robot.has_said("violated"), "three outputs at the start were off"
-
-
 class Sprung(Car):
     """A robot on a cubic spring, watched by a tube that is proved for commands up to 1.5 N."""
 

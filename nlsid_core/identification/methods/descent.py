@@ -57,10 +57,15 @@ class StableSet(Protocol):
         ...
 
 
-def descend(problem: StableSet, theta: FloatArray, *, steps: int) -> FloatArray | None:
-    """θ in the set with a local minimum of |r|²; None if no step from `theta` enters the set."""
-    best, cost, damping, small = None, np.inf, FIRST_DAMPING, 0
-    found = problem.outputs(theta)
+def descend(
+    problem: StableSet, theta: FloatArray, *, steps: int, inside: bool = False
+) -> FloatArray | None:
+    """θ in the set with a local minimum of |r|²; None if no step from `theta` enters the set.
+
+    inside: `theta` is in the set, and is what is returned if no step goes down.
+    """
+    best, cost = (theta, problem.cost(theta)) if inside else (None, np.inf)
+    damping, small, found = FIRST_DAMPING, 0, problem.outputs(theta)
     for _ in range(steps):
         if found is None:
             break

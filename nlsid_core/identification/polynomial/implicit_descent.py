@@ -16,6 +16,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.identification.methods.descent import Outputs, Step, descend
 from nlsid_core.identification.polynomial.implicit_rie import (
+    Model,
+    Proof,
     indeterminates_of,
     kept_in_set,
     left_coefficients,
@@ -24,9 +26,9 @@ from nlsid_core.identification.polynomial.implicit_rie import (
     unknowns,
 )
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, delayed_states
-from nlsid_core.identification.polynomial.rollout import DIVERGED, Rollout
-from nlsid_core.identification.proofs.stable_sets import ImplicitProof
-from nlsid_core.models import ImplicitModel, Signal
+from nlsid_core.identification.polynomial.rollout import DIVERGED, Linearised, Rollout
+from nlsid_core.models import ImplicitModel, MonotoneEquation, Signal
+from nlsid_core.models.monotone_equation import is_increasing
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables
 from nlsid_core.polynomial.maps import combinations
@@ -39,10 +41,13 @@ SCALE = 4.0  # of the coefficients that a descent begins with: what Q may then g
 
 @dataclass(frozen=True, eq=False)
 class ImplicitSet:
-    """The set of the rows' class, and the trials of the rows. slowest: rate that it keeps."""
+    """The set of the rows' class, and the trials of the rows.
+
+    slowest: rate that it keeps; None: no set, but e of one output increases.
+    """
 
     rows: ImplicitRows
-    slowest: float
+    slowest: float | None
 
     @cached_property
     def rollout(self) -> Rollout:
@@ -79,11 +84,17 @@ class ImplicitSet:
         both = theta.reshape(-1, len(self.rows.y_scale[0]))
         return both[: len(self.rows.left)], both[len(self.rows.left) :]
 
+    def solved(self, theta: FloatArray) -> tuple[FloatArray, Linearised] | None:
+        """`Rollout.solved`; None where e does not increase, if that is not kept by a set."""
+        e, f = self.split(theta)
+        if self.slowest is None and not is_increasing(np.pad(e[:, 0], (0, 3 - len(e)))):
+            return None
+        return self.rollout.solved(np.concatenate([e, -f]))
+
     def outputs(self, theta: FloatArray) -> Outputs | None:
         """In spreads of the outputs, of all samples that are not given."""
-        e, f = self.split(theta)
-        rollout, n_v = self.rollout, e.shape[1]
-        solved = rollout.solved(np.concatenate([e, -f]))
+        e, _ = self.split(theta)
+        rollout, n_v, solved = self.rollout, e.shape[1], self.solved(theta)
         if solved is None:
             return None
         y, jacobian = solved
@@ -97,8 +108,7 @@ class ImplicitSet:
 
     def cost(self, theta: FloatArray) -> float:
         """Σ |ŷ - y|², in spreads."""
-        e, f = self.split(theta)
-        solved = self.rollout.solved(np.concatenate([e, -f]))
+        solved = self.solved(theta)
         if solved is None or not np.abs(solved[0]).max() < DIVERGED:
             return np.inf
         return float(np.sum((solved[0] - self.rollout.measured) ** 2))
@@ -108,6 +118,16 @@ class ImplicitSet:
 
         Terms of f in the inputs alone are eliminated from the program.
         """
+        along = step.D * step.theta / np.linalg.norm(step.D * step.theta)
+        across = np.sqrt(step.damping) * (
+            np.eye(len(step.D)) - (1.0 - FREE) * np.outer(along, along)
+        )
+        everything = np.concatenate([step.R, across])
+        right_side = np.concatenate([step.r, np.zeros(len(across))])
+        if self.slowest is None:
+            return np.asarray(
+                step.theta - np.linalg.lstsq(everything, right_side, rcond=None)[0] / step.D
+            )
         rows, (bound,) = self.rows, variables("bound")
         n_v, n_e = len(rows.y_scale[0]), len(rows.left)
         e, f = unknowns(rows)
@@ -118,12 +138,6 @@ class ImplicitSet:
         ]
         names = list(np.array(columns, dtype=object).T.ravel())
         kept = np.repeat(np.concatenate([np.ones(n_e, dtype=bool), ~rows.driven]), n_v)
-        along = step.D * step.theta / np.linalg.norm(step.D * step.theta)
-        across = np.sqrt(step.damping) * (
-            np.eye(len(step.D)) - (1.0 - FREE) * np.outer(along, along)
-        )
-        everything = np.concatenate([step.R, across])
-        right_side = np.concatenate([step.r, np.zeros(len(across))])
         first = int((~kept).sum())
         factor: FloatArray = np.asarray(
             np.linalg.qr(
@@ -152,7 +166,7 @@ def minimise_certified_implicit(
     *,
     slowest: float = 1.0,
     steps: int,
-) -> tuple[ImplicitModel, ImplicitProof] | None:
+) -> tuple[Model, Proof] | None:
     """A local minimum of Σ |y - ŷ|² in the set, from scaled e and f in it or not, with its proof.
 
     None if there is none, or it has no exact proof.
@@ -164,3 +178,14 @@ def minimise_certified_implicit(
         return None
     model, proof = kept_in_set(rows, *inside.split(found), MONOTONE)
     return None if proof is None else (model, proof)
+
+
+def minimise_equation(
+    rows: ImplicitRows, start: tuple[FloatArray, FloatArray], *, steps: int
+) -> MonotoneEquation | None:
+    """The same of set 3.8 without the set: nothing makes the equation stable."""
+    everywhere, theta = ImplicitSet(rows, None), np.concatenate(start).ravel()
+    found = descend(everywhere, theta, steps=steps, inside=True)
+    if found is None or not np.isfinite(everywhere.cost(found)):
+        return None
+    return rows.equation(*everywhere.split(found))

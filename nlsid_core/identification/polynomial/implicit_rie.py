@@ -29,13 +29,14 @@ from nlsid_core.identification.polynomial.implicit_rows import (
 from nlsid_core.identification.proofs import conditions
 from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.sets import Names
+from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.proofs.stable_sets import (
     ImplicitProof,
     prove_implicit,
     storage_template,
 )
 from nlsid_core.identification.regressors import FEWER
-from nlsid_core.models import ImplicitModel
+from nlsid_core.models import ImplicitModel, MonotoneEquation
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import (
@@ -58,6 +59,8 @@ HALF = 0.5  # of what the search keeps: what is left for the exact proof
 SMALL_DELTA = 1e-3  # δ that is tried for a model no set was kept for, e being 1-monotone
 
 Objects = NDArray[np.object_]
+Model = ImplicitModel | MonotoneEquation
+Proof = ImplicitProof | StabilityProof
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +70,8 @@ class ImplicitFit:
     e, f: its coefficients (m, n_v) for scaled signals.
     """
 
-    model: ImplicitModel
-    proof: ImplicitProof
+    model: Model
+    proof: Proof
     bound: float
     e: FloatArray
     f: FloatArray
@@ -113,7 +116,7 @@ def refuse_large_program(rows: ImplicitRows) -> None:
 
 def kept_in_set(
     rows: ImplicitRows, e: FloatArray, f: FloatArray, monotone: float
-) -> tuple[ImplicitModel, ImplicitProof | None]:
+) -> tuple[Model, Proof | None]:
     """The model of scaled coefficients for which the set's inequality kept Q, and its proof.
 
     monotone: what was kept of ∂e/∂v + (∂e/∂v)' in scaled signals.
@@ -122,7 +125,7 @@ def kept_in_set(
     return model, _proved(model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0))
 
 
-def implicit_equation_error(rows: ImplicitRows) -> ImplicitModel:
+def implicit_equation_error(rows: ImplicitRows) -> Model:
     """Least squares on the equation error with a 1-monotone e: well posed, perhaps unstable."""
     return rows.model(*least_squares_coefficients(rows), HALF / 2.0)
 
@@ -136,12 +139,14 @@ def least_squares_coefficients(rows: ImplicitRows) -> tuple[FloatArray, FloatArr
     return coefficients(_interior(parts, rows.names)[0], rows)
 
 
-def prove_in_set(model: ImplicitModel, rows: ImplicitRows) -> ImplicitProof | None:
+def prove_in_set(model: Model, rows: ImplicitRows) -> Proof | None:
     """A proof that a model of these rows is in their class's set, if the search finds one."""
     return _proved(model, rows, SMALL_DELTA)
 
 
-def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitProof | None:
+def _proved(model: Model, rows: ImplicitRows, delta: float) -> Proof | None:
+    if isinstance(model, MonotoneEquation):
+        return prove_stability(model)
     mean, spread = rows.units
     n_v = len(rows.y_scale[0])
     sizes = np.abs(mean) + spread

@@ -17,10 +17,12 @@ from scipy.linalg import solve_triangular
 from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
+from nlsid_core.identification.polynomial.moment_rie import equation
+from nlsid_core.identification.polynomial.moments import Offsets
 from nlsid_core.identification.polynomial.options import Polynomial as Options
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
-from nlsid_core.models import ImplicitModel
+from nlsid_core.models import ImplicitModel, MonotoneEquation
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import signals_of
 from nlsid_core.polynomial import Polynomial, monomials, variables
@@ -61,9 +63,9 @@ class ImplicitRows:
 
     @property
     def set(self) -> str:
-        """The set of the models."""
+        """The set of the models; 3.8 is 2.11 for what is affine but in y(t)."""
         assert self.model_class.form is not None, "equations of Chapter 4 have rows of their own"
-        return self.model_class.form
+        return "2.11" if self.model_class.form == "3.8" else self.model_class.form
 
     @property
     def states(self) -> int:
@@ -121,12 +123,26 @@ class ImplicitRows:
         of_u = [i for i, _ in self.model_class.window(len(self.u_scale[0]))]
         return [*(list(box[:n_v]) * self.model_class.lags), *(box[n_v + i] for i in of_u)]
 
-    def model(self, e: FloatArray, f: FloatArray, monotonicity: float) -> ImplicitModel:
+    def equation(self, e: FloatArray, f: FloatArray) -> MonotoneEquation:
+        """e(v) = f(x, w) of set 3.8, of scaled e (m_e, 1) and f (m_f, 1)."""
+        mean, spread = self.y_scale
+        powers = spread[0] ** np.arange(1, len(e) + 1)
+        constant = f[~self.right.any(axis=1)].sum()
+        slopes = self.right.T @ f[:, 0] / self.units[1]  # every other term is one state or input
+        c = np.concatenate([e[:, 0] / powers, [-constant], -slopes])
+        offsets = Offsets(float(mean[0]), self.u_scale[0])
+        return equation(c / c[0], self.model_class, self.dataset, offsets)
+
+    def model(
+        self, e: FloatArray, f: FloatArray, monotonicity: float
+    ) -> ImplicitModel | MonotoneEquation:
         """e(v) = f(x, w) in the signals' units, of scaled e (m_e, n_v), f (m_f, n_v).
 
         monotonicity: of the scaled e, and of the model: both sides are multiplied by the square of
         the largest spread, so that every condition on the scaled model holds with the same δ.
         """
+        if self.model_class.form == "3.8":
+            return self.equation(e, f)
         largest = float(np.max(self.y_scale[1]))
         n_v, n, names = len(self.y_scale[0]), self.states, self.names
         mean, spread = self.units

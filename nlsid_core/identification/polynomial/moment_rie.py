@@ -14,6 +14,7 @@ Source: thesis (3.6)-(3.9), Claim 3.6, Section 3.5.2, with V = |x₁ - x₂|²_P
 2.10, 2.16.
 """
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,11 +24,17 @@ import scipy.sparse as sp
 from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.identification.polynomial.moments import Moments, Offsets
+from nlsid_core.identification.polynomial.moments import (
+    Moments,
+    Offsets,
+    offsets_of,
+    repeated_moments,
+)
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
+from nlsid_core.identification.repeats import refuse_false_repeats
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.signal import signals_of
 
@@ -47,24 +54,56 @@ class MomentFit:
     bound: float
 
 
+def identify_from_repeats(
+    data: Dataset,
+    model_class: Polynomial,
+    *,
+    transient: int = 0,
+    accept_untested_repeats: bool = False,
+    slowest: float = 1.0,
+    executor: Executor | None = None,
+) -> MomentFit:
+    """Identify a `MonotoneEquation` from the dataset's groups of repeats, proved stable.
+
+    Trajectories without a repeat are not used. transient: samples at the start of each that the
+    test of the repeats leaves out. accept_untested_repeats: skip that test; the bias of noise is
+    then removed only if the trials repeat one excitation all the same. slowest: as of
+    `minimise_moment_rie`. executor: for the moments.
+    Raises DataError if there are no repeats or they are not repeats, ShapeError for several
+    outputs, Infeasible or SolverError as `minimise_moment_rie`.
+    """
+    groups = tuple(data.repeats().values())
+    if not groups:
+        raise DataError(
+            "no two trajectories share a `group`: bias removal needs repeated experiments; without "
+            "them use another method"
+        )
+    if not accept_untested_repeats:
+        refuse_false_repeats(data, transient=transient)
+    used = Dataset(tuple(trial for group in groups for trial in group))
+    offsets = offsets_of(used.trajectories)
+    moments = repeated_moments(groups, model_class, offsets, executor=executor)
+    return minimise_moment_rie(moments, model_class, used, offsets, slowest=slowest)
+
+
 def minimise_moment_rie(
     moments: Moments,
     model_class: Polynomial,
-    template: Trajectory,
+    data: Dataset,
     offsets: Offsets,
     *,
     slowest: float = 1.0,
 ) -> MomentFit:
     """The stable model with the least bound on these moments, and its exact proof.
 
-    template: names, units and sample time. slowest: V shrinks by its square or more, a sample.
+    data: what they are of. slowest: V shrinks by its square or more, a sample.
     Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
     exact proof, SolverError if the solver gives up.
     """
     problem = Problem.of(moments, model_class.lags, slowest)
     solution = problem.solve()
     c = (problem.columns * solution.x)[problem.layout.c]
-    model = equation(c / c[0], model_class, template, offsets)  # the scale of both sides is free
+    model = equation(c / c[0], model_class, data, offsets)  # the scale of both sides is free
     proof = prove_stability(model)
     if proof is None:
         raise Infeasible(
@@ -74,21 +113,22 @@ def minimise_moment_rie(
 
 
 def equation(
-    c: FloatArray, model_class: Polynomial, template: Trajectory, offsets: Offsets
+    c: FloatArray, model_class: Polynomial, data: Dataset, offsets: Offsets
 ) -> MonotoneEquation:
     """The model ε = c'Λ = 0."""
-    D, n = model_class.degrees.left, model_class.lags
+    D, n, first = model_class.degrees.left, model_class.lags, data.trajectories[0]
     return MonotoneEquation(
         e=np.concatenate([c[:D], np.zeros(3 - D)]),
         a=-c[D + 1 : D + 1 + n],
         b=-c[D + 1 + n :],
         c=-float(c[D]),
-        window=model_class.window(template.u.shape[1]),
+        window=model_class.window(first.u.shape[1]),
         y_offset=offsets.y,
         u_offset=offsets.u,
-        period=template.period,
-        y=signals_of(template, "y")[0],
-        u=signals_of(template, "u"),
+        period=data.period,
+        y=signals_of(first, "y")[0],
+        u=signals_of(first, "u"),
+        bags=data.bags,
     )
 
 

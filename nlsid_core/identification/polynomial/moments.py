@@ -22,10 +22,6 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification.polynomial.options import Polynomial
-from nlsid_core.identification.regressors import FEWER
-
-CONSTANT = 1e-10  # relative rms below which an input minus its mean is rounding
-RANK_TOLERANCE = 1e-12  # relative eigenvalue of unit moments at which inputs repeat each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,35 +132,6 @@ def repeated_moments(
     classes, shifts = [model_class] * len(pairs), [offsets] * len(pairs)
     mapped = map if executor is None else executor.map
     return reduce(add, mapped(_pair, first, second, classes, shifts))
-
-
-def refuse_unexcited(
-    moments: Moments, model_class: Polynomial, template: Trajectory, offsets: Offsets
-) -> None:
-    """DataError if an input is constant, or the window of inputs and a constant repeat themselves.
-
-    template: for the names of the inputs.
-    """
-    n = model_class.lags
-    window = model_class.window(template.u.shape[1])
-    block = np.zeros((len(window) + 1,) * 2)
-    block[0, 0] = 1.0
-    block[0, 1:] = block[1:, 0] = moments.mixed[0, n:] / moments.count
-    block[1:, 1:] = moments.products[n:, n:] / moments.count
-    sizes = np.sqrt(np.maximum(np.diag(block), 0.0))
-    for (i, _), size in zip(window, sizes[1:], strict=True):
-        if size <= CONSTANT * max(1.0, abs(float(offsets.u[i]))):
-            raise DataError(
-                f"the excitation {template.u_names[i]} is constant ({offsets.u[i]:g}) in all "
-                "trials: nothing can be identified from it"
-            )
-    singular = np.linalg.svd(block / np.outer(sizes, sizes), compute_uv=False)
-    rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
-    if rank < len(block):
-        raise DataError(
-            f"the excitation does not excite the window of {len(window)} inputs: with a constant "
-            f"it has rank {rank}, not {len(block)}; {FEWER}"
-        )
 
 
 def plain_moments(
