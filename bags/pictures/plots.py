@@ -1,8 +1,9 @@
 """Pictures for reports (extra `report`: matplotlib). Each function returns a Figure."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +16,7 @@ from nlsid_core.running.reading import Reading, Status
 
 INK, BLUE, ORANGE, RED, GREY = "#222222", "#1f6fb4", "#d9822b", "#c23b3b", "#9aa0a6"
 LINE = 1.2
+Place = Literal["outside upper left", "outside upper right", "outside lower left"]
 
 
 def svg(figure: Figure) -> str:
@@ -61,10 +63,10 @@ def grid(
 
 
 def legend(
-    figure: Figure, panels: Sequence[Axes], *, loc: str = "outside upper left", ncols: int = 3
+    figure: Figure, panels: Iterable[Axes], *, loc: Place = "outside upper left", ncols: int = 3
 ) -> None:
     """One legend for these panels, each label once."""
-    named = {}
+    named: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
