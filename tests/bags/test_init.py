@@ -526,7 +526,7 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
     u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
     assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
     said = nlsid("init", tmp_path, tmp_path / "a", tmp_path / "b", "-u", u, "-y", y)
-    assert re.search(r"expect 0\.\d+ % error in simulation", said)
+    assert re.search(r"expect 1\.\d+ % error .* of the part of the trial held back.*: good", said)
     assert "if a trial begins near half a turn" in said
 
 
