@@ -10,7 +10,7 @@ Read in this order: `files` (untrusted input), `exact` (definite matrices), `pol
 """
 
 from .checking import KINDS, LEFT, check, decide
-from .files import REASONS, Mismatch, Rejected
+from .files import REASONS, Rejected
 from .text import Verdict
 
-__all__ = ["KINDS", "LEFT", "REASONS", "Mismatch", "Rejected", "Verdict", "check", "decide"]
+__all__ = ["KINDS", "LEFT", "REASONS", "Rejected", "Verdict", "check", "decide"]

@@ -44,7 +44,7 @@ LEFT = (
 def check(path: str | os.PathLike[str]) -> Verdict:
     """Decide the proof file at `path` about the files beside it.
 
-    Raises Rejected with the reason (Mismatch if a file is not the one that the proof is about).
+    Raises Rejected with the reason.
     OSError if `path` itself cannot be read.
     """
     folder = Path(path).parent

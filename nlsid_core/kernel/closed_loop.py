@@ -8,18 +8,17 @@ between samples" in docs/theory-funnels.md.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise, product
 from math import prod
 from typing import Any
 
-from .exact import Matrix, dot
+from .exact import dot
 from .files import Node, Terms, limit
 from .polynomials import Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .trajectory import MAX_PIECES, Field, Funnel, Mode, Part, Piece, in_order, pushed
+from .trajectory import MAX_PIECES, Case, Motion, Part, Piece, in_order, pushed
 
 Corner = tuple[int, ...]  # -1 or 1 for each input that is off; 0 where it is not
 
@@ -30,24 +29,24 @@ class ClosedLoop:
     gap: ρ - W, W = x̄'Px̄. held: what is nonnegative in the mode. moved: dx₀/ds.
     """
 
-    def __init__(self, funnel: Funnel, ring: Ring, part: Part, mode: Mode) -> None:
+    def __init__(self, motion: Motion, ring: Ring, part: Part, mode: Case) -> None:
         (k, level, index), x = part, ring.variables
-        self.funnel, self.ring, self.k = funnel, ring, k
-        self.h = funnel.t[k + 1] - funnel.t[k]
+        self.motion, self.ring, self.k = motion, ring, k
+        self.h = motion.t[k + 1] - motion.t[k]
         self.in_time = partial(ring.bernstein, level=level, index=index)
-        self.rho = self.in_time(funnel.rho[k : k + 2])
-        rows = zip(funnel.P[k], funnel.P[k + 1], strict=True)
+        self.rho = self.in_time(motion.rho[k : k + 2])
+        rows = zip(motion.P[k], motion.P[k + 1], strict=True)
         self.Px = [ring.dot(self._curve(pair), x) for pair in rows]
         self.gap = self.rho - ring.dot(x, self.Px)
-        self.moved = self._curve(slopes(funnel.x[k]))
-        states = [p + e for p, e in zip(self._curve(funnel.x[k]), x, strict=True)]
-        self.known = [self.in_time(funnel.t[k : k + 2]), *states]
+        self.moved = self._curve(slopes(motion.x[k]))
+        states = [p + e for p, e in zip(self._curve(motion.x[k]), x, strict=True)]
+        self.known = [self.in_time(motion.t[k : k + 2]), *states]
         self._put: dict[Corner, Callable[[Terms], Polynomial]] = {}
 
-        planned = enumerate(self._curve(funnel.u[k]))  # ũ = u₀ - Kx̄
+        planned = enumerate(self._curve(motion.u[k]))  # ũ = u₀ - Kx̄
         self.inputs = [u - ring.dot(self._curve(self._gains(i)), x) for i, u in planned]
         self.held = []
-        for side, (i, (low, high)) in zip(mode, funnel.limits.items(), strict=True):
+        for side, (i, (low, high)) in zip(mode, motion.limits.items(), strict=True):
             wanted = self.inputs[i]
             if side:
                 self.held.append(low - wanted if side < 0 else wanted - high)
@@ -58,9 +57,9 @@ class ClosedLoop:
     @cached_property
     def drift(self) -> Polynomial:
         """dρ/ds + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄: what neither f nor a multiplier is in."""
-        funnel, ring, k = self.funnel, self.ring, self.k
-        bend = [slopes(rows)[0] for rows in zip(funnel.P[k], funnel.P[k + 1], strict=True)]
-        rise = funnel.rho[k + 1] - funnel.rho[k]
+        motion, ring, k = self.motion, self.ring, self.k
+        bend = [slopes(rows)[0] for rows in zip(motion.P[k], motion.P[k + 1], strict=True)]
+        rise: Fraction = motion.rho[k + 1] - motion.rho[k]
         return 2 * ring.dot(self.moved, self.Px) + rise - ring.form(bend, ring.variables)
 
     def rates(
@@ -76,7 +75,7 @@ class ClosedLoop:
     def turning(self, i: int, f: Sequence[Polynomial]) -> Polynomial:
         """dũ_i/ds = du₀/ds - (dK/ds)x̄ - K(h f - dx₀/ds), where ẋ = f."""
         ring, gains = self.ring, self._gains(i)
-        (planned,) = self._curve(slopes([[u[i]] for u in self.funnel.u[self.k]]))
+        (planned,) = self._curve(slopes([[u[i]] for u in self.motion.u[self.k]]))
         turned = ring.dot(self._curve(slopes(gains)), ring.variables)
         moved = [m - self.h * rate for m, rate in zip(self.moved, f, strict=True)]
         return planned - turned + ring.dot(self._curve(gains), moved)
@@ -91,7 +90,7 @@ class ClosedLoop:
 
     def _gains(self, i: int) -> list[list[Fraction]]:
         """Control points of row i of K."""
-        return [gain[i] for gain in self.funnel.K[self.k]]
+        return [gain[i] for gain in self.motion.K[self.k]]
 
     def _curve(self, points: Sequence[Sequence[Fraction]]) -> list[Polynomial]:
         """The curve with these control points."""
@@ -132,104 +131,107 @@ def slopes(points: Sequence[Sequence[Fraction]]) -> list[list[Fraction]]:
     return found or [[Fraction(0)] * len(points[0])]
 
 
-@dataclass(frozen=True)
-class Hold:
-    """By interval and input: the bounds R of |dũ/dt| in 1/s, and W of what u is off.
-
-    period: how old the applied input is at most, in s. error: bounds by state. Both may be 0.
-    """
-
-    period: Fraction
-    error: list[Fraction]
-    rates: Matrix
-    widths: Matrix
-
-    @property
-    def corners(self) -> list[Corner]:
-        """The corners of the box of δ; one where the input is not off."""
-        inputs = len(self.widths[0])
-        off = self.period or any(self.error)
-        return list(product((-1, 1), repeat=inputs)) if off else [(0,) * inputs]
-
-
-def read_hold(claim: Node, stated: dict[str, Any], field: Field, funnel: Funnel) -> Hold:
+def read_hold(claim: Node, stated: dict[str, Any], motion: Motion) -> None:
     """The hold and the measurement error that a claim is about, and what u is off by then.
 
+    period: how old the applied input is at most, in s; error: bounds by state; both may be 0. By
+    interval and input, rates: the bounds R of |dũ/dt| in 1/s; widths: W. corners: of the box of δ.
     At a time in interval k the input is of a time in it or in one that ends less than a period
     before it starts: W is period times the largest rate there, and what e does to the largest Ke.
     """
-    count, held = len(funnel.x), "hold" in claim.value
-    period, error = Fraction(0), [Fraction(0)] * field.n
-    rates: Matrix = [[Fraction(0)] * field.m for _ in range(count)]
+    count, n, m, held = len(motion.x), motion.n, motion.m, "hold" in claim.value
+    motion.period, motion.error = Fraction(0), [Fraction(0)] * n
+    motion.rates = [[Fraction(0)] * m for _ in range(count)]
     if held:
-        period = Node(claim.value["hold"], "hold").number()
-        rates = stated["rates"].array(count, field.m)
-        curves: list[Any] = [funnel.u, funnel.K]
-        steady = all(p[-1] == q[0] for curve in curves for p, q in pairwise(curve))
-        fits = period > 0 and all(rate > 0 for row in rates for rate in row)
+        motion.period = Node(claim.value["hold"], "hold").number()
+        motion.rates = stated["rates"].array(count, m)
+        steady = all(p[-1] == q[0] for curve in (motion.u, motion.K) for p, q in pairwise(curve))
+        fits = motion.period > 0 and all(rate > 0 for row in motion.rates for rate in row)
         claim.require({"hold and rates should be positive": fits}, "not_below")
         claim.require({"the policy jumps at a knot: no rate bounds a hold": steady}, "not_valid")
     if "error" in claim.value:
-        error = Node(claim.value["error"], "error").array(field.n)
-        claim.require({"error should be 0 or more": min(error) >= 0}, "not_below")
-    if held or "error" in claim.value:
-        claim.require({"f is not affine in each input that is off": field.affine}, "not_valid")
+        motion.error = Node(claim.value["error"], "error").array(n)
+        claim.require({"error should be 0 or more": min(motion.error) >= 0}, "not_below")
+    affine = motion.affine or not (held or "error" in claim.value)
+    claim.require({"f is not affine in each input that is off": affine}, "not_valid")
 
     shaken = [
-        [max(dot(list(map(abs, gain[i])), error) for gain in points) for i in range(field.m)]
-        for points in funnel.K
+        [max(dot(list(map(abs, gain[i])), motion.error) for gain in points) for i in range(m)]
+        for points in motion.K
     ]
-    widths, begun = [], 0
+    motion.widths, begun = [], 0
     for k in range(count):
-        while funnel.t[begun + 1] <= funnel.t[k] - period:
+        while motion.t[begun + 1] <= motion.t[k] - motion.period:
             begun += 1
         turned, moved = (
             [max(column) for column in zip(*rows[begun : k + 1], strict=True)]
-            for rows in (rates, shaken)
+            for rows in (motion.rates, shaken)
         )
-        widths.append([period * rate + e for rate, e in zip(turned, moved, strict=True)])
-    return Hold(period, error, rates, widths)
+        pairs = zip(turned, moved, strict=True)
+        motion.widths.append([motion.period * rate + e for rate, e in pairs])
+    off = motion.period or any(motion.error)
+    motion.corners = list(product((-1, 1), repeat=m)) if off else [(0,) * m]
 
 
-def decide_rates(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any]) -> int:
+def decide_pieces(
+    motion: Motion,
+    stated: dict[str, Any],
+    name: str,
+    vertices: Sequence[tuple[Corner, Sequence[Fraction]]],
+    cases: Sequence[Case],
+    parts: Callable[[dict[str, Any], Case, ClosedLoop, list[Polynomial]], list[Polynomial]],
+) -> int:
+    """Prove the sum of its parts positive on every piece of a list; how many pieces it has.
+
+    parts: of a piece's members, its case, its closed loop, and f at its vertex (δ, w).
+    """
+    limited, loops = len(motion.limits), lru_cache(maxsize=1)(partial(ClosedLoop, motion))
+    needed = list(product(range(len(motion.x)), range(len(vertices)), cases))
+    members = "mu" + " tau" * bool(limited) if name == "pieces" else "input sign tau"
+    pieces = in_order(stated[name], members, needed, limited)
+
+    def decide(ring: Ring, piece: Piece) -> None:
+        (k, v, case), part, given, what = piece
+        loop, (corner, w) = loops(ring, part, case[len(case) - limited :]), vertices[v]
+        f = loop.rates(at(motion.equations[k], w), corner, motion.widths[k])
+        squares = read_squares(given | {"basis": stated["basis"]}, ring)
+        positive(ring.sum(parts(given, case, loop, f)), squares, ring, what)
+
+    at_width(motion.n, pieces, decide)
+    return len(pieces)
+
+
+def decide_rates(motion: Motion, stated: dict[str, Any]) -> int:
     """Prove |dũ_i/dt| < R_i in the funnel, for every input where it is not at a limit.
 
     What entries of (δ, w) do that only push is taken off R; the others are at vertices.
     """
-    m, count, limited = field.m, len(funnel.x), list(funnel.limits)
-    free = [j for j in range(m + len(field.box)) if 1 + field.n + j in field.pushing]
-    halves = [(high - low) / 2 for low, high in field.box]
+    n, m, limited, box = motion.n, motion.m, list(motion.limits), motion.box
+    free = [j for j in range(m + len(box)) if 1 + n + j in motion.pushing]
+    halves = [(high - low) / 2 for low, high in box]
     sides = [(0,) if j in free else (-1, 1) for j in range(m)]
     values = [
-        ((low + high) / 2,) if m + j in free else (low, high)
-        for j, (low, high) in enumerate(field.box)
+        ((low + high) / 2,) if m + j in free else (low, high) for j, (low, high) in enumerate(box)
     ]
-    cases_of = 2 ** (m + len(field.box) - len(free)) * len(funnel.modes) * 2 * m
-    limit(count * cases_of, MAX_PIECES, "intervals, vertices and modes")
-    vertices = list(product(product(*sides), product(*values)))
+    cases_of = 2 ** (m + len(box) - len(free)) * len(motion.modes) * 2 * m
+    limit(len(motion.x) * cases_of, MAX_PIECES, "intervals, vertices and modes")
     cases = [
         (i, sign, *mode)
-        for i, sign, mode in product(range(m), (-1, 1), funnel.modes)
+        for i, sign, mode in product(range(m), (-1, 1), motion.modes)
         if i not in limited or not mode[limited.index(i)]
     ]
-    needed = list(product(range(count), range(len(vertices)), cases))
-    pieces = in_order(stated["rate_pieces"], "input sign tau", needed, len(limited))
-    loops = lru_cache(maxsize=1)(partial(ClosedLoop, funnel))
 
-    def decide(ring: Ring, piece: Piece) -> None:
-        (k, v, (i, sign, *mode)), part, members = piece
-        loop, (corner, w) = loops(ring, part, tuple(mode)), vertices[v]
-        room = hold.rates[k][i]
+    def parts(
+        piece: dict[str, Any], case: Case, loop: ClosedLoop, f: list[Polynomial]
+    ) -> list[Polynomial]:
+        i, sign, *_ = case
+        room = motion.rates[loop.k][i]
         for j in free:
-            half = hold.widths[k][j] if j < m else halves[j - m]
-            column = [pushed(equation, 1 + field.n + j) for equation in field.equations[k]]
-            room -= half * max(abs(dot(gain[i], column)) for gain in funnel.K[k])
-        f = loop.rates(at(field.equations[k], w), corner, hold.widths[k])
-        parts = [ring.made(loop.h * room), -sign * loop.turning(i, f)]
-        parts += loop.taken(members["tau"], [loop.gap, *loop.held], stated["sides"])
-        squares = read_squares(members | {"basis": stated["basis"]}, ring)
-        what = f"{members['index'].where}, of a rate (interval {k}, vertex {v}, input {i})"
-        positive(ring.sum(parts), squares, ring, what)
+            half = motion.widths[loop.k][j] if j < m else halves[j - m]
+            column = [pushed(equation, 1 + n + j) for equation in motion.equations[loop.k]]
+            room -= half * max(abs(dot(gain[i], column)) for gain in motion.K[loop.k])
+        taken = loop.taken(piece["tau"], [loop.gap, *loop.held], stated["sides"])
+        return [loop.ring.made(loop.h * room), -sign * loop.turning(i, f), *taken]
 
-    at_width(field.n, pieces, decide)
-    return len(pieces)
+    vertices = list(product(product(*sides), product(*values)))
+    return decide_pieces(motion, stated, "rate_pieces", vertices, cases, parts)

@@ -14,17 +14,15 @@ as every vertex of w is. Why that is enough: docs/certificate_continuous_funnel.
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from functools import lru_cache, partial
 from itertools import product
 from typing import Any
 
 from . import text
-from .closed_loop import ClosedLoop, Hold, at, decide_rates, read_hold, read_multiplier
-from .exact import Matrix, Rows, at_most, dot, identity, inverse_forms, scaled, semidefinite, unit
+from .closed_loop import ClosedLoop, decide_pieces, decide_rates, read_hold, read_multiplier
+from .exact import Rows, at_most, dot, identity, inverse_forms, scaled, semidefinite, unit
 from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
-from .polynomials import Polynomial, Ring, at_width
-from .positivity import positive, read_squares
-from .trajectory import MAX_PIECES, Field, Funnel, Piece, in_order, pushed, read_field, read_funnel
+from .polynomials import Polynomial
+from .trajectory import MAX_PIECES, Case, Motion, pushed, read_motion
 
 SENTENCE = (
     "funnel: every solution that {whose} in it at a time from {start:exact} to {end:exact} s, such "
@@ -49,43 +47,41 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     return decide_funnel(claim, proof, read)[0]
 
 
-def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[text.Verdict, Funnel]:
+def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[text.Verdict, Motion]:
     """The verdict, and the funnel that it is about."""
     parts = claim.members("kind about", "goal hold error")
     documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
-    funnel = read_funnel(documents, digests)
-    field = read_field(documents["vector_field"], funnel)
+    motion = read_motion(documents, digests)
     table: Table = {"basis": itself, "multiplier": itself, "pieces": itself, "margin": ()}
     if "goal" in parts:
-        table |= {"goal_multiplier": ()}
+        table["goal_multiplier"] = ()
     if "hold" in parts:
         table |= {"rates": itself, "rate_pieces": itself}
-    if "hold" in parts or funnel.limits:
-        table |= {"sides": itself}
-    if field.box:
-        table |= {"kappa?": itself}
+    if "hold" in parts or motion.limits:
+        table["sides"] = itself
+    if motion.box:
+        table["kappa?"] = itself
     stated = proof.read(table)
     proof.require({"the margin should be positive": stated["margin"] > 0}, "not_below")
-    hold = read_hold(claim, stated, field, funnel)
+    read_hold(claim, stated, motion)
 
-    goal = _decide_goal(parts["goal"], stated["goal_multiplier"], funnel) if "goal" in parts else ""
-    _decide_valid(field, funnel, hold)
-    count = _decide_pieces(field, funnel, hold, stated)
-    if hold.period:
-        count += decide_rates(field, funnel, hold, stated)
+    goal = _decide_goal(parts["goal"], stated["goal_multiplier"], motion) if "goal" in parts else ""
+    _decide_valid(motion)
+    count = _decide_decrease(motion, stated)
+    if motion.period:
+        count += decide_rates(motion, stated)
     said = text.say(
         SENTENCE,
         # A held input remembers: only of a solution that starts inside is it one from inside.
-        whose="starts" if hold.period else "is",
-        start=funnel.t[0],
-        end=funnel.t[-1],
-        point=", ".join(map(text.exact, funnel.x[0][0])),
+        whose="starts" if motion.period else "is",
+        start=motion.t[0],
+        end=motion.t[-1],
+        point=", ".join(map(text.exact, motion.x[0][0])),
         goal=goal,
-        kept=_kept(field),
+        kept=_kept(motion),
         count=count,
     )
-    assumptions = _assumptions(field, funnel, hold)
-    return text.Verdict(said, stated["margin"], assumptions, digests), funnel
+    return text.Verdict(said, stated["margin"], _assumptions(motion), digests), motion
 
 
 def inside(
@@ -103,19 +99,18 @@ def inside(
     semidefinite([*rows, [*(-e for e in Bd), corner]], what)
 
 
-def _decide_goal(node: Node, multiplier: Fraction, funnel: Funnel) -> str:
-    n = len(funnel.x[0][0])
-    goal = node.read({"centre": (n,), "P": (n, n)})
+def _decide_goal(node: Node, multiplier: Fraction, motion: Motion) -> str:
+    goal = node.read({"centre": (motion.n,), "P": (motion.n, motion.n)})
+    last = scaled(motion.P[-1], 1 / motion.rho[-1])
     what = "that the funnel ends in the goal, by the S-lemma,"
-    last = scaled(funnel.P[-1], 1 / funnel.rho[-1])
-    inside(funnel.x[-1][-1], last, goal["centre"], goal["P"], multiplier, what)
-    forms = inverse_forms(goal["P"], identity(n), "the goal's matrix")
+    inside(motion.x[-1][-1], last, goal["centre"], goal["P"], multiplier, what)
+    forms = inverse_forms(goal["P"], identity(motion.n), "the goal's matrix")
     reaches = zip(goal["centre"], map(text.root_above, forms), strict=True)
     box = _named("x", enumerate((c - reach, c + reach) for c, reach in reaches), "outer_range")
     return text.say(GOAL, box=box)
 
 
-def _decide_valid(field: Field, funnel: Funnel, hold: Hold) -> None:
+def _decide_valid(motion: Motion) -> None:
     """x and the input stay where the equations are valid.
 
     |g'x̄| <= d wherever W <= ρ if ρ g'P⁻¹g <= d², so if d²P - ρgg' ⪰ 0, which holds between knots if
@@ -125,80 +120,66 @@ def _decide_valid(field: Field, funnel: Funnel, hold: Hold) -> None:
     the bounds keeps its side by itself. Of another side the other limit has to be W away: it is the
     input where ũ is beyond it, and a held one may be from before these bounds began.
     """
-    for k, entries in enumerate(field.bounds):
+    n = motion.n
+    for k, entries in enumerate(motion.bounds):
         kept: list[tuple[int, list[Fraction], Fraction]] = []  # entry, g, room
         for j, (low, high) in entries.items():
-            i = j - field.n
-            middle = [point[j] for point in funnel.x[k]] if i < 0 else [u[i] for u in funnel.u[k]]
-            rows = [unit(j, field.n)] if i < 0 else [gain[i] for gain in funnel.K[k]]
-            off = hold.widths[k][i] if i >= 0 else Fraction(0)
+            i = j - n
+            middle = [point[j] for point in motion.x[k]] if i < 0 else [u[i] for u in motion.u[k]]
+            rows = [unit(j, n)] if i < 0 else [gain[i] for gain in motion.K[k]]
+            off = motion.widths[k][i] if i >= 0 else Fraction(0)
             room = [min(middle) - low - off, high - max(middle) - off]
-            if i in funnel.limits:
-                least, most = funnel.limits[i]
+            if i in motion.limits:
+                least, most = motion.limits[i]
                 beyond = (least < low and most < low + off) or (most > high and least > high - off)
                 refuse_if(beyond, f"the limits of u{i} lie where f is not valid", "not_valid")
                 room = room[least >= low : 2 - (most <= high)]
             kept += [(j, row, min(room)) for row in rows if room]
         for knot in (k, k + 1):
-            forms = inverse_forms(funnel.P[knot], [g for _, g, _ in kept], "P")
-            for (j, _, margin), form in zip(kept, forms, strict=True):
-                reached = funnel.rho[knot] * form
-                within = reached < margin**2 or (reached == margin**2 and j >= field.n)
-                where = f"at {text.exact(funnel.t[knot])} s entry {j} of (x, u)"
-                leaves = f"{where} is not proved to stay where its dynamics are valid"
-                refuse_if(margin < 0 or not within, leaves, "not_valid")
+            forms = inverse_forms(motion.P[knot], [g for _, g, _ in kept], "P")
+            for (j, _, room_left), form in zip(kept, forms, strict=True):
+                reached, room2 = motion.rho[knot] * form, room_left**2
+                leaves = room_left < 0 or reached > room2 or (reached == room2 and j < n)
+                where = f"at {text.exact(motion.t[knot])} s entry {j} of (x, u)"
+                can = f"{where} is not proved to stay where its dynamics are valid"
+                refuse_if(leaves, can, "not_valid")
 
 
-def _decide_pieces(field: Field, funnel: Funnel, hold: Hold, stated: dict[str, Any]) -> int:
+def _decide_decrease(motion: Motion, stated: dict[str, Any]) -> int:
     """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
-    first, count, limited = 1 + field.n + field.m, len(funnel.x), len(funnel.limits)
-    columns = range(first, first + len(field.box))
-    halves = [(high - low) / 2 for low, high in field.box]
-    values: Iterable[tuple[Fraction, ...]] = product(*field.box)
-    kappa: Matrix = []
-    if stated.get("kappa"):
-        kappa = stated["kappa"].array(count, len(field.box))
+    first, count, box = 1 + motion.n + motion.m, len(motion.x), motion.box
+    halves, middle = ([(high + sign * low) / 2 for low, high in box] for sign in (-1, 1))
+    kappa = stated["kappa"].array(count, len(box)) if stated.get("kappa") else []
+    if kappa:
         above = all(entry > 0 for row in kappa for entry in row)
         stated["kappa"].require({"should be positive": above}, "not_below")
-        pushing = {"w does more than add constants": field.pushing.issuperset(columns)}
-        stated["kappa"].require(pushing, "not_valid")
-        values = [tuple((low + high) / 2 for low, high in field.box)]
-    most = count * 2 ** (0 if kappa else len(field.box)) * len(hold.corners) * 3**limited
+        pushing = motion.pushing.issuperset(range(first, first + len(box)))
+        stated["kappa"].require({"w does more than add constants": pushing}, "not_valid")
+    most = 1 if kappa else 2 ** len(box)
+    most *= count * len(motion.corners) * len(motion.modes)
     limit(most, MAX_PIECES, "intervals, vertices and modes")
-    vertices = list(product(hold.corners, values))
-    needed = list(product(range(count), range(len(vertices)), funnel.modes))
-    pieces = in_order(stated["pieces"], "mu" + " tau" * bool(limited), needed, limited)
-    multiplier = stated["multiplier"].monomials(field.n)
-    loops = lru_cache(maxsize=1)(partial(ClosedLoop, funnel))
+    values = [middle] if kappa else product(*box)
+    multiplier = stated["multiplier"].monomials(motion.n)
 
-    def pushes(loop: ClosedLoop) -> list[Polynomial]:
-        """-h r (κ(x̄'Pg)² + 1/κ) for each entry of w."""
-        found = []
-        for j, half, factor in zip(columns, halves, kappa[loop.k], strict=True):
-            along = loop.ring.dot([pushed(p, j) for p in field.equations[loop.k]], loop.Px)
-            found.append(-loop.h * half * (factor * (along * along) + 1 / factor))
-        return found
+    def parts(
+        piece: dict[str, Any], _: Case, loop: ClosedLoop, f: list[Polynomial]
+    ) -> list[Polynomial]:
+        h, dot = loop.h, loop.ring.dot
+        found = [loop.drift, -stated["margin"] * h * loop.rho, -2 * h * dot(f, loop.Px)]
+        found.append(read_multiplier(piece["mu"], multiplier, loop.ring) * loop.gap)
+        for j, half in enumerate(halves if kappa else []):  # -h r (κ(x̄'Pg)² + 1/κ)
+            along = dot([pushed(p, first + j) for p in motion.equations[loop.k]], loop.Px)
+            factor = kappa[loop.k][j]
+            found.append(-h * half * (factor * (along * along) + 1 / factor))
+        return found + (loop.taken(piece["tau"], loop.held, stated["sides"]) if loop.held else [])
 
-    def decide_piece(ring: Ring, piece: Piece) -> None:
-        (k, v, mode), part, members = piece
-        loop, (corner, w) = loops(ring, part, mode), vertices[v]
-        f = loop.rates(at(field.equations[k], w), corner, hold.widths[k])
-        mu = read_multiplier(members["mu"], multiplier, ring)
-        parts = [loop.drift, -stated["margin"] * loop.h * loop.rho, mu * loop.gap]
-        parts += [-2 * loop.h * ring.dot(f, loop.Px), *(pushes(loop) if kappa else [])]
-        if limited:
-            parts += loop.taken(members["tau"], loop.held, stated["sides"])
-        squares = read_squares(members | {"basis": stated["basis"]}, ring)
-        what = f"{members['mu'].where} (interval {k}, vertex {v}, mode {mode})"
-        positive(ring.sum(parts), squares, ring, what)
-
-    at_width(field.n, pieces, decide_piece)
-    return len(pieces)
+    vertices = list(product(motion.corners, values))
+    return decide_pieces(motion, stated, "pieces", vertices, motion.modes, parts)
 
 
-def _kept(field: Field) -> str:
+def _kept(motion: Motion) -> str:
     """Where x and u are proved to stay, at all times."""
-    bounds, n = field.bounds, field.n
+    bounds, n = motion.bounds, motion.n
     always = sorted(set.intersection(*map(set, bounds)))
     ends = {j: (min(b[j][0] for b in bounds), max(b[j][1] for b in bounds)) for j in always}
     shown = [
@@ -209,21 +190,19 @@ def _kept(field: Field) -> str:
     return f", and keeps {', '.join(filter(None, shown))}" if any(shown) else ""
 
 
-def _assumptions(field: Field, funnel: Funnel, hold: Hold) -> tuple[str, ...]:
-    how = text.say(LATE, hold.period) if hold.period else AT_ONCE
-    if any(hold.error):
-        errors = ", ".join(f"x{i} by {text.exact(e)}" for i, e in enumerate(hold.error) if e)
+def _assumptions(motion: Motion) -> tuple[str, ...]:
+    how = text.say(LATE, motion.period) if motion.period else AT_ONCE
+    if any(motion.error):
+        errors = ", ".join(f"x{i} by {text.exact(e)}" for i, e in enumerate(motion.error) if e)
         how += f", measured wrong by at most: {errors}"
-    for i in range(field.m):
-        if i in funnel.limits:
-            how += f", u{i} clipped to {text.PRINTED['exact_range'](funnel.limits[i])}"
-        elif not all(field.n + i in entries for entries in field.bounds):
+    for i in range(motion.m):
+        if i in motion.limits:
+            how += f", u{i} clipped to {text.PRINTED['exact_range'](motion.limits[i])}"
+        elif not all(motion.n + i in entries for entries in motion.bounds):
             how += f", u{i} without saturation"
-    ranges = _named("w", enumerate(field.box), "exact_range")
+    ranges = _named("w", enumerate(motion.box), "exact_range")
     found = [text.say(OBEYED, how=how)] + [f"at every time {ranges}"] * bool(ranges)
-    if field.expansion:
-        found.append(text.say(EXPANDED, field.expansion))
-    return tuple(found)
+    return (*found, *[text.say(EXPANDED, motion.expansion)] * bool(motion.expansion))
 
 
 def _named(letter: str, ends: Iterable[tuple[int, Sequence[Fraction]]], how: str) -> str:

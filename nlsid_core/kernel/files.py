@@ -1,14 +1,13 @@
 """Reading untrusted files: strict JSON, exact numbers, digests of bytes, plain names.
 
-A JSON number stands for the float64 nearest to it, and is refused unless it is that float64's own
-shortest decimal form (or an equal one): so no changed digit goes unnoticed. Whole numbers beyond
-2^53, NaN, infinities, duplicate keys and unknown members are refused. Numbers arrive as `int` or
-`Fraction`, never as `float`.
+A JSON number is refused unless it is a float64's shortest decimal form, or equal to it: so no
+changed digit goes unnoticed. Numbers arrive as `int` or `Fraction`, never as `float`.
 """
 
 import hashlib
 import json
 import os
+import re
 import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,9 +31,13 @@ VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
 Reader: TypeAlias = "Callable[[Node], Any] | tuple[int | None, ...]"  # of a member, or its shape
+Members = dict[str, Any]  # of an object, as they were read
 Table = dict[str, Reader]  # the members of an object; `name?` may be missing
+NOTHING: dict[str, str] = {}
 # Of a polynomial: exponents and coefficients. Exponents are bytes, whose hash no file can choose.
 Terms = list[tuple[bytes, Fraction]]
+
+RATIONAL = re.compile(rf"-?[0-9]{{1,{MAX_DIGITS}}}(/(?!0+$)[0-9]{{1,{MAX_DIGITS}}})?")
 
 # Why a proof is refused: the code of each "no".
 REASONS = {
@@ -59,13 +62,6 @@ class Rejected(Exception):  # noqa: N818 - a verdict
     def __init__(self, message: str, reason: str = "malformed") -> None:
         super().__init__(message)
         self.reason = reason
-
-
-class Mismatch(Rejected):
-    """A file is not the one that the proof is about."""
-
-    def __init__(self, message: str, reason: str = "mismatch") -> None:
-        super().__init__(message, reason)
 
 
 def refuse_if(wrong: object, message: str, reason: str = "malformed") -> None:
@@ -102,40 +98,35 @@ class Node:
         """An object with exactly these members (names separated by spaces)."""
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
-        self.require({f"'{name}' is missing": False for name in wanted if name not in self.value})
-        known = {*wanted, *allowed}
-        self.require({f"unknown member {plain(n)!r}": False for n in self.value if n not in known})
+        missing = {f"'{name}' is missing": False for name in wanted if name not in self.value}
+        others = [name for name in self.value if name not in (*wanted, *allowed)]
+        self.require(missing | {f"unknown member {plain(name)!r}": False for name in others})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
-    def read(self, table: Table) -> dict[str, Any]:
+    def read(self, table: Table) -> Members:
         """The members of an object, by their readers or of their shapes; None for a missing one."""
-        optional = [name[:-1] for name in table if name.endswith("?")]
+        optional = [name[:-1] for name in table if name[-1] == "?"]
         parts = self.members(" ".join(n for n in table if n[-1] != "?"), " ".join(optional))
-        found: dict[str, Any] = dict.fromkeys(optional)
-        for stated, reader in table.items():
-            name = stated.rstrip("?")
-            if name not in parts:
-                continue
-            if isinstance(reader, tuple):
-                found[name] = parts[name].array(*reader)
-            else:
-                found[name] = reader(parts[name])
-        return found
+        readers = {name.rstrip("?"): reader for name, reader in table.items()}
+        found = {name: parts[name].by(how) for name, how in readers.items() if name in parts}
+        return {**dict.fromkeys(optional), **found}
+
+    def by(self, how: Reader) -> Any:
+        """What a reader finds, or an array of a shape."""
+        return self.array(*how) if isinstance(how, tuple) else how(self)
 
     def document(
-        self, form: str, table: Table, kinds: str = "", made_for: Mapping[str, str] | None = None
-    ) -> dict[str, Any]:
+        self, form: str, table: Table, kinds: str = "", made_for: Mapping[str, str] = NOTHING
+    ) -> Members:
         """The members of a document nlsid/`form`, of one of `kinds` if there are any.
 
-        made_for: the digests, by role, that it has to name; Mismatch if it names another.
+        made_for: the digests, by role, that it has to name.
         """
-        version = whole(VERSION, VERSION)
-        heads: Table = {"format": one_of(f"nlsid/{form}"), "version": version}
+        heads: Table = {"format": one_of(f"nlsid/{form}"), "version": whole(VERSION, VERSION)}
         if kinds:
             heads["kind"] = one_of(*kinds.split())
-        for role, made in (made_for or {}).items():
-            heads[role] = _made(role, made)
-        return self.read({**heads, **table})
+        made = {role: one_of(digest, reason="mismatch") for role, digest in made_for.items()}
+        return self.read({**heads, **made, **table})
 
     def items(self, least: int = 0, most: int = MAX_ENTRIES) -> list["Node"]:
         """A list of `least` to `most` entries."""
@@ -165,12 +156,9 @@ class Node:
         """A float64, or a text "p/q" or "p" of whole numbers."""
         if type(self.value) is not str:
             return self.number()
-        above, slash, below = self.value.partition("/")
-        for digits in (above.removeprefix("-"), below if slash else "1"):
-            fits = digits.isascii() and digits.isdigit() and len(digits) <= MAX_DIGITS
-            self.require({"should be a number or a text p/q of whole numbers": fits})
-        self.require({"divides by zero": not slash or int(below)})
-        return Fraction(int(above), int(below) if slash else 1)
+        fits = RATIONAL.fullmatch(self.value)
+        self.require({"should be a number, or a text p/q of whole numbers, q not 0": fits})
+        return Fraction(self.value)
 
     def integer(self) -> int:
         """A whole number; one beyond 2^53 is a text of digits."""
@@ -248,31 +236,18 @@ def whole(least: int, most: int = MAX_WHOLE) -> Reader:
     return lambda node: node.whole(least, most)
 
 
-def rows_of(count: int) -> Reader:
-    """A reader of rows of so many whole numbers."""
-    return lambda node: node.wholes(None, count)
-
-
 def each(reader: Callable[[Node], Any], least: int, most: int = MAX_ENTRIES) -> Reader:
     """A reader of a list of `least` to `most` entries."""
     return lambda node: list(map(reader, node.items(least, most)))
 
 
-def one_of(*texts: str) -> Reader:
+def one_of(*texts: str, reason: str = "malformed") -> Reader:
     """A reader of one of these texts."""
 
     def read(node: Node) -> str:
         found, wanted = node.text(), " or ".join(map(repr, texts))
-        refuse_if(found not in texts, f"{node.where} is {found!r}, not {wanted}")
+        node.require({f"should be {wanted}, not {found!r}": found in texts}, reason)
         return found
-
-    return read
-
-
-def _made(role: str, made: str) -> Reader:
-    def read(node: Node) -> None:
-        if node.text() != made:
-            raise Mismatch(f"{node.where}: it was made for another {role}")
 
     return read
 
@@ -319,10 +294,12 @@ def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], d
         try:
             content = read(name)
         except OSError as error:
-            raise Mismatch(f"{role} file {name} cannot be read: {error.strerror}") from error
-        if digest(content) != stated["digest"]:
-            raise Mismatch(f"{name} is not the {role} this proof is about: its digest differs")
-        documents[role], digests[role] = parse(content, role), digest(content)
+            unread = f"{role} file {name} cannot be read: {error.strerror}"
+            raise Rejected(unread, "mismatch") from error
+        digests[role] = digest(content)
+        other = f"{name} is not the {role} this proof is about: its digest differs"
+        refuse_if(digests[role] != stated["digest"], other, "mismatch")
+        documents[role] = parse(content, role)
     return documents, digests
 
 

@@ -12,7 +12,7 @@ from . import text
 from .continuous_funnel import decide_funnel, inside
 from .exact import scaled
 from .files import Node, Read, Rejected, bound_files, itself, limit, refuse_if
-from .trajectory import Funnel
+from .trajectory import Motion
 
 MAX_STAGES = 100
 SENTENCE = (
@@ -52,7 +52,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     return text.Verdict(said, margin, tuple(assumptions), digests)
 
 
-def _decide_stage(node: Node, read: Read) -> tuple[text.Verdict, Funnel]:
+def _decide_stage(node: Node, read: Read) -> tuple[text.Verdict, Motion]:
     """A continuous funnel whose input is not held into the next stage: that is not covered."""
     stage = node.document("proof", {"claim": itself, "proof": itself})
     claim = stage["claim"]
@@ -62,10 +62,9 @@ def _decide_stage(node: Node, read: Read) -> tuple[text.Verdict, Funnel]:
     return decide_funnel(claim, stage["proof"], read)
 
 
-def _decide_step(role: str, multiplier: Fraction, before: Funnel, after: Funnel) -> None:
+def _decide_step(role: str, multiplier: Fraction, before: Motion, after: Motion) -> None:
     """`before` ends when `after` starts, and inside it there."""
-    same = len(before.x[0][0]) == len(after.x[0][0])
-    refuse_if(not same, f"{role} and the next differ in their states")
+    refuse_if(before.n != after.n, f"{role} and the next differ in their states")
     end = text.exact(before.t[-1])
     meets = before.t[-1] == after.t[0]
     refuse_if(not meets, f"{role} ends at {end} s, the next starts at another time", "not_covered")

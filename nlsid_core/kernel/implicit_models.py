@@ -1,55 +1,25 @@
 """Implicit models as files state them: 0 = h(v, x, w), x⁺ = [v; ã(x, w)]."""
 
-from dataclasses import dataclass
-from fractions import Fraction
+from typing import Any
 
-from .files import Node, Table, Terms, each, itself, one_of, refuse_if
+from .files import Node, Table, Terms, each, itself, one_of
 
-EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
-MAX_IMPLICIT, MAX_WINDOW = 30, 60  # states, and entries of w
-EQUATIONS = "format version kind equation period states inputs monotonicity h"
-IMPLICIT: Table = {  # the members of a file; those of recorded signals are not read
-    "equation": one_of(EQUATION),
+MAX_STATES, MAX_WINDOW = 30, 60  # of x, and of w
+
+Implicit = dict[str, Any]  # the members of an implicit model's file, its equations as Terms
+IMPLICIT: Table = {
+    "equation": one_of("0 = h(v, x, w), x+ = [v; shift(x, w)]"),
     "period": (),
-    "states": each(Node.text, 1, MAX_IMPLICIT),
+    "states": each(Node.text, 1, MAX_STATES),
     "inputs": each(Node.text, 0, MAX_WINDOW),
     "monotonicity": (),
     "h": itself,
-    "shift?": itself,
-    "centre?": itself,
-    "y?": itself,
-    "u?": itself,
-    "window?": itself,
-    "training?": itself,
-    "bags?": itself,
+    **dict.fromkeys(("shift?", "centre?", "y?", "u?", "window?", "training?", "bags?"), itself),
 }
 
 
-@dataclass(frozen=True)
-class ImplicitModel:
-    """h in (v, x, w), ã in (x, w), and perhaps a centre in v; n states, m entries of w."""
-
-    unknowns: int
-    states: int
-    inputs: int
-    h: list[Terms]
-    shift: list[Terms]
-    centre: list[Terms]
-    monotonicity: Fraction
-    period: Fraction
-
-    def separated(self) -> tuple[list[Terms], list[Terms]]:
-        """(e in x, f in (x, w)) of a model e(x⁺) = f(x, w); Rejected if it is not of that form."""
-        n = self.states
-        mixed = any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p)
-        refuse_if(mixed or self.unknowns < n, "the set is for models e(x+) = f(x, w)")
-        left = [[(e[:n], c) for e, c in p if any(e[:n])] for p in self.h]
-        right = [[(e[n:], -c) for e, c in p if not any(e[:n])] for p in self.h]
-        return left, right
-
-
-def read_implicit_model(node: Node) -> ImplicitModel:
-    """The equations of an `implicit` model's file."""
+def read_implicit(node: Node) -> Implicit:
+    """The members of an `implicit` model's file: 0 = h(v, x, w), x⁺ = [v; ã(x, w)]."""
     given = node.document("model", IMPLICIT, "implicit")
     n, m = len(given["states"]), len(given["inputs"])
     rows = given["h"].members("exponents coefficients")["coefficients"].array(None, None)
@@ -62,15 +32,9 @@ def read_implicit_model(node: Node) -> ImplicitModel:
             "a shift gives the states without an equation": bool(given["shift"]) == (k < n),
         }
     )
-    h = _read_stack(given["h"], k + n + m, k)
-    shift = _read_stack(given["shift"], n + m, n - k) if given["shift"] else []
-    centre = _read_stack(given["centre"], k, k) if given["centre"] else []
-    return ImplicitModel(k, n, m, h, shift, centre, given["monotonicity"], given["period"])
-
-
-def derivative(p: Terms, j: int) -> Terms:
-    """∂p/∂(variable j)."""
-    return [(bytes([*e[:j], e[j] - 1, *e[j + 1 :]]), c * e[j]) for e, c in p if e[j]]
+    for name, count, size in (("h", k + n + m, k), ("shift", n + m, n - k), ("centre", k, k)):
+        given[name] = _read_stack(given[name], count, size) if given[name] else []
+    return given
 
 
 def _read_stack(node: Node, count: int, size: int) -> list[Terms]:
@@ -81,3 +45,8 @@ def _read_stack(node: Node, count: int, size: int) -> list[Terms]:
     return [
         [(e, row[i]) for e, row in zip(rows, values, strict=True) if row[i]] for i in range(size)
     ]
+
+
+def derivative(p: Terms, j: int) -> Terms:
+    """∂p/∂(variable j)."""
+    return [(bytes([*e[:j], e[j] - 1, *e[j + 1 :]]), c * e[j]) for e, c in p if e[j]]

@@ -1,59 +1,86 @@
-"""Model files in increment form; the first family: equations 0 = h(v, x, w), x⁺ = [v; ã(x, w)].
+"""Model files in increment form, of two families: equations, and networks of bounded slopes.
 
-Of two solutions under one input, E = [∂h/∂v, ∂h/∂x] is averaged on the segment between them, and
-so it is in the hull of the Bernstein coefficients of these derivatives on a box that both are in.
-Where they depend on the input alone, the box is the model's own range of it; where they are
-constant there is none. docs/certificate_stability.md and docs/certificate_tube.md.
+Equations: 0 = h(v, x, w), x⁺ = [v; ã(x, w)]. Of two solutions under one input, E is [∂h/∂v, ∂h/∂x],
+averaged on the segment between them: in the hull of these derivatives' Bernstein coefficients on a
+box that both are in. Where they depend on the input alone, the box is the model's own range of it;
+where they are constant there is none.
+Networks: ν_j = f_j(into_j·[ν, x, u, 1]), x⁺ = next·[ν, x, u, 1], y = output·[ν, x, u, 1], `into`
+strictly lower triangular in ν. Of two solutions, ν̄_j = σ_j into_j·[ν̄, x̄], σ_j a mean slope of f_j:
+E = [I, 0] - diag(σ) into on the box of the slopes. docs/certificate_stability.md.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
-from itertools import product
-from math import comb, prod
+from itertools import pairwise
 from typing import Any
 
-from .exact import MAX_ORDER, Matrix, combined, definite, identity, unit
-from .files import Node, Table, Terms, each, itself, limit, one_of, refuse_if, rows_of
-from .implicit_models import EQUATIONS, ImplicitModel, derivative, read_implicit_model
-from .increments import Box, Hull, Linear, Model, read_recorded, sized
-from .networks import read_cascade, read_cells
-from .signals import Signal, ranges, read_signal, signals
-from .text import PRINTED
+from . import text
+from .exact import Matrix, identity, unit
+from .files import Node, Table, Terms, each, itself, limit, one_of, refuse_if
+from .implicit_models import derivative, read_implicit
+from .increments import MAX_POWER, Box, Entries, Hull, Linear, Model
+from .signals import ranges, read_signal, signals
 
-MAX_POWER = 20  # of a variable in a monomial of E
-MAX_VERTICES = 10**5  # of a box
+MAX_STATES = 120
+MAX_MAPS = 8  # a network has 2^maps matrices
+ZERO = Fraction(0)
+SLOPES = "for every input (the slopes of its nonlinearity are in {0:outer_range} everywhere)"
 
-MatrixTerms = list[tuple[bytes, Matrix]]  # of a matrix polynomial: powers and coefficients
+
+def read_model(node: Node, bounds: Node | None = None) -> Model:
+    """The increment form of a model file's content.
+
+    bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form.
+    """
+    kind = node.kind()
+    if kind == "implicit":
+        return _read_recorded_implicit(node, bounds)
+    refuse_if(kind not in READERS, f"{node.where}: no model kind {kind!r} is known")
+    refuse_if(bounds is not None, f"a model of kind {kind} needs no box")
+    return READERS[kind](node)
 
 
-def read_linear(node: Node) -> Model:
+def _recorded(node: Node, kind: str, table: Table) -> dict[str, Any]:
+    """The members of a model of recorded signals; what made it is not read."""
+    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": itself}
+    given = node.document("model", {**heads, **table}, kind)
+    node.require({"the period should be positive": given["period"] > 0})
+    return given
+
+
+def _sized(n: int, node: Node) -> int:
+    """So many states."""
+    return limit(n, MAX_STATES, f"{node.where}: states", least=1)
+
+
+def _read_linear(node: Node) -> Model:
     """A `difference_equation`: ŷ = x_1 + b_0 u + c, x⁺ = a ŷ + shift(x) + b_1..n u; no ν."""
     table: Table = {"y": read_signal, "u": read_signal, "a": (None,), "b": (None,), "c": ()}
-    given = read_recorded(node, "difference_equation", {**table, "u_range": (2,)})
-    a, n, (low, high) = given["a"], sized(len(given["a"]), node), given["u_range"]
+    given = _recorded(node, "difference_equation", {**table, "u_range": (2,)})
+    a, n, (low, high) = given["a"], _sized(len(given["a"]), node), given["u_range"]
     fits = len(given["b"]) == n + 1
     node.require({"b should have one number more than a": fits, "u_range": low <= high})
     direct, *b = given["b"]
     F = [[a_i, *unit(i + 1, n + 1)[1:n]] for i, a_i in enumerate(a)]
-    B = [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)]
-    y, u, H = (given["y"],), (given["u"],), [unit(0, n)]
-    none, linear = Hull(lambda _, __: []), Linear(B, direct, (low, high))
-    return Model(given["period"], y, u, F, H, none, "for every input", linear)
+    B = [p + q * direct for p, q in zip(b, a, strict=True)]
+    linear = Linear(B=B, D=direct, input_range=(low, high))
+    y, u = (given["y"],), (given["u"],)
+    return Model(given["period"], y, u, F, [unit(0, n)], Hull([]), linear=linear)
 
 
-def read_affine(node: Node) -> Model:
+def _read_affine(node: Node) -> Model:
     """A `state_affine` model: 0 = Σ_k G_k(w) ȳ(t-k) + p(w), ν = ȳ(t), E = [G_0 … G_n](w)."""
     table: Table = {
         "y": signals("outputs", 1),
         "u": signals("inputs", 1),
-        "window": rows_of(2),
+        "window": lambda entry: entry.wholes(None, 2),
         "G": each(itself, 2),
         "p": itself,
         **dict.fromkeys(("y_offset", "y_scale", "u_offset", "u_scale"), (None,)),
         "u_range": (None, 2),
         "on_out_of_range": one_of("clip", "refuse"),
     }
-    given = read_recorded(node, "state_affine", table)
+    given = _recorded(node, "state_affine", table)
     p, m, window, limits = len(given["y"]), len(given["u"]), given["window"], given["u_range"]
     scales, offsets = given["u_scale"], given["u_offset"]
     node.require(
@@ -64,49 +91,59 @@ def read_affine(node: Node) -> Model:
             "input ranges should not be empty": all(low < high for low, high in limits),
         }
     )
-    size = sized(p * (len(given["G"]) - 1), node)
+    size = _sized(p * (len(given["G"]) - 1), node)
     _require_window(window, m, len(given["G"]), node)
-    G = [_matrix_terms(entry, len(window), p, p) for entry in given["G"]]
-    _matrix_terms(given["p"], len(window), p)
-
-    E, box = _side_by_side(G, p), []
-    for i, _ in window:
-        low, high = ((end - offsets[i]) / scales[i] for end in limits[i])
-        box.append((low, high))
-
-    def vertices(part: Box, ends: Node | None) -> list[Matrix]:
-        return bernstein(E, part) if ends is None else _between(E, part, ends)
-
+    blocks = [_matrix(entry, len(window), p, p) for entry in given["G"]]
+    _matrix(given["p"], len(window), p)
+    E = [[[(e, G[i][j]) for e, G in block] for block in blocks for j in range(p)] for i in range(p)]
+    scaled = [
+        ((low - o) / s, (high - o) / s)
+        for (low, high), o, s in zip(limits, offsets, scales, strict=True)
+    ]
+    box = [scaled[i] for i, _ in window]
     F = identity(p + size)[:size]  # x⁺ = [ν; all but the oldest of x]
     H = [[scale * entry for entry in unit(i, p + size)] for i, scale in enumerate(given["y_scale"])]
-    where = _within(given["on_out_of_range"], given["u"], limits)
-    return Model(given["period"], given["y"], given["u"], F, H, Hull(vertices, box), where)
+    hull = Hull(E, box, bounded=True)
+    shown = ranges(given["u"], list(map(text.PRINTED["inner_range"], limits)))
+    where = f"for every input (the model clips its inputs: {shown})"
+    if given["on_out_of_range"] == "refuse":
+        where = f"for every input in the model's range ({shown}; it refuses others)"
+    return Model(given["period"], given["y"], given["u"], F, H, hull, where)
 
 
-def read_monotone(node: Node) -> Model:
+def _matrix(node: Node, variables: int, *shape: int) -> list[tuple[bytes, Any]]:
+    """Monomials, each with a coefficient of this shape."""
+    parts = node.members("exponents coefficients")
+    rows = parts["exponents"].monomials(variables)
+    fits = rows and all(power <= MAX_POWER for row in rows for power in row)
+    node.require({f"monomials are missing, or a power is above {MAX_POWER}": fits})
+    return list(zip(rows, parts["coefficients"].array(len(rows), *shape), strict=True))
+
+
+def _read_monotone(node: Node) -> Model:
     """A `monotone_equation`: e(ȳ(t)) = affine in the past, E = [e', -a]."""
     table: Table = {
         "y": read_signal,
         "u": signals("inputs"),
-        "window": rows_of(2),
+        "window": lambda entry: entry.wholes(None, 2),
         "e": (3,),
         **dict.fromkeys(("a", "b", "u_offset"), (None,)),
         **dict.fromkeys(("c", "y_offset"), ()),
     }
-    given = read_recorded(node, "monotone_equation", table)
-    e, u, n = given["e"], given["u"], sized(len(given["a"]), node)
+    given = _recorded(node, "monotone_equation", table)
+    e, u, n = given["e"], given["u"], _sized(len(given["a"]), node)
     _require_window(given["window"], len(u), None, node)
     fits = len(given["b"]) == len(given["window"]), len(given["u_offset"]) == len(u)
     node.require({"one b an entry of the window": fits[0], "one u_offset an input": fits[1]})
     increases = e[2] > 0 or e[1] == e[2] == 0
     node.require({"e should increase everywhere": increases}, "not_valid")
-    only = [[[_least_slope(e), *(-entry for entry in given["a"])]]]
+    slope = [(bytes([k]), (k + 1) * c) for k, c in enumerate(e) if c]
+    E = [[slope, *([(bytes(1), -entry)] for entry in given["a"])]]
     F, H = identity(n + 1)[:n], [unit(0, n + 1)]
-    hull = Hull(lambda _, __: only, ray=e[2] > 0)
-    return Model(given["period"], (given["y"],), u, F, H, hull, "for every input")
+    return Model(given["period"], (given["y"],), u, F, H, _pointed(E) or Hull(E))
 
 
-def read_implicit(node: Node, bounds: Node | None) -> Model:
+def _read_recorded_implicit(node: Node, bounds: Node | None) -> Model:
     """An `implicit` model of recorded signals, y = v: ν = v - v̂.
 
     Where ∂h is constant, E is one matrix. Where h = e(v) - (affine in x), v one number and e a
@@ -115,187 +152,59 @@ def read_implicit(node: Node, bounds: Node | None) -> Model:
     E ζ = 0 (mean value theorem), whatever leaf it is in; for several there need be none, so only w
     is split.
     """
-    model = read_implicit_model(node)
-    parts = node.members(f"{EQUATIONS} y u window", "shift centre training bags")
-    y, u = signals("outputs")(parts["y"]), signals("inputs")(parts["u"])
-    window = parts["window"].wholes(model.inputs, 2)
-    p, n, h = model.unknowns, model.states, model.h
+    model = read_implicit(node)
+    recorded = all(model[name] for name in ("y", "u", "window"))
+    node.require({"of recorded signals there should be y, u and window": recorded})
+    y, u = signals("outputs")(model["y"]), signals("inputs")(model["u"])
+    p, n, shift = len(model["h"]), len(model["states"]), model["shift"]
+    window = model["window"].wholes(len(model["inputs"]), 2)
     node.require({"one output an equation, and past ones the states": len(y) == p and n % p == 0})
     _require_window(window, len(u), None, node)
-    F = identity(p + n)[:p]
-    for terms in model.shift:
-        linear = all(sum(e) == 1 for e, _ in terms if any(e[:n]))
-        node.require({"the shift should be linear in the states": linear})
-        slopes = {e.index(1): c for e, c in terms if any(e[:n])}
-        F.append([Fraction(slopes.get(j - p, 0)) for j in range(p + n)])
+    slopes = [[derivative(row, j) for j in range(n)] for row in shift]
+    linear = not any(any(e) for row in slopes for entry in row for e, _ in entry)
+    node.require({"the shift should be linear in the states": linear})
+    F = identity(p + n)[:p] + [[ZERO] * p + [_constant(entry) for entry in row] for row in slopes]
 
-    E, least = _jacobian(h, p + n), _least_cubic(model)
-    known = least is not None or not any(any(e) for e, _ in E)
+    E = [[derivative(row, j) for j in range(p + n)] for row in model["h"]]
+    powers = [e for row in E for entry in row for e, _ in entry]
+    refuse_if(not powers, "the model's equation does not depend on its output")
+    hull = _pointed(E) or Hull(E)
+    known = hull.ray or not any(map(any, powers))
     wanted = "it needs no box" if known else "its increments are known on a box only"
     node.require({wanted: known == (bounds is None)}, "not_valid")
-    box = [] if bounds is None else _read_box(model, bounds, window, len(u))
-
-    def vertices(part: Box, ends: Node | None) -> list[Matrix]:
-        node.require({"ends are for state-affine models": ends is None})
-        return bernstein(E, part) if least is None else [least]
-
-    hull = Hull(vertices, box, ray=least is not None, whole=p + n if p > 1 and box else 0)
-    where = "while signals stay in the box" if box else "for every input"
-    return Model(model.period, y, u, F, identity(p + n)[:p], hull, where)
-
-
-def bernstein(E: MatrixTerms, box: Box) -> list[Matrix]:
-    """The Bernstein coefficients of E(w) on a box: their convex hull holds its values.
-
-    On [lo, hi], w^e has the coefficient Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j) at index k
-    of degree d. Where they differ in one entry only, the two extreme ones have the same hull.
-    """
-    degrees = [max(powers[i] for powers, _ in E) for i in range(len(box))]
-    limit(prod(d + 1 for d in degrees), MAX_VERTICES, "vertices of a box")
-    tables = [
-        [[_weight(e, k, d, low, high) for k in range(d + 1)] for e in range(d + 1)]
-        for d, (low, high) in zip(degrees, box, strict=True)
-    ]
-    found: list[Matrix] = []
-    for k in product(*(range(d + 1) for d in degrees)):
-        value = [[Fraction(0)] * len(row) for row in E[0][1]]
-        for powers, coefficients in E:
-            factors = (tables[i][e][k[i]] for i, e in enumerate(powers[: len(box)]) if e)
-            weight = prod(factors, start=Fraction(1))
-            if weight:
-                value = combined(value, coefficients, weight)
-        found.append(value)
-
-    places = [(i, j) for i, row in enumerate(found[0]) for j in range(len(row))]
-    varying = [(i, j) for i, j in places if any(E[i][j] != found[0][i][j] for E in found)]
-    if len(varying) > 1:
-        return found
-    i, j = varying[0] if varying else (0, 0)
-    ends = [min(found, key=lambda E: E[i][j]), max(found, key=lambda E: E[i][j])]
-    return ends[: 1 + len(varying)]
+    where = "for every input"
+    if bounds is not None:
+        states = [[(unit(i, n + len(window)), 1)] for i in range(n - p)]
+        past = [[(list(e), c) for e, c in row] for row in shift] == states
+        bounds.require({"on a box the states should be the past outputs": past})
+        box = _read_box(bounds, p, n, window, len(u))
+        hull = Hull(E, box, whole=p + n if p > 1 else 0)
+        where = "while signals stay in the box"
+    return Model(model["period"], y, u, F, identity(p + n)[:p], hull, where)
 
 
-def _weight(e: int, k: int, d: int, low: Fraction, high: Fraction) -> Fraction:
-    parts = (
-        comb(e, j) * low ** (e - j) * (high - low) ** j * Fraction(comb(k, j), comb(d, j))
-        for j in range(min(e, k) + 1)
-    )
-    return sum(parts, Fraction(0))
-
-
-def _between(E: MatrixTerms, box: Box, node: Node) -> list[Matrix]:
-    """E at the stated ends of its first entry q, a quadratic; the others are constant.
-
-    low <= q(w) <= high on the box by the S-procedure: with weights a, b >= 0, as forms in [1; w],
-        q - low - Σ a_i (w_i - lo_i)(hi_i - w_i) ≻ 0,
-        high - q - Σ b_i (w_i - lo_i)(hi_i - w_i) ≻ 0.
-    """
-    q = [(e, c[0][0]) for e, c in E if c[0][0]]
-    others = any(any(e) and any(c[0][1:]) for e, c in E)
-    fits = len(E[0][1]) == 1 and not others and all(sum(e) <= 2 for e, _ in q)
-    node.require({"ends are for one output, constant lags, and degree 2 at most": fits})
-    limit(len(box), MAX_ORDER - 1, f"{node.where}: entries of the box")
-    weighted = (len(box),)
-    table: Table = {"low": (), "high": (), "low_weights": weighted, "high_weights": weighted}
-    given = node.read(table)
-    for name, sign in (("low", 1), ("high", -1)):
-        weights = given[f"{name}_weights"]
-        node.require({"weights should be 0 or more": min(weights) >= 0}, "not_below")
-        M = [[Fraction(0)] * (len(box) + 1) for _ in range(len(box) + 1)]
-        M[0][0] = -sign * given[name]
-        for e, c in q:
-            used = [i + 1 for i, power in enumerate(e) for _ in range(power)]
-            i, j = [0] * (2 - len(used)) + used
-            M[i][j] += sign * c / 2
-            M[j][i] += sign * c / 2
-        for i, (weight, (low, high)) in enumerate(zip(weights, box, strict=True), 1):
-            M[0][0] += weight * low * high
-            M[i][i] += weight
-            M[0][i] -= weight * (low + high) / 2
-            M[i][0] -= weight * (low + high) / 2
-        definite(M, f"the {name} end of the leading coefficient")
-    lags = [sum((c[0][j] for _, c in E), Fraction(0)) for j in range(1, len(E[0][1][0]))]
-    return [[[given[end], *lags]] for end in ("low", "high")]
-
-
-def _least_slope(e: Sequence[Fraction]) -> Fraction:
-    """The least slope of e_1 v + e_2 v² + e_3 v³, for e_3 > 0 or e_2 = e_3 = 0."""
-    return e[0] - e[1] ** 2 / (3 * e[2]) if e[2] else e[0]
-
-
-def _least_cubic(model: ImplicitModel) -> Matrix | None:
-    """[min e', -a] of one equation e(v) = a'x + (terms in w), e an increasing cubic; else None."""
-    if model.unknowns != 1:
-        return None
-    n, cubic, slopes = model.states, [Fraction(0)] * 3, [Fraction(0)] * (1 + model.states)
-    for powers, c in model.h[0]:
-        v, x, w = powers[0], powers[1 : 1 + n], powers[1 + n :]
-        if v and v <= 3 and not any(x) and not any(w):
-            cubic[v - 1] += c
-        elif not v and sum(x) == 1 and not any(w):
-            slopes[1 + x.index(1)] += c
-        elif v or any(x):
-            return None
-    slopes[0] = _least_slope(cubic)
-    return [slopes] if cubic[2] > 0 else None
-
-
-def _read_box(model: ImplicitModel, bounds: Node, window: list[list[int]], inputs: int) -> Box:
+def _read_box(bounds: Node, p: int, n: int, window: list[list[int]], inputs: int) -> Box:
     """The box of (v, x, w), from ranges of outputs and inputs; x stacks past outputs."""
-    p, n, ends = model.unknowns, model.states, bounds.members("y u")
-    y_box, u_box = ends["y"].array(p, 2), ends["u"].array(inputs, 2)
-    full = all(low < high for low, high in [*y_box, *u_box])
+    ends = bounds.read({"y": (p, 2), "u": (inputs, 2)})
+    full = all(low < high for low, high in [*ends["y"], *ends["u"]])
     bounds.require({"no range should be empty": full}, "not_valid")
-    for i, terms in enumerate(model.shift):  # else a state is no output: it has another range
-        same = [(bytes(int(j == i) for j in range(n + model.inputs)), Fraction(1))]
-        bounds.require({"on a box the states should be the past outputs": terms == same})
-    rows = [*y_box, *y_box * (n // p), *(u_box[i] for i, _ in window)]
+    rows = [*ends["y"], *ends["y"] * (n // p), *(ends["u"][i] for i, _ in window)]
     return [(low, high) for low, high in rows]
 
 
-def _jacobian(rows: Sequence[Terms], variables: int) -> MatrixTerms:
-    """The derivatives of polynomials by their first variables, as a matrix polynomial."""
-    entries = [
-        (powers, i, j, c)
-        for i, row in enumerate(rows)
-        for j in range(variables)
-        for powers, c in derivative(row, j)
-    ]
-    refuse_if(not entries, "the model's equation does not depend on its output")
-    most = max(power for powers, *_ in entries for power in powers)
-    limit(most, MAX_POWER, "the power of a variable")
-    return _collected(entries, len(rows), variables)
+def _pointed(E: Entries) -> Hull | None:
+    """[min e', -a] and all above, where E = [e'(v), -a] with an increasing cubic e; else None."""
+    slope, *lags = E[0]
+    a, b, c = (sum((c for e, c in slope if e[0] == power), ZERO) for power in range(3))
+    other = any(e[0] > 2 or any(e[1:]) for e, _ in slope)
+    if len(E) > 1 or c <= 0 or other or any(any(e) for lag in lags for e, _ in lag):
+        return None
+    least = a - b**2 / (4 * c)
+    return Hull([[[(bytes(len(slope[0][0])), least)], *lags]], ray=True)
 
 
-def _side_by_side(G: Sequence[MatrixTerms], rows: int) -> MatrixTerms:
-    """[G_0 … G_n] as one matrix polynomial."""
-    entries = [
-        (powers, i, k * rows + j, entry)
-        for k, terms in enumerate(G)
-        for powers, block in terms
-        for i, row in enumerate(block)
-        for j, entry in enumerate(row)
-    ]
-    return _collected(entries, rows, rows * len(G))
-
-
-def _collected(
-    entries: Sequence[tuple[bytes, int, int, Fraction]], rows: int, columns: int
-) -> MatrixTerms:
-    """The matrix polynomial with these entries: powers, row, column, coefficient."""
-    found: dict[bytes, Matrix] = {}
-    for powers, i, j, c in entries:
-        found.setdefault(powers, [[Fraction(0)] * columns for _ in range(rows)])[i][j] += c
-    return sorted(found.items())
-
-
-def _matrix_terms(node: Node, variables: int, *shape: int) -> MatrixTerms:
-    parts = node.members("exponents coefficients")
-    exponents = parts["exponents"].monomials(variables)
-    coefficients = parts["coefficients"].array(len(exponents), *shape)
-    fits = exponents and all(power <= MAX_POWER for row in exponents for power in row)
-    node.require({f"monomials are missing, or a power is above {MAX_POWER}": fits})
-    return list(zip(exponents, coefficients, strict=True))
+def _constant(p: Terms) -> Fraction:
+    return sum((c for _, c in p), ZERO)
 
 
 def _require_window(window: Any, inputs: int, delays: int | None, node: Node) -> None:
@@ -304,31 +213,101 @@ def _require_window(window: Any, inputs: int, delays: int | None, node: Node) ->
     node.require({"the window should name inputs and delays that are there": known})
 
 
-def _within(beyond: str, u: Sequence[Signal], limits: Sequence[Sequence[Fraction]]) -> str:
-    """For which inputs, in words: the model's range of them."""
-    shown = ranges(u, list(map(PRINTED["inner_range"], limits)))
-    if beyond == "clip":
-        return f"for every input (the model clips its inputs: {shown})"
-    return f"for every input in the model's range ({shown}; it refuses others)"
+def _read_cells(node: Node) -> Model:
+    """A `cell_network`: maps that are linear between their knots, and on beyond them."""
+    table: Table = {
+        "y": signals("outputs", 1),
+        "u": signals("inputs"),
+        "maps": each(_slopes, 1, MAX_MAPS),
+        **dict.fromkeys(("into", "next", "output", "start_samples"), itself),
+        "start": (None,),
+    }
+    given = _recorded(node, "cell_network", table)
+    slopes, n, y, u = given["maps"], _sized(len(given["start"]), node), given["y"], given["u"]
+    m, width = len(slopes), len(slopes) + n + len(u) + 1
+    into, F, H = (
+        [row[: m + n] for row in given[name].array(rows, width)]
+        for name, rows in (("into", m), ("next", n), ("output", len(y)))
+    )
+    earlier = not any(any(row[j:m]) for j, row in enumerate(into))
+    given["into"].require({"a map should depend on earlier maps only": earlier})
+    return Model(given["period"], y, u, F, H, _between_slopes(slopes, into))
+
+
+def _read_cascade(node: Node) -> Model:
+    """A `block_cascade`, two linear filters around a spline: a network with one map a phase.
+
+    v(t) = u(t) + Σ a1_k v(t-k), x_j = Σ_i b1_ji v(t-i), y(t) = Σ a2_k y(t-k) + Σ b2_ji f(x_j(t-i)).
+    x stacks v(t-1) … v(t-n₁) of the first filter and the observer form of the second.
+    """
+    table: Table = {"y": read_signal, "u": read_signal, "a1": (None,), "a2": (None,)}
+    table |= {"f": _spline_slopes, "b1": (None, None), "b2": (None, None)}
+    given = _recorded(node, "block_cascade", table)
+    b1, b2, M = given["b1"], given["b2"], len(given["b1"])
+    even = all(row and len(row) == len(rows[0]) for rows in (b1, b2) for row in rows)
+    node.require(
+        {
+            f"b1 and b2 should have as many rows, 1 to {MAX_MAPS}": 0 < M == len(b2) <= MAX_MAPS,
+            "the rows of b1, and of b2, should have equal lengths": even,
+        }
+    )
+    n1, n2 = max(len(given["a1"]), len(b1[0]) - 1), max(len(given["a2"]), len(b2[0]) - 1)
+    n, a1, a2 = _sized(n1 + n2, node), _padded(given["a1"], n1), _padded(given["a2"], n2)
+
+    # x_j = b1_j0 v(t) + … with v(t) = u + a1·past gives C_j; the same way behind f gives g_j.
+    C = [[row[0] * a + b for a, b in zip(a1, _padded(row[1:], n1), strict=True)] for row in b1]
+    g = [[row[0] * a + b for a, b in zip(a2, _padded(row[1:], n2), strict=True)] for row in b2]
+    first = [ZERO] * M + a1 + [ZERO] * n2
+    F = [first, *(unit(M + k, M + n) for k in range(n1 - 1))][:n1]
+    for i in range(n2):
+        row = [g[j][i] for j in range(M)] + [ZERO] * n1 + unit(i + 1, n2 + 1)[:n2]
+        row[M + n1] += a2[i]
+        F.append(row)
+    H = [row[0] for row in b2] + [ZERO] * n1 + unit(0, n2)
+    hull = _between_slopes([given["f"]] * M, [[ZERO] * M + row + [ZERO] * n2 for row in C])
+    where = text.say(SLOPES, given["f"])
+    return Model(given["period"], (given["y"],), (given["u"],), F, [H], hull, where)
+
+
+def _between_slopes(slopes: Box, into: Matrix) -> Hull:
+    """[I, 0] - diag(σ) into, σ in the box of the slopes, which is not split."""
+    m, E = len(into), identity(len(into[0]))
+    one = [bytes(map(int, row)) for row in identity(m)]
+    terms = [
+        [[(bytes(m), a), (one[j], -b)] for a, b in zip(E[j], row, strict=True)]
+        for j, row in enumerate(into)
+    ]
+    return Hull(terms, slopes, whole=m)
+
+
+def _slopes(node: Node) -> tuple[Fraction, Fraction]:
+    """The least and the largest slope of a piecewise-linear map."""
+    given = node.read({"knots": (None,), "values": (None,)})
+    knots, values = given["knots"], given["values"]
+    ascending = len(knots) >= 2 and all(a < b for a, b in pairwise(knots))
+    node.require({"2 knots or more, ascending": ascending, "values": len(knots) == len(values)})
+    steps = zip(pairwise(knots), pairwise(values), strict=True)
+    slopes = [(after - before) / (high - low) for (low, high), (before, after) in steps]
+    return min(slopes), max(slopes)
+
+
+def _spline_slopes(node: Node) -> tuple[Fraction, Fraction]:
+    """The same of a spline: f' is a convex combination of (c_{k+1} - c_k)/spacing everywhere."""
+    given = node.read({"low": (), "spacing": (), "coefficients": (None,)})
+    spacing, c = given["spacing"], given["coefficients"]
+    node.require({"a positive spacing, 4 coefficients or more": spacing > 0 and len(c) >= 4})
+    slopes = [(after - before) / spacing for before, after in pairwise(c)]
+    return min(slopes), max(slopes)
+
+
+def _padded(values: list[Fraction], size: int) -> list[Fraction]:
+    return values + [ZERO] * (size - len(values))
 
 
 READERS: dict[str, Callable[[Node], Model]] = {
-    "difference_equation": read_linear,
-    "state_affine": read_affine,
-    "monotone_equation": read_monotone,
-    "block_cascade": read_cascade,
-    "cell_network": read_cells,
+    "difference_equation": _read_linear,
+    "state_affine": _read_affine,
+    "monotone_equation": _read_monotone,
+    "block_cascade": _read_cascade,
+    "cell_network": _read_cells,
 }
-
-
-def read_model(node: Node, bounds: Node | None = None) -> Model:
-    """The increment form of a model file's content.
-
-    bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form.
-    """
-    kind = node.kind()
-    if kind == "implicit":
-        return read_implicit(node, bounds)
-    refuse_if(kind not in READERS, f"{node.where}: no model kind {kind!r} is known")
-    refuse_if(bounds is not None, f"a model of kind {kind} needs no box")
-    return READERS[kind](node)

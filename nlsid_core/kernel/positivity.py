@@ -11,10 +11,10 @@ So c >= Σ_i left[i] v_i², left[i] >= 0 being the least that any b_k leaves on 
 if something is left for the monomial 1.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from fractions import Fraction
 from math import comb, lcm
+from types import SimpleNamespace
 
 from .files import MAX_DEGREE, Node, Rejected, Table, itself, limit, refuse_if, whole
 from .polynomials import Polynomial, Ring, packed, unpacked
@@ -23,22 +23,11 @@ MAX_BASIS = 200
 MAX_FACTORS = 24
 MAX_SHIFT = 400  # of a power of two
 WITNESS = "basis columns squares"
-Rows = list[tuple[int, list[int]]]  # of a factor, each with its weight
 
-
-@dataclass(frozen=True)
-class Squares:
-    """Σ_j B_j(s) Σ_i weight_i (R_j[i] V v)² / (scale 4^unit): nowhere negative.
-
-    keys: the monomials v, of `degree` at most; columns: their powers of two.
-    """
-
-    keys: list[int]
-    columns: list[int]
-    degree: int
-    scale: Fraction
-    unit: int
-    factors: list[Rows]
+# Σ_j B_j(s) Σ_i weights[i] (R_j[i] V v)² / (scale 4^unit), nowhere negative. keys: the monomials v,
+# of `degree` at most. columns: their powers of two. grams: of each factor the sum over i by
+# monomial, whole numbers, in units of `weight`.
+Squares = SimpleNamespace
 
 
 def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
@@ -53,15 +42,16 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     stated = node.read({**table, "weights?": lambda entry: entry.integers(0, 4 * MAX_BASIS)})
     scale = 1 if stated["scale"] is None else stated["scale"]
     node.require({"scale should be a positive whole number": scale >= 1})
-    factors = []
+    keys, shifts, grams = list(map(ring.key, basis)), [c - min(columns) for c in columns], []
     for factor in stated["factors"].items(1, MAX_FACTORS):
         rows = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
         weights = [1] * len(rows) if stated["weights"] is None else stated["weights"]
         fits = len(weights) == len(rows) and min(weights, default=0) >= 0
         factor.require({"one weight of 0 or more a row": fits})
-        factors.append(list(zip(weights, rows, strict=True)))
-    keys, degree = list(map(ring.key, basis)), max(map(sum, basis))
-    return Squares(keys, columns, degree, Fraction(scale), stated["unit"], factors)
+        grams.append(_gram(keys, shifts, weights, rows))
+    weight, degree = Fraction(2) ** (2 * min(columns) - 2 * stated["unit"]), max(map(sum, basis))
+    weight /= scale
+    return Squares(keys=keys, columns=columns, degree=degree, weight=weight, grams=grams)
 
 
 def powers_of_two(node: Node, size: int) -> list[int]:
@@ -74,13 +64,12 @@ def powers_of_two(node: Node, size: int) -> list[int]:
 
 def expanded(squares: Squares, ring: Ring) -> Polynomial:
     """The squares as a polynomial in s and x: a multiplier that is never negative."""
-    lowest, J = min(squares.columns), len(squares.factors) - 1
-    weight = Fraction(2) ** (2 * lowest - 2 * squares.unit) / squares.scale
-    parts = []
-    for j, gram in enumerate(_grams(squares, lowest)):
+    parts, J = [], len(squares.grams) - 1
+    for j, gram in enumerate(squares.grams):
         norm = sum(map(abs, gram.values()))
         constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, norm)
-        parts.append((weight, ring.bernstein([Fraction(i == j) for i in range(J + 1)]) * constants))
+        basis = ring.bernstein([Fraction(i == j) for i in range(J + 1)])
+        parts.append((squares.weight, basis * constants))
     return ring.weighted(parts)
 
 
@@ -94,29 +83,13 @@ def positive(
     return left.get(0, Fraction(0))
 
 
-def positive_on(
-    c: Polynomial, domain: Sequence[Polynomial], parts: Mapping[str, Node], ring: Ring, what: str
-) -> dict[int, Fraction]:
-    """`remainder` of c - Σ_k σ_k domain[k], σ_k sums of squares: then c >= 0 where domain >= 0.
-
-    parts: `basis`, `columns`, `squares`, and perhaps `multipliers`, each with `of`, the index
-    k of its part of the domain, increasing, and the same three members; a part without one has 0.
-    """
-    terms, last = [c], -1
-    for entry in parts["multipliers"].items(0, len(domain)) if "multipliers" in parts else []:
-        members = entry.members(f"of {WITNESS}")
-        last = members["of"].whole(last + 1, len(domain) - 1)
-        terms.append(-1 * (expanded(read_squares(members, ring), ring) * domain[last]))
-    return remainder(ring.sum(terms), read_squares(parts, ring), ring, what)
-
-
 def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[int, Fraction]:
     """left[i] by monomial, so that c >= Σ_i left[i] v_i² >= 0 for every s in [0, 1] and every x.
 
     Raises Rejected if r is not diagonally dominant; TooNarrow if the ring is.
     """
-    basis, columns = squares.keys, squares.columns
-    lowest, highest = min(columns), max(columns)
+    basis, columns, grams, digits = squares.keys, squares.columns, squares.grams, ring.digits(c)
+    highest = max(columns)
     square = {2 * key: i for i, key in enumerate(basis)}
     pair: dict[int, tuple[int, int]] = {}  # who is charged for a product
     for i, left_key in enumerate(basis):
@@ -124,15 +97,13 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
             a, b = pair.setdefault(left_key + basis[j], (i, j))
             if columns[i] + columns[j] > columns[a] + columns[b]:
                 pair[left_key + basis[j]] = (i, j)
-    grams, digits = _grams(squares, lowest), ring.digits(c)
     keys = list(set(digits).union(*grams))
     balanced = all(key in square or key in pair for key in keys)
     refuse_if(not balanced, f"{what}: a monomial is no product of the basis", "not_positive")
     J, order = len(grams) - 1, c.order
     D = max(order, J)
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
-    ratio = Fraction(2) ** (2 * lowest - 2 * squares.unit) / squares.scale * c.denominator
-    above, below = ratio.numerator, ratio.denominator
+    above, below = (squares.weight * c.denominator).as_integer_ratio()
     # One integer for each power of s and each factor, a lane for each monomial, wide enough for r.
     largest = max((abs(entry) for gram in grams for entry in gram.values()), default=0)
     bits = max(ring.width + below.bit_length(), (largest * above).bit_length())
@@ -174,29 +145,26 @@ def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[in
     }
 
 
-def _grams(squares: Squares, lowest: int) -> list[dict[int, int]]:
-    """Σ_i weight_i (R_j[i] V v)² / 4^lowest by monomial, whole numbers, for each factor R_j.
+def _gram(
+    keys: list[int], shifts: list[int], weights: list[int], rows: list[list[int]]
+) -> dict[int, int]:
+    """Σ_i weights[i] (rows[i]·diag(2^shifts) v)² by monomial.
 
     Rows are packed into one integer each, so that a row of R'R is a few products.
     """
-    keys, size = squares.keys, len(squares.keys)
-    columns = [shift - lowest for shift in squares.columns]
-    result = []
-    for factor in squares.factors:
-        most = max((abs(entry) for _, row in factor for entry in row), default=0)
-        heaviest = max((weight for weight, _ in factor), default=1)
-        width = (most * most * max(1, heaviest) * (len(factor) + 1)).bit_length() // 8 + 1
-        lines = [
-            (weight * packed(row, width) << 8 * width * (size - len(row)), row)
-            for weight, row in factor
-        ]
-        gram: dict[int, int] = {}
-        for i, left in enumerate(keys):  # a row's last entry belongs to the last monomial
-            line = sum(line * row[i - size] for line, row in lines if len(row) >= size - i)
-            entries = unpacked(line, width, size, i)
-            for j, entry in enumerate(entries, start=i):
-                if entry:
-                    key = left + keys[j]
-                    gram[key] = gram.get(key, 0) + (entry << columns[i] + columns[j] + (i != j))
-        result.append(gram)
-    return result
+    size, most = len(keys), max((abs(entry) for row in rows for entry in row), default=0)
+    largest = most * most * max([1, *weights]) * (len(rows) + 1)
+    width = largest.bit_length() // 8 + 1
+    lines = [
+        (weight * packed(row, width) << 8 * width * (size - len(row)), row)
+        for weight, row in zip(weights, rows, strict=True)
+    ]
+    gram: dict[int, int] = {}
+    for i, left in enumerate(keys):  # a row's last entry belongs to the last monomial
+        line = sum(line * row[i - size] for line, row in lines if len(row) >= size - i)
+        entries = unpacked(line, width, size, i)
+        for j, entry in enumerate(entries, start=i):
+            if entry:
+                key = left + keys[j]
+                gram[key] = gram.get(key, 0) + (entry << shifts[i] + shifts[j] + (i != j))
+    return gram

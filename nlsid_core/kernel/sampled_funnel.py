@@ -13,27 +13,18 @@ from math import comb
 from typing import Any
 
 from . import text
-from .exact import Matrix, at_most, identity, inverse_forms, product, transposed
-from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
+from .exact import at_most, identity, inverse_forms, product, transposed
+from .files import Members, Node, Read, Table, bound_files, itself, limit, refuse_if
 from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
-from .sampled_step import Link, Model, Sample, nonnegative, read_link, stretch, triangular
+from .sampled_step import Sample, nonnegative, read_step, stretch, triangular
 from .signals import apart, ranges, signals
-from .text import above
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
 
-Policy = dict[str, Any]  # the members of a policy's file
-Funnel = dict[str, Any]  # the members of a funnel's file and of its assumption
-
-ASSUMPTION: Table = {  # what was measured is no part of the claim
-    "form": Node.text,
-    **dict.fromkeys(("bound", "rate", "gain"), nonnegative),
-    **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),
-}
 
 SENTENCE = (
     "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
@@ -67,42 +58,43 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     S, A = funnel["S"], funnel["A"]
     for k, (point, inputs, gain) in enumerate(zip(x, [*u, []], [*K, []], strict=True)):
         _prove_box(model, funnel, k, [*point, *inputs], gain)
-    names = "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
+    names = "basis ball_basis steps" + " roots_basis equation_basis" * model["trapezoidal"]
     bases = proof.members(names)
     steps, rooms = bases["steps"].items(len(u), len(u)), []
 
     def prove(ring: Ring, k: int) -> None:
-        at = Sample(x[k], u[k], K[k], x[k + 1], S[k], S[k + 1], A[k])
-        stated, link = read_link(steps[k], model, at, funnel["form"], ring)
-        rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
+        after = {"x_next": x[k + 1], "S_next": S[k + 1]}
+        at = Sample(x=x[k], u=u[k], K=K[k], S=S[k], A=A[k], **after)
+        step = read_step(steps[k], model, at, funnel["form"], ring)
+        rooms.extend([_prove_chain(step, bases, funnel, chain, k) for chain in CHAINS])
 
-    at_width(_variables(model), range(len(u)), prove, FREE_OF_S)
+    at_width(model["variables"], range(len(u)), prove, FREE_OF_S)
     said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
     return text.Verdict(said, min(rooms), assumptions, digests)
 
 
-def _prove_step(
-    link: Link, node: Node, bases: dict[str, Node], funnel: Funnel, chain: str, k: int
+def _prove_chain(
+    step: Members, bases: dict[str, Node], funnel: Members, chain: str, k: int
 ) -> Fraction:
     """Prove one step of one chain; the part of the next radius that it leaves free."""
-    ring, d, what = link.size.ring, len(link.h), f"{chain}, step {k}"
+    ring, d, what = step["size"].ring, len(step["h"]), f"{chain}, step {k}"
     names = "reach columns squares ball" + " roots equations" * bool(d)
     names += " spread extents" * (bool(d) and funnel["form"] == "response")
-    stated = node.members(names)
+    stated = step[chain].members(names)
     reach, (radius, following) = nonnegative(stated["reach"]), funnel[chain][k : k + 2]
-    parts = [reach**2 - ring.dot(link.rows, link.rows)]
-    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size))
+    parts = [reach**2 - ring.dot(step["rows"], step["rows"])]
+    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, step["size"]))
     if d:
-        root = link.bounds["kappa_next"] * funnel["roots"][k + 1]
-        far, added = root, funnel["bound"]
+        far, added = step["kappa_next"] * funnel["roots"][k + 1], funnel["bound"]
         if funnel["form"] == "response":
-            far, added = _implicit_addition(link, stated, funnel, radius, root)
+            far, added = _implicit_addition(step, stated, funnel["bound"], radius, far)
         w = ring.variables[-d:]
         parts.append(_ball(stated["roots"], bases["roots_basis"], far, ring.dot(w, w)))
-        parts += _equations(stated["equations"], bases["equation_basis"], link)
+        parts += _equations(stated["equations"], bases["equation_basis"], step["h"])
     else:
-        added = _explicit_addition(link, funnel, radius, what)
-    exceeds = f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius"
+        added = _explicit_addition(step, funnel, radius, what)
+    shown = text.above(reach), text.above(added)
+    exceeds = f"{what}: reach {shown[0]} and disturbance {shown[1]} exceed the next radius"
     at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
@@ -115,71 +107,74 @@ def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polyno
     return expanded(squares, size.ring) * (size - radius**2)
 
 
-def _equations(node: Node, basis: Node, link: Link) -> list[Polynomial]:
+def _equations(node: Node, basis: Node, h: list[Polynomial]) -> list[Polynomial]:
     """-ν_i h_i, zero at a root: ν_i = Σ_m rows[i][m] 2^columns[m] monomial_m."""
-    stated, ring = node.members("columns rows"), link.size.ring
+    stated, ring = node.members("columns rows"), h[0].ring
     monomials = [ring.monomial(row) for row in basis.monomials(ring.count)]
     columns = powers_of_two(stated["columns"], len(monomials))
-    rows = stated["rows"].wholes(len(link.h), len(monomials))
+    rows = stated["rows"].wholes(len(h), len(monomials))
     nu = ([-e * Fraction(2) ** c for e, c in zip(row, columns, strict=True)] for row in rows)
-    return [ring.dot(row, monomials) * h for row, h in zip(nu, link.h, strict=True)]
+    return [ring.dot(row, monomials) * equation for row, equation in zip(nu, h, strict=True)]
 
 
-def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) -> Fraction:
+def _explicit_addition(step: Members, funnel: Members, radius: Fraction, what: str) -> Fraction:
     """What the disturbance adds to the reach of an explicit model from `radius`."""
-    form, bound, kappa = funnel["form"], funnel["bound"], link.bounds["kappa"]
+    form, bound, kappa = funnel["form"], funnel["bound"], step["kappa"]
     if form == "peak":
         return Fraction(bound)
-    mu = kappa * stretch(link.curvature, kappa * radius, kappa * bound, least=1)
+    mu = kappa * stretch(step["curvature"], kappa * radius, kappa * bound, least=1)
     if form == "response":
         return Fraction(mu * bound)
-    much = f"{what}: deviations stretch by {above(mu)}, too much for rate and gain"
+    much = f"{what}: deviations stretch by {text.above(mu)}, too much for rate and gain"
     at_most(funnel["gain"] * mu**2, (funnel["gain"] - 1) * funnel["rate"], much)
     return Fraction(0)
 
 
 def _implicit_addition(
-    link: Link, stated: dict[str, Node], funnel: Funnel, radius: Fraction, far: Fraction
+    step: Members, stated: dict[str, Node], bound: Fraction, radius: Fraction, far: Fraction
 ) -> tuple[Fraction, Fraction]:
     """|w| that the reach has to be proved for, and what a response adds to the reach."""
-    b, where = link.bounds, stated["spread"].where
-    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel["bound"], nonnegative(stated["spread"])
+    z, r, spread = step["kappa"] * radius, step["kappa"] * bound, nonnegative(stated["spread"])
     wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
     # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
     far += spread * r
-    at_most(z**2 + far**2, wide**2, f"{where}: the first extent is too small")
-    mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
-    mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
-    within = b["rates"] < 1 and mapped_to <= spread
+    at_most(z**2 + far**2, wide**2, f"{stated['extents'].where}: the first is too small")
+    mu = stretch(step["curvature"], wide, (1 + spread) * r, least=2)
+    mapped_to = step["state"] + step["rates"] * spread + mu * (1 + spread)
+    within = step["rates"] < 1 and mapped_to <= spread
     stated["spread"].require({"two roots may differ by more": within}, "not_below")
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
-    own = b["kappa_next"] * stated["reach"].number()
-    at_most(z**2 + own**2, near**2, f"{where}: the second extent is too small")
-    mu = stretch(link.curvature, near, (1 + spread) * r, least=2)
-    shrink = 1 - b["rates"] - mu
+    own = step["kappa_next"] * stated["reach"].number()
+    at_most(z**2 + own**2, near**2, f"{stated['extents'].where}: the second is too small")
+    mu = stretch(step["curvature"], near, (1 + spread) * r, least=2)
+    shrink = 1 - step["rates"] - mu
     if shrink > 0:
-        spread = min(spread, (b["state"] + mu) / shrink)
-    return far, (b["direct"] + b["through"] * (b["rates"] * spread + mu * (1 + spread))) * r
+        spread = min(spread, (step["state"] + mu) / shrink)
+    turned = step["rates"] * spread + mu * (1 + spread)
+    return far, (step["direct"] + step["through"] * turned) * r
 
 
-def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K: Matrix) -> None:
+def _prove_box(
+    model: Members, funnel: Members, k: int, centres: list[Fraction], K: list[Any]
+) -> None:
     """At sample k both chains stay in the box of the data, inputs included; and the half-widths.
 
     |g'x̄| <= room where |S x̄| <= radius if radius² g'(S'S)⁻¹g <= room².
     """
-    S = funnel["S"][k]
-    tube, inlet = (funnel[chain][k] + _widens(funnel) for chain in CHAINS)
-    forms = inverse_forms(product(transposed(S), S), identity(model.states) + K, "S'S")
+    S, n = funnel["S"][k], len(model["x"])
+    tube, inlet = (funnel[chain][k] + funnel["widens"] for chain in CHAINS)
+    forms = inverse_forms(product(transposed(S), S), identity(n) + K, "S'S")
     rooms = [(tube, width, "its stated half-width") for width in funnel["half_widths"][k]]
-    for centre, (low, high) in zip(centres, model.box, strict=False):
+    for centre, (low, high) in zip(centres, model["box"], strict=False):
         rooms.append((max(tube, inlet), min(high - centre, centre - low), "the box of the data"))
-    states = range(model.states)
-    for i, (radius, room, kept) in zip([*states, *range(len(forms))], rooms, strict=True):
+    entries = [*range(n), *range(len(forms))]
+    for i, (radius, room, kept) in zip(entries, rooms, strict=True):
         leaves = room < 0 or radius**2 * forms[i] > room**2
-        refuse_if(leaves, f"sample {k}: {model.signals[i].name} can leave {kept}", "not_valid")
+        refuse_if(leaves, f"sample {k}: {model['named'][i].name} can leave {kept}", "not_valid")
 
 
-def _read_model(node: Node) -> Model:
+def _read_model(node: Node) -> Members:
+    """The members of a model; its map; the box and names of all signals; variables of a step."""
     table: Table = {
         **dict.fromkeys(("equation", "noise", "disturbance", "bags"), itself),
         "period": (),
@@ -198,36 +193,24 @@ def _read_model(node: Node) -> Model:
             "there should be monomials": exponents,
         }
     )
-    outputs = len(x) // 2 if trapezoidal else len(x)
-    columns = transposed(given["coefficients"].array(len(exponents), outputs))
-    polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
-    named = [*x, *apart(u, x)]
-    model = Model(trapezoidal, polynomials, given["period"], named, box, len(x))
-    degree, variables = max(map(sum, exponents)), _variables(model)
+    columns = given["coefficients"].array(len(exponents), len(x) // (1 + trapezoidal))
+    polynomials = [list(zip(exponents, column, strict=True)) for column in transposed(columns)]
+    variables = len(x) + len(x) // 2 * trapezoidal  # z, and of an implicit model w
+    degree = max(map(sum, exponents))
     limit(comb(variables + degree, degree), MAX_MONOMIALS, f"monomials of degree {degree}")
-    return model
+    found = {"trapezoidal": trapezoidal, "map": polynomials, "box": box, "variables": variables}
+    return {**given, **found, "named": [*x, *apart(u, x)]}
 
 
-def _variables(model: Model) -> int:
-    """z, and of an implicit model w."""
-    return model.states + model.states // 2 * model.trapezoidal
-
-
-def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
-    n, p = model.states, len(model.signals) - model.states
-    table: Table = {
-        "law": itself,
-        "period": (),
-        "L": (n, n),
-        "u": (None, p),
-        "x": (None, n),
-        "K": (None, p, n),
-    }
-    policy = node.document("policy", table, "sampled", {"model": made_for})
+def _read_policy(node: Node, model: Members, made_for: str) -> Members:
+    n, p = len(model["x"]), len(model["u"])
+    table: Table = {"law": itself, "period": (), "L": (n, n), "u": (None, p), "x": (None, n)}
+    made = {"model": made_for}
+    policy = node.document("policy", {**table, "K": (None, p, n)}, "sampled", made)
     steps = limit(len(policy["u"]), MAX_SAMPLES // n**3, f"steps of {n} states", least=1)
     node.require(
         {
-            "the period should be the model's": policy["period"] == model.period,
+            "the period should be the model's": policy["period"] == model["period"],
             "there should be a sample more than steps": len(policy["x"]) == steps + 1,
             "there should be one K a step": len(policy["K"]) == steps,
         }
@@ -235,12 +218,18 @@ def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
     return policy
 
 
-def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) -> Funnel:
-    n, samples = model.states, (steps + 1,)
+def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]) -> Members:
+    """The members of a funnel and its assumption; `widens`: what a disturbance adds to a radius."""
+    n, samples = len(model["x"]), (steps + 1,)
+    assumed: Table = {  # what was measured is no part of the claim
+        "form": Node.text,
+        **dict.fromkeys(("bound", "rate", "gain"), nonnegative),
+        **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),
+    }
     table: Table = {
         "set": itself,
-        "assumption": lambda entry: entry.read(ASSUMPTION),
-        **dict.fromkeys(("tube", "inlet") + ("roots",) * model.trapezoidal, samples),
+        "assumption": lambda entry: entry.read(assumed),
+        **dict.fromkeys(("tube", "inlet") + ("roots",) * model["trapezoidal"], samples),
         "half_widths": (*samples, n),
         "S": (*samples, n, n),
         "A": (steps, n, n),
@@ -248,53 +237,48 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
     made_for = {role: digests[role] for role in ("model", "policy")}
     given = node.document("funnel", table, "sampled", made_for)
     funnel = {"roots": [], **given, **given["assumption"]}
-    radii = funnel["tube"] + funnel["inlet"] + funnel["roots"]
-    starts = min(radii) > 0 and funnel["tube"][0] <= funnel["inlet"][0]
+    form, rate, gain = (funnel[name] for name in ("form", "rate", "gain"))
+    starts = funnel["tube"][0] <= funnel["inlet"][0]
+    positive_radii = min(funnel["tube"] + funnel["inlet"] + funnel["roots"]) > 0
     wanted = "radii and roots should be positive, and the tube start in the inlet"
-    node.require({wanted: starts}, "not_below")
+    node.require({wanted: positive_radii and starts}, "not_below")
     for S in funnel["S"]:
         triangular(S, node)
-    form, rate, gain = (funnel[name] for name in ("form", "rate", "gain"))
-    forms = ["response", "peak"] + ["energy", "fading"] * (not model.trapezoidal)
+    forms = ["response", "peak"] + ["energy", "fading"] * (not model["trapezoidal"])
     node.require({f"the form should be one of {', '.join(forms)}": form in forms})
     own = (form == "fading" or rate == 1) and (form in ("energy", "fading") or gain == 1)
     wanted = f"rate and gain should be those of form {form}"
     node.require({wanted: rate <= 1 <= gain and own}, "not_below")
-    return funnel
+    return {**funnel, "widens": Fraction(0) if form == "peak" else funnel["bound"]}
 
 
-def _widens(funnel: Funnel) -> Fraction:
-    """What the disturbance adds to a radius."""
-    return Fraction(0 if funnel["form"] == "peak" else funnel["bound"])
-
-
-def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
+def _sentence(model: Members, funnel: Members, steps: int) -> str:
     """What is proved, its numbers rounded outward."""
     tube, inlet = (funnel[chain] for chain in CHAINS)
-    wider = (inlet[-1] + _widens(funnel)) / (tube[-1] + _widens(funnel))
+    wider = (inlet[-1] + funnel["widens"]) / (tube[-1] + funnel["widens"])
     ends, goal = (
         ", ".join(
-            signal.quantity(f"{signal.name} {above(width * factor)}")
-            for signal, width in zip(model.signals, funnel["half_widths"][-1], strict=False)
+            signal.quantity(f"{signal.name} {text.above(width * factor)}")
+            for signal, width in zip(model["x"], funnel["half_widths"][-1], strict=True)
         )
         for factor in (1, wider)
     )
     return text.say(
         SENTENCE,
         tube=tube[0],
-        bound=" + bound" if _widens(funnel) else "",
+        bound=" + bound" if funnel["widens"] else "",
         samples=steps + 1,
-        span=steps * model.period,
+        span=steps * model["period"],
         ends=ends,
         inlet=inlet[0],
         goal=goal,
-        box=ranges(model.signals, list(map(text.PRINTED["outer_range"], model.box))),
+        box=ranges(model["named"], list(map(text.PRINTED["outer_range"], model["box"]))),
     )
 
 
-def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
+def _assumptions(model: Members, funnel: Members) -> tuple[str, ...]:
     kept = text.say(KEPT[funnel["form"]], **funnel)
     said = (text.say(DISTURBANCE, form=funnel["form"], kept=kept), APPLIED)
-    if not model.trapezoidal:
+    if not model["trapezoidal"]:
         return said
     return (*said, text.say(ROOTS, low=min(funnel["roots"][1:]), high=max(funnel["roots"][1:])))

@@ -5,86 +5,51 @@ which are verified here. What they prove: `sampled_funnel`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from math import factorial, prod
+from types import SimpleNamespace
 
 from .exact import Matrix, combined, identity, product, scaled, semidefinite, transposed
-from .files import Node, Terms, refuse_if
+from .files import Members, Node, Table, Terms, each, itself, refuse_if
 from .polynomials import Polynomial, Ring
-from .signals import Signal
+
+MAX_CURVED = 64  # degrees with a bound of their curvature
 
 
-@dataclass(frozen=True)
-class Model:
-    """A map (trapezoidal: of accelerations); signals and their box, states first."""
-
-    trapezoidal: bool
-    map: list[Terms]
-    period: Fraction
-    signals: list[Signal]
-    box: Matrix
-    states: int
+# Of a policy x, u, K at a sample and the next x, of a funnel S at both and A of the response.
+Sample = SimpleNamespace
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A sample of a policy and the next state, with the shapes of both and A of the response."""
-
-    x: list[Fraction]
-    u: list[Fraction]
-    K: Matrix
-    x_next: list[Fraction]
-    S: Matrix
-    S_next: Matrix
-    A: Matrix
-
-
-@dataclass(frozen=True)
-class Link:
-    """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
-
-    rows: list[Polynomial]
-    h: list[Polynomial]
-    size: Polynomial
-    bounds: dict[str, Fraction]
-    curvature: list[Fraction]
-
-
-def read_link(
-    node: Node, model: Model, at: Sample, form: str, ring: Ring
-) -> tuple[dict[str, Node], Link]:
-    """A step's members; its polynomials, and its stated bounds verified."""
-    norms = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
-    more = " T_next inverse" * model.trapezoidal
-    stated = node.members(f"T curvature tube inlet {norms}{more}")
-    bounds = {name: nonnegative(stated[name]) for name in norms.split()}
-    curvature = [nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
-    n, d, where = model.states, model.states // 2, node.where
-    T = triangular(stated["T"].array(n, n), stated["T"])
+def read_step(node: Node, model: Members, at: Sample, form: str, ring: Ring) -> Members:
+    """A step's members, its stated bounds verified; with S⁺x̄⁺ (rows), h, and |S T z|² (size)."""
+    n, d, where, trapezoidal = len(at.x), len(at.x) // 2, node.where, model["trapezoidal"]
+    norms = ["kappa"] + ["kappa_next", "state", "rates", "direct", "through"] * trapezoidal
+    curvature = each(nonnegative, 0, MAX_CURVED)
+    table: Table = {"T": (n, n), "curvature": curvature, "tube": itself, "inlet": itself}
+    table |= dict.fromkeys(["T_next", "inverse"] * trapezoidal, (d, d))
+    step = node.read({**table, **dict.fromkeys(norms, nonnegative)})
+    T = triangular(step["T"], node)
     ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
-    prove_inverse(ST, bounds["kappa"], f"{where}: kappa")
-    if not model.trapezoidal:
-        h: list[Polynomial] = []
-        rows = moved = explicit_step(model.map, at, T, ring)
+    prove_inverse(ST, step["kappa"], f"{where}: kappa")
+    h: list[Polynomial] = []
+    if trapezoidal:
+        S_rates = product([row[d:] for row in at.S_next[d:]], step["T_next"])
+        prove_inverse(S_rates, step["kappa_next"], f"{where}: kappa_next")
+        rows, h = implicit_step(model["map"], at, T, step["T_next"], model["period"], ring)
+        moved = ring.product(step["inverse"], h)
+        (B, C), (L_z, L_w) = linear_part(moved, ring, n), linear_part(rows, ring, n)
+        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
+        norm = {"state": B, "rates": combined(C, identity(d), -1), "through": L_w}
+        for name, M in {**norm, "direct": direct}.items():
+            prove_norm(M, step[name], f"{where}: the bound {name}")
+    else:
+        rows = moved = explicit_step(model["map"], at, T, ring)
         if form == "response":
             turned = ring.product(unit, ring.variables[:n])
             moved = [p - q for p, q in zip(rows, turned, strict=True)]
-    else:
-        T_next = stated["T_next"].array(d, d)
-        S_rates = [row[d:] for row in at.S_next[d:]]
-        prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
-        rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
-        moved = ring.product(stated["inverse"].array(d, d), h)
-        B, C = _columns(linear_part(moved, ring), n)
-        L_z, L_w = _columns(linear_part(rows, ring), n)
-        through = combined(L_z, product(L_w, B), -1)
-        norm = {"state": B, "rates": combined(C, identity(d), -1), "through": L_w}
-        for name, M in {**norm, "direct": combined(through, unit, -1)}.items():
-            prove_norm(M, bounds[name], f"{where}: the bound {name}")
-    prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
+    prove_curvature(moved, step["curvature"], ring, least=1 + trapezoidal)
     size = ring.product(ST, ring.variables[:n])
-    return stated, Link(rows, h, ring.dot(size, size), bounds, curvature)
+    return {**step, "rows": rows, "h": h, "size": ring.dot(size, size)}
 
 
 def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
@@ -112,9 +77,17 @@ def implicit_step(
     return ring.product(at.S_next, after), h
 
 
-def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
-    """The coefficients of degree 1: a row for each polynomial."""
-    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in ring.keys] for q in p]
+def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+    """x + T z and u - K T z."""
+    feedback = scaled(product(at.K, T), -1)
+    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
+    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
+
+
+def linear_part(p: Sequence[Polynomial], ring: Ring, count: int) -> tuple[Matrix, Matrix]:
+    """The coefficients of degree 1, a row each: of the first `count` variables, and others."""
+    rows = [[Fraction(q.terms.get(key, 0), q.denominator) for key in ring.keys] for q in p]
+    return [row[:count] for row in rows], [row[count:] for row in rows]
 
 
 def prove_curvature(
@@ -161,18 +134,6 @@ def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
 
 def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
     semidefinite(combined(scaled(identity(len(MM)), bound**2), MM, -1), what)
-
-
-def _columns(M: Matrix, count: int) -> tuple[Matrix, Matrix]:
-    """The first columns of M, and the others."""
-    return [row[:count] for row in M], [row[count:] for row in M]
-
-
-def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
-    """x + T z and u - K T z."""
-    feedback = scaled(product(at.K, T), -1)
-    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
-    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
 
 
 def nonnegative(node: Node) -> Fraction:

@@ -1,8 +1,7 @@
 """`Verdict`: a sentence that is proved; the numbers in sentences, and their one printer.
 
 A sentence is a template with slots, `{name:how}`, and `how` is one of PRINTED. A bound is printed
-exactly where its shortest decimal form is short, else rounded outward: no printed bound is better
-than the proved one. As in the files, a decimal stands for the float64 nearest to it.
+exactly where its shortest decimal form is short, else rounded outward.
 """
 
 import json
@@ -59,14 +58,11 @@ def exact(value: Fraction) -> str:
 
 
 def root_above(value: Fraction, bits: int = 64) -> Fraction:
-    """A rational at least the square root of value >= 0, within 2^(1 - bits) of it, relatively."""
-    if not value:
-        return Fraction(0)
-    shift = max(0, 2 * bits - value.numerator.bit_length() + value.denominator.bit_length())
-    shift += shift % 2
-    scaled = -((-value.numerator << shift) // value.denominator)
+    """A rational at least the square root of value >= 0, within 2^(2 - bits) of it, relatively."""
+    shift = max(0, bits + (value.denominator.bit_length() - value.numerator.bit_length()) // 2)
+    scaled = -((-value.numerator << 2 * shift) // value.denominator)
     root = isqrt(scaled)
-    return Fraction(root if root * root == scaled else root + 1, 1 << (shift // 2))
+    return Fraction(root + (root * root < scaled), 1 << shift)
 
 
 PRINTED: dict[str, Callable[[Any], str]] = {

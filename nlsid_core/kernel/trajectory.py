@@ -4,13 +4,13 @@ Between knots the nominal's states and inputs and the gains are Bézier curves, 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
+from types import SimpleNamespace
 from typing import Any
 
-from .exact import Matrix, definite
-from .files import Mismatch, Node, Reader, Table, Terms, itself, whole
+from .exact import definite
+from .files import Node, Reader, Table, Terms, itself, refuse_if, whole
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -18,50 +18,19 @@ MAX_BOUNDS, MAX_KNOTS, MAX_SPANS = 10_000, 10_000, 1000
 MAX_LEVEL, MAX_PIECES = 16, 100_000
 
 Bounds = dict[int, tuple[Fraction, Fraction]]
-Curve = list[list[list[Fraction]]]  # by interval, control point, entry
-Mode = tuple[int, ...]  # -1 low, 0 free, 1 high, of each input with limits
+# A mode, -1 low, 0 free, 1 high, of each input with limits; of a rate after its input and sign.
+Case = tuple[int, ...]
+Key = tuple[int, int, Case]  # interval, vertex, case
 Part = tuple[int, int, int]  # interval k, level, index: [index, index + 1] / 2^level of it
-Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
-Piece = tuple[Key, Part, dict[str, Node]]  # what it is about, and its members
+Piece = tuple[Key, Part, dict[str, Any], str]  # what it is about, its members, and where it stands
+
+# t, P, rho: knots, and what holds at them. x, u, K: control points by interval. limits: low and
+# high by input; modes. n states, m inputs, the box of w. By interval, equations in t, x, u, w and
+# bounds of (x, u). pushing: the variables that only add constants to ẋ. affine: f is so in each u.
+Motion = SimpleNamespace
 
 
-@dataclass(frozen=True)
-class Funnel:
-    """Knots; control points of x₀, u₀ and K; low and high by input with limits; P, ρ at knots."""
-
-    t: list[Fraction]
-    x: Curve
-    u: Curve
-    K: list[list[Matrix]]
-    limits: Bounds
-    P: list[Matrix]
-    rho: list[Fraction]
-
-    @property
-    def modes(self) -> list[Mode]:
-        """Each input with limits free, low or high."""
-        return list(product((0, -1, 1), repeat=len(self.limits)))
-
-
-@dataclass(frozen=True)
-class Field:
-    """n states, m inputs, a box of w; by interval, equations in t, x, u, w and bounds of (x, u).
-
-    pushing: the variables of the equations that only add constants to ẋ; affine: whether f is so in
-    each input; both in all time spans.
-    """
-
-    n: int
-    m: int
-    box: list[tuple[Fraction, Fraction]]
-    equations: list[list[Terms]]
-    bounds: list[Bounds]
-    pushing: set[int]
-    affine: bool
-    expansion: str
-
-
-def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
+def read_motion(documents: dict[str, Node], digests: dict[str, str]) -> Motion:
     """The policy and the funnel: around one nominal, x₀ continuous, P ≻ 0, ρ > 0 at every knot."""
     made_for = {"vector_field": digests["vector_field"]}
     table: Table = {"t": (None,), "x": itself, "u": itself, "K": itself, "limits": (None, 3)}
@@ -72,8 +41,8 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
 
     t, rho, x = given["t"], given["rho"], _curve(given["x"], len(given["t"]) - 1, None)
     n, count = len(x[0][0]), len(x)
-    if policy["t"] != t or _curve(policy["x"], count, n) != x:
-        raise Mismatch("the funnel is around another nominal than the policy's")
+    other = policy["t"] != t or _curve(policy["x"], count, n) != x
+    refuse_if(other, "the funnel is around another nominal than the policy's", "mismatch")
     smooth = all(a[-1] == b[0] for a, b in pairwise(x))
     node.require({"one rho a knot": len(rho) == len(t), "x should not jump": smooth})
     node.require({"rho should be positive": min(rho) > 0}, "not_below")
@@ -91,10 +60,13 @@ def read_funnel(documents: dict[str, Node], digests: dict[str, str]) -> Funnel:
             "limits should have low < high": all(low < high for low, high in limits.values()),
         }
     )
-    return Funnel(t, x, u, _curve(policy["K"], count, m, n), limits, P, rho)
+    K, modes = _curve(policy["K"], count, m, n), list(product((0, -1, 1), repeat=len(limits)))
+    motion = Motion(t=t, x=x, u=u, K=K, limits=limits, P=P, rho=rho, n=n, m=m, modes=modes)
+    _read_field(documents["vector_field"], motion)
+    return motion
 
 
-def read_field(node: Node, funnel: Funnel) -> Field:
+def _read_field(node: Node, motion: Motion) -> None:
     """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
     table: Table = {
         "states": whole(1, MAX_STATES),
@@ -106,17 +78,16 @@ def read_field(node: Node, funnel: Funnel) -> Field:
         "pieces": itself,
     }
     given = node.document("vector_field", table)
-    n, m, box = given["states"], given["inputs"], given["uncertain"]
-    count, first = len(given["breaks"]) + 1, 1 + n + m
-    sizes = (len(funnel.x[0][0]), len(funnel.u[0][0]))
-    knots = [t for t in given["breaks"] if funnel.t[0] < t < funnel.t[-1]]
+    n, m, box, breaks = motion.n, motion.m, given["uncertain"], given["breaks"]
+    count, first, sizes = len(breaks) + 1, 1 + n + m, (given["states"], given["inputs"])
+    knots = {*motion.t}.issuperset(t for t in breaks if motion.t[0] < t < motion.t[-1])
     node.require(
         {
             "other states and inputs than the policy's": sizes == (n, m),
             "uncertain should have low <= high": all(low <= high for low, high in box),
             f"uncertain should have at most {MAX_UNCERTAIN} rows": len(box) <= MAX_UNCERTAIN,
             f"valid should have at most {MAX_BOUNDS} rows": len(given["valid"]) <= MAX_BOUNDS,
-            "the dynamics change at a time that is no knot": all(t in funnel.t for t in knots),
+            "the dynamics change at a time that is no knot": knots,
         }
     )
     bounds: list[Bounds] = [{} for _ in range(count)]
@@ -134,11 +105,13 @@ def read_field(node: Node, funnel: Funnel) -> Field:
     rows = [e for span in equations for equation in span for e, _ in equation]
     single = all(max(e[first:], default=0) <= 1 for e in rows)
     node.require({"a monomial should have degree 1 at most in an entry of w": single})
-    pushing = {j for j in range(1 + n, first + len(box)) if all(sum(e) == 1 for e in rows if e[j])}
-    spans = [sum(t <= start for t in given["breaks"]) for start in funnel.t[:-1]]
-    by_interval = [equations[span] for span in spans], [bounds[span] for span in spans]
-    affine = all(max(e[1 + n : first], default=0) <= 1 for e in rows)
-    return Field(n, m, box, *by_interval, pushing, affine, given["expansion"])
+    spans = [sum(t <= start for t in breaks) for start in motion.t[:-1]]
+    motion.equations, motion.bounds = [equations[i] for i in spans], [bounds[i] for i in spans]
+    motion.pushing = {
+        j for j in range(1 + n, first + len(box)) if all(sum(e) == 1 for e in rows if e[j])
+    }
+    motion.affine = all(max(e[1 + n : first], default=0) <= 1 for e in rows)
+    motion.box, motion.expansion = box, given["expansion"]
 
 
 def pushed(equation: Terms, j: int) -> Fraction:
@@ -151,26 +124,28 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
 
     Raises Rejected unless their parts of time cover [0, 1] for everything that is needed.
     """
-    names = f"interval vertex level index columns squares {names}" + " mode" * bool(limited)
+    rate = {"input": whole(0), "sign": whole(-1, 1)} if "input" in names else {}
+    place = {"interval": whole(0), "vertex": whole(0), "level": whole(0, MAX_LEVEL)}
+    others = dict.fromkeys(f"columns squares {names}".split(), itself)
+    table: Table = {**place, "index": whole(0), **others, **rate}
+    if limited:
+        table["mode"] = lambda entry: entry.wholes(limited)
     pieces: list[Piece] = []
     covered = dict.fromkeys(needed, Fraction(0))
     for entry in node.items(1, MAX_PIECES):
-        piece = entry.members(names)
-        level = piece["level"].whole(0, MAX_LEVEL)
-        index = piece["index"].whole(0, 2**level - 1)
-        mode = tuple(piece["mode"].wholes(limited)) if limited else ()
-        if "input" in piece:
-            mode = piece["input"].whole(0), piece["sign"].whole(-1, 1), *mode
-        k, v = piece["interval"].whole(0), piece["vertex"].whole(0)
-        known = (k, v, mode) in covered
-        entry.require({f"no interval {k}, vertex {v}, mode {mode}": known}, "not_covered")
-        pieces.append(((k, v, mode), (k, level, index), piece))
-    starts = sorted((key, Fraction(i, 2**level), level) for key, (_, level, i), _ in pieces)
+        piece = entry.read(table)
+        k, v, level, index = (piece[name] for name in ("interval", "vertex", "level", "index"))
+        entry.require({f"index should be below 2^{level}": index < 2**level})
+        case = (*(piece[name] for name in rate), *piece.get("mode", ()))
+        where = f"interval {k}, vertex {v}, case {case}"
+        entry.require({f"no {where}": (k, v, case) in covered}, "not_covered")
+        pieces.append(((k, v, case), (k, level, index), piece, f"{entry.where} ({where})"))
+    starts = sorted((key, Fraction(i, 2**level), level) for key, (_, level, i), *_ in pieces)
     for key, start, level in starts:
         if start <= covered[key]:
             covered[key] = max(covered[key], start + Fraction(1, 2**level))
-    for (k, v, mode), until in covered.items():
-        wanted = f"a piece of interval {k}, vertex {v}, mode {mode} is missing"
+    for (k, v, case), until in covered.items():
+        wanted = f"a piece of interval {k}, vertex {v}, case {case} is missing"
         node.require({wanted: until >= 1}, "not_covered")
     return pieces
 

@@ -1,7 +1,7 @@
 """Claim `tube`: outputs stay near the model's own simulation, or near a policy's plan.
 
 The model runs twice under the same inputs: the simulation x, and the observer x̂ with L e injected
-after each step, e the innovation. x̄ = x̂ - x, x̄⁺ = F ζ + L e, o = y - y° = H ζ + e, ζ = (ν, x̄), and
+after each step, e the innovation. Of x̄ = x̂ - x, x̄⁺ = F ζ + L e, o = y - y° = H ζ + e, ζ = (ν, x̄),
 the inequality of `increments` has to hold, with the funnel's ρ, P, R,
     for G = [F L], Q = P: V = x̄'Px̄ grows by no more than the innovation's energy,
     for G = [H_j 1_j], Q = τ_j: V bounds output j.
@@ -17,23 +17,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 from . import text
-from .exact import Matrix, Rows, at_most, definite, unit
-from .files import (
-    Node,
-    Read,
-    Rejected,
-    Table,
-    bound_files,
-    each,
-    itself,
-    limit,
-    one_of,
-    refuse_if,
-    whole,
-)
+from .exact import Matrix, at_most, combined, definite, unit
+from .files import Members, Node, Read, Table, bound_files, each, itself, limit, one_of, whole
 from .increments import Model, gap, positive
 from .models import read_model
 from .signals import Signal, apart, ranges
@@ -41,29 +28,21 @@ from .signals import Signal, apart, ranges
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
 MAX_PLAN = 10**6  # samples of a plan
-
 MAX_TERMS = 200
 MAX_FACTORS = 4
 WORDS = ("E", "e", "g", "i", "x", "sum", "change")  # of a formula: names that are these are quoted
+
 TERM: Table = {
     "inputs": lambda node: node.wholes(None),
     "of": one_of("value", "change"),
-    "centre": (),
-    "scale": (),
-    "fading": (),
+    **dict.fromkeys(("centre", "scale", "fading"), ()),
 }
-
-Term = dict[str, Any]  # one G, the members of TERM
-CommandLevel = list[tuple[Fraction, Term]]  # its weights, not negative, some positive, and terms
-
-Tube = dict[str, Any]  # the members of a tube in a funnel's file
-Policy = dict[str, Any]  # the members of a policy's file
-
 ASSUMPTION: Table = {  # what was measured is no part of the claim
     "kind": one_of("fading", "energy"),
     "samples?": whole(1, MAX_SAMPLES),
     **dict.fromkeys(("measured", "safety_factor", "designed_on", "measured_on"), itself),
 }
+CommandLevel = list[tuple[Fraction, Members]]  # weights, not negative, some positive; and terms G
 
 SENTENCE = (
     "tube: the measured output stays near the model's simulation under the same inputs, {tubes}, "
@@ -81,6 +60,9 @@ ENGAGED = (
 )
 START = "after {settling} samples ({span:up} s) the simulation starts at {whose}{inlet}{plan}"
 INLET = ", or where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
+SUM = "sum of {energy} <= {level} over {samples} samples"
+FADING = "E <= {level}{g} after every sample, E+ = {rho:exact} E + {energy} from 0{sum}"
+PAST = ", sums over the run's samples, each i samples ago"
 INSIDE = (
     "the inputs, and the outputs and states of simulation and observer, stay in {ranges}; that any "
     "do is not stated"
@@ -100,87 +82,70 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     funnel = documents["funnel"].document("funnel", table, "tube", made_for)
     model = read_model(documents["model"], funnel["box"])
     policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None
-    tubes = [_read_tube(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
+    tubes = [_read_tube(node, model, policy) for node in funnel["tubes"].items(1, MAX_TUBES)]
 
-    given = proof.members("", "multipliers").get("multipliers")
-    trees = [None] * len(tubes) if given is None else given.items(len(tubes), len(tubes))
+    given = proof.read({"multipliers?": itself})["multipliers"]
+    trees = given.items(len(tubes), len(tubes)) if given else [None] * len(tubes)
     modes = _modes(model, policy)
-    pairs = zip(tubes, trees, strict=True)
-    margin = min(_decide_tube(tube, tree, modes, policy) for tube, tree in pairs)
+    margin = min(_decide_tube(*pair, modes) for pair in zip(tubes, trees, strict=True))
 
-    assumptions = [_start(model, policy, tubes, funnel["settling"])]
+    several = any(tube["L"] != tubes[0]["L"] for tube in tubes)
+    assumptions = [_start(model, policy, tubes, funnel["settling"], several)]
     if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
-    own = " of its own observer" if _several(tubes) else ""
-    shown = []
+    own, shown = " of its own observer" if several else "", []
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
         shown.append(label + _shown(model, tube))
         assumptions.append(f"{label}innovation energy{own}: {_energy(model, tube)}")
-    plan = _around_plan(model, policy)
+    plan = _around_plan(model, policy) if policy else ""
     said = text.say(SENTENCE, tubes="; ".join(shown), where=model.where, plan=plan)
     return text.Verdict(said, margin, tuple(assumptions), digests)
 
 
-def _decide_tube(
-    tube: Tube, tree: Node | None, modes: Sequence[tuple[str, Model]], policy: Policy | None
-) -> Fraction:
+def _decide_tube(tube: Members, tree: Node | None, modes: Sequence[tuple[str, Model]]) -> Fraction:
     """The part of the half-widths' squares that one tube leaves."""
-    if policy:
-        refuse_if(tube["L"] != policy["L"], "the observer of a tube is not the policy's")
-        refuse_if(tube["follows"], "with a policy no level follows the commands")
     definite(tube["P"], "P")
     definite(tube["R"], "R")
     for mode, model in modes:
         positive(model, tree, _gaps(model, tube, mode))
-
-    used = tube["level"] + tube["rho"] * tube["inlet"]
-    shares: list[Fraction] = []
+    used, shares = tube["level"] + tube["rho"] * tube["inlet"], []
     for tau, width, signal in zip(tube["tau"], tube["half_widths"], modes[0][1].y, strict=True):
-        shares.append(used / (tau * width**2))
+        shares.append(Fraction(used / (tau * width**2)))
         at_most(shares[-1], 1, f"{signal.name} can leave the stated half-width {text.above(width)}")
     return 1 - max(shares)
 
 
-def _modes(model: Model, policy: Policy | None) -> list[tuple[str, Model]]:
+def _modes(model: Model, policy: Members | None) -> list[tuple[str, Model]]:
     """The increments with the plan's inputs played, and with the policy engaged if it acts."""
-    if policy is None or model.linear is None or not any(policy["K"][0]):
+    linear = model.linear
+    if policy is None or linear is None or not any(policy["K"][0]):
         return [("", model)]
-    linear, (K,) = model.linear, policy["K"]
-    F = [_minus(row, b, K) for row, b in zip(model.F, linear.B, strict=True)]
-    engaged = replace(model, F=F, H=[_minus(row, linear.D, K) for row in model.H])
+    BK, DK = ([[b * k for k in policy["K"][0]] for b in rows] for rows in (linear.B, [linear.D]))
+    engaged = replace(model, F=combined(model.F, BK, -1), H=combined(model.H, DK, -1))
     return [(", the plan's inputs played,", model), (", the policy engaged,", engaged)]
 
 
-def _minus(row: list[Fraction], gain: Fraction, K: list[Fraction]) -> list[Fraction]:
-    return [entry - gain * k for entry, k in zip(row, K, strict=True)]
-
-
-def _gaps(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
+def _gaps(model: Model, tube: Members, mode: str) -> list[tuple[str, Matrix]]:
     """The two inequalities of the module's docstring, without the multipliers."""
-
-    def form(G: Rows, Q: Rows) -> Matrix:
-        return gap(model, tube["rho"], tube["P"], tube["R"], G, Q)
-
-    F, p = [row + gain for row, gain in zip(model.F, tube["L"], strict=True)], len(model.H)
-    found = [(f"the decrease of V up to the innovation's energy{mode}", form(F, tube["P"]))]
+    rho, P, R, p = tube["rho"], tube["P"], tube["R"], len(model.H)
+    F = [row + gain for row, gain in zip(model.F, tube["L"], strict=True)]
+    what = f"the decrease of V up to the innovation's energy{mode}"
+    found = [(what, gap(model, rho, P, R, F, P))]
     for j, (row, tau) in enumerate(zip(model.H, tube["tau"], strict=True)):
         what = f"the bound on {model.y[j].name} by V{mode}"
-        found.append((what, form([row + unit(j, p)], [[tau]])))
+        found.append((what, gap(model, rho, P, R, [row + unit(j, p)], [[tau]])))
     return found
 
 
-def _read_tube(node: Node, model: Model) -> Tube:
+def _read_tube(node: Node, model: Model, policy: Members | None) -> Members:
     n, p = model.states, len(model.H)
     table: Table = {
-        "rho": (),
+        **dict.fromkeys(("rho", "level", "inlet"), ()),
         "L": (n, p),
         "P": (n, n),
         "R": (p, p),
-        "tau": (p,),
-        "half_widths": (p,),
-        "level": (),
-        "inlet": (),
+        **dict.fromkeys(("tau", "half_widths"), (p,)),
         "assumption": lambda entry: entry.read(ASSUMPTION),
         "follows?": lambda entry: read_level(entry, len(model.u)),
         "peak?": itself,
@@ -188,17 +153,19 @@ def _read_tube(node: Node, model: Model) -> Tube:
     tube = node.read(table)
     rho, energy = tube["rho"], tube["assumption"]["kind"] == "energy"
     ends = tube["assumption"]["samples"] is not None
-    apart = not tube["follows"] or (rho < 1 and not tube["inlet"])
+    free = not tube["follows"] or (rho < 1 and not tube["inlet"])
     node.require(
         {
             "energy is for a number of samples, fading for ever": energy == ends,
-            "a level that follows the commands is for fading, without an inlet": apart,
+            "a level that follows the commands is for fading, without an inlet": free,
+            "the observer should be the policy's": policy is None or tube["L"] == policy["L"],
+            "with a policy no level follows the commands": not (policy and tube["follows"]),
         }
     )
-    rated = 0 < rho <= 1 and energy == (rho == 1)
     node.require(
         {
-            "rho should be 1 for energy, between 0 and 1 for fading": rated,
+            "rho should be above 0, and 1 for energy, below 1 for fading": 0 < rho <= 1
+            and energy == (rho == 1),
             "tau and half_widths should be positive": min(tube["tau"] + tube["half_widths"]) > 0,
             "inlet and level should be 0 or more": min(tube["inlet"], tube["level"]) >= 0,
         },
@@ -207,21 +174,20 @@ def _read_tube(node: Node, model: Model) -> Tube:
     return tube
 
 
-def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
-    n, p, m = model.states, len(model.H), len(model.u)
+def _read_policy(node: Node, model: Model, made_for: str) -> Members:
+    n, p, m, linear = model.states, len(model.H), len(model.u), model.linear
     table: Table = {"period": (), "start": (n,), "u": (None, m), "K": (m, n), "L": (n, p)}
     policy = node.document("policy", table, "tube", {"model": made_for})
     node.require({"the period should be the model's": policy["period"] == model.period})
     limit(len(policy["u"]), MAX_PLAN, "samples of a plan", least=1)
-    if model.linear is None:
-        raise Rejected("a plan is decided for a model of kind difference_equation")
-    low, high = model.linear.input_range
+    node.require({"a plan is decided for a model of kind difference_equation": linear})
+    low, high = linear.input_range if linear else (0, 0)
     inside = all(low <= entry <= high for row in policy["u"] for entry in row)
     node.require({"u should be in the model's input range": inside}, "not_valid")
     return policy
 
 
-def _shown(model: Model, tube: Tube) -> str:
+def _shown(model: Model, tube: Members) -> str:
     """The half-widths of one tube, and for how long they hold."""
     root, samples = " sqrt(g)" if tube["follows"] else "", tube["assumption"]["samples"]
     widths = " and ".join(
@@ -235,53 +201,52 @@ def _samples(model: Model, count: int) -> str:
     return f"{count} samples, which span {text.below((count - 1) * model.period)} s"
 
 
-def _around_plan(model: Model, policy: Policy | None) -> str:
+def _around_plan(model: Model, policy: Members) -> str:
     """What is claimed of the plan beside what is claimed of every simulation."""
-    if policy is None or model.linear is None:
-        return ""
     how = PLAYED
-    if any(policy["K"][0]):
+    if model.linear and any(policy["K"][0]):
         clipped = text.PRINTED["exact_range"](model.linear.input_range)
         how = text.say(ENGAGED, clipped=model.u[0].quantity(clipped))
     return text.say(PLAN, samples=_samples(model, len(policy["u"])), how=how)
 
 
-def _several(tubes: list[Tube]) -> bool:
-    """Whether the tubes have observers of their own."""
-    return any(tube["L"] != tubes[0]["L"] for tube in tubes)
-
-
-def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int) -> str:
-    whose, inlet = "the observer's state", ""
-    if _several(tubes):
-        whose = "one state with the observers, one for each tube"
-    if any(tube["inlet"] for tube in tubes):
-        inlet = text.say(INLET, inlets=" and ".join(text.below(tube["inlet"]) for tube in tubes))
-    plan = ", as the plan does" if policy else ""
-    span = settling * model.period
-    return text.say(START, settling=settling, span=span, whose=whose, inlet=inlet, plan=plan)
+def _start(
+    model: Model, policy: Members | None, tubes: list[Members], settling: int, several: bool
+) -> str:
+    own = "one state with the observers, one for each tube"
+    inlets = " and ".join(text.below(tube["inlet"]) for tube in tubes)
+    return text.say(
+        START,
+        settling=settling,
+        span=settling * model.period,
+        whose=own if several else "the observer's state",
+        inlet=text.say(INLET, inlets=inlets) if any(tube["inlet"] for tube in tubes) else "",
+        plan=", as the plan does" if policy else "",
+    )
 
 
 def _inside(model: Model, box: Node) -> str:
-    signals, ends = [*model.y, *apart(model.u, model.y)], box.members("y u")
-    rows = ends["y"].array(len(model.y), 2) + ends["u"].array(len(model.u), 2)
-    return text.say(INSIDE, ranges=ranges(signals, list(map(text.PRINTED["inner_range"], rows))))
+    ends = box.read({"y": (len(model.y), 2), "u": (len(model.u), 2)})
+    shown = list(map(text.PRINTED["inner_range"], ends["y"] + ends["u"]))
+    return text.say(INSIDE, ranges=ranges([*model.y, *apart(model.u, model.y)], shown))
 
 
-def _energy(model: Model, tube: Tube) -> str:
+def _energy(model: Model, tube: Members) -> str:
     """The bound on the innovations' energy; of one output with R = 1 in its unit, squared."""
-    unit_, energy, samples = "", "e'Re", tube["assumption"]["samples"]
-    if len(model.y) == 1 and tube["R"] == [[1]]:
-        unit_, energy = f"({model.y[0].unit})^2" if model.y[0].unit else "", "e^2"
-    elif len(model.y) == 1:
-        energy = f"{text.exact(tube['R'][0][0])} e^2"
-    level = Signal("", unit_).quantity(text.below(tube["level"]))
-    if samples:
-        return f"sum of {energy} <= {level} over {samples} samples"
-    growth = f"after every sample, E+ = {text.exact(tube['rho'])} E + {energy} from 0"
-    if tube["follows"] is None:
-        return f"E <= {level} {growth}"
-    return f"E <= {level} g {growth}, g = {formula(tube['follows'], model.u)}"
+    samples, follows, R = tube["assumption"]["samples"], tube["follows"], tube["R"]
+    energy, squared = "e'Re", ""
+    if len(model.y) == 1:
+        energy = "e^2" if R == [[1]] else f"{text.exact(R[0][0])} e^2"
+        squared = f"({model.y[0].unit})^2" if R == [[1]] and model.y[0].unit else ""
+    return text.say(
+        SUM if samples else FADING,
+        energy=energy,
+        level=Signal("", squared).quantity(text.below(tube["level"])),
+        samples=samples,
+        rho=tube["rho"],
+        g=" g" if follows else "",
+        sum=f", g = {formula(follows, model.u)}" if follows else "",
+    )
 
 
 def read_level(node: Node, inputs: int) -> CommandLevel:
@@ -296,7 +261,7 @@ def read_level(node: Node, inputs: int) -> CommandLevel:
     return list(zip(weights, terms, strict=True))
 
 
-def _term(node: Node) -> Term:
+def _term(node: Node) -> Members:
     given = node.read(TERM)
     node.require({f"at most {MAX_FACTORS} inputs": len(given["inputs"]) <= MAX_FACTORS})
     fits = given["scale"] > 0 and 0 <= given["fading"] < 1
@@ -304,33 +269,27 @@ def _term(node: Node) -> Term:
     return given
 
 
-def formula(level: CommandLevel, u: tuple[Signal, ...]) -> str:
+def formula(level: CommandLevel, u: Sequence[Signal]) -> str:
     """g as a sum, every number exact."""
-    summands, past = [], ""
-    for weight, term in level:
-        if not weight:
-            continue
-        square = _square(term, u)
-        if term["fading"]:
-            square = f"(sum {text.exact(term['fading'])}^i {square or '1'})"
-            past = ", sums over the run's samples, each i samples ago"
-        summands.append(f"{text.exact(weight)} {square}".rstrip())
-    return " + ".join(summands) + past
+    used = [(weight, term) for weight, term in level if weight]
+    past = PAST if any(term["fading"] for _, term in used) else ""
+    shown = (f"{text.exact(weight)} {_summand(term, u)}".rstrip() for weight, term in used)
+    return " + ".join(shown) + past
 
 
-def _square(term: Term, u: tuple[Signal, ...]) -> str:
-    """v² in words; empty where it is 1."""
-    changes, centre, scale = term["of"] == "change", term["centre"], term["scale"]
-    if not (term["inputs"] or changes or centre) and scale == 1:
-        return ""
+def _summand(term: Members, u: Sequence[Signal]) -> str:
+    """G in words; empty where it is 1."""
     used = [u[i] for i in term["inputs"]]
     product = " x ".join(_plain(signal.name, "()+*^/-") for signal in used) or "1"
     unit = Signal("", " ".join(_plain(signal.unit, "()+*^") for signal in used if signal.unit))
-    if changes:
+    centre, scale = (unit.quantity(text.exact(term[name])) for name in ("centre", "scale"))
+    if term["of"] == "change":
         product = f"change of {product}"
-    elif centre:
-        product = f"({product} - {unit.quantity(text.exact(centre))})"
-    return f"({product} / {unit.quantity(text.exact(scale))})^2"
+    elif term["centre"]:
+        product = f"({product} - {centre})"
+    square = "" if product == scale == "1" else f"({product} / {scale})^2"
+    fading = text.exact(term["fading"])
+    return f"(sum {fading}^i {square or '1'})" if term["fading"] else square
 
 
 def _plain(word: str, operators: str) -> str:

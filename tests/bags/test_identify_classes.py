@@ -24,7 +24,7 @@ from nlsid_core.identification import (
     select,
     validate,
 )
-from nlsid_core.identification.prediction import history, simulate_trial, solve_increasing_at
+from nlsid_core.identification.prediction import simulate_trial, solve_increasing_at
 from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from nlsid_core.models.monotone_equation import solve_increasing
@@ -217,20 +217,6 @@ def test_many_increasing_cubics_are_inverted_at_once() -> None:
         found = solve_increasing_at(np.array(e), targets)
         one_by_one = [solve_increasing(e, target, 0.0) for target in targets.tolist()]
         np.testing.assert_allclose(found, one_by_one, rtol=1e-12, atol=1e-15)
-
-
-def test_predictions_of_a_monotone_equation_are_simulations_restarted_at_every_sample() -> None:
-    model = replace(repeated.truth(), window=((0, 3),), y_offset=0.2)
-    w = np.random.default_rng(0).uniform(-2.0, 2.0, 60)
-    trial = repeated.run(w, 0.1, 1)
-    h, horizon = history(model), 4
-    assert h == 3
-    predicted = predict(model, trial, horizon)
-    assert predicted.shape == (60 - h - horizon + 1, 1)
-    for row in range(len(predicted)):
-        rows = slice(row, row + h + horizon)
-        restarted = model.simulate(trial.u[rows], trial.y[row : row + h, 0])
-        assert predicted[row, 0] == pytest.approx(restarted[-1], abs=1e-12)
 
 
 def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[MonotoneEquation]) -> None:

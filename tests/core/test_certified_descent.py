@@ -62,15 +62,6 @@ def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> No
     assert "incremental stability" in decided.statement
 
 
-@pytest.mark.slow
-def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
-    fast = identify(noisy(800, 1), CLASS, method=Sem(certified=True), comparators=(), max_rate=0.4)
-    assert fast.proof.rate <= 0.4
-    free = identify(noisy(800, 1), CLASS, method=Sem(certified=True), comparators=())
-    assert free.proof.rate > 0.4
-    assert free.errors["train"]["sem_certified"] < fast.errors["train"]["sem_certified"]
-
-
 @pytest.mark.parametrize(
     "model_class",
     [

@@ -1,27 +1,16 @@
 """Robust simulation error: the bound, its derivatives, its iterates, and what is refused."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.identification import Fit, Polynomial, identify, prove_stability, simulation_percent
-from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.explicit import equation_error
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import DifferenceEquation, Signal
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
 
 EXACT = 1e-10  # agreement of two floating-point routes to the same number
-
-
-def test_the_bound_never_goes_up_over_the_iterates(train: Dataset) -> None:
-    regression = build_state_affine_rows(train, Polynomial(3))
-    bounds = [iterate.J for iterate in robust_simulation_error(regression.rows)]
-    assert len(bounds) > 2
-    assert all(after <= before for before, after in pairwise(bounds))
 
 
 def test_noise_free_data_give_the_true_coefficients_back() -> None:
@@ -89,30 +78,6 @@ def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
     proof = prove_stability(model)
     assert proof is not None
     assert float(np.abs(model.poles).max()) < proof.rate < 1.0
-
-
-def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
-    return Dataset(
-        (Trajectory(t=np.linspace(0.0, PERIOD * (len(u) - 1), len(u)), y=y, u=u, name="run"),)
-    )
-
-
-def test_a_constant_input_is_refused_with_the_reason() -> None:
-    y = np.random.default_rng(0).standard_normal(100)
-    with pytest.raises(DataError, match=r"u0 is constant \(0.4\)"):
-        identify(_dataset(np.full(100, 0.4), y), Polynomial(2))
-
-
-def test_an_input_that_excites_too_few_lags_is_refused() -> None:
-    u = np.tile([0.0, 1.0], 50)
-    with pytest.raises(DataError, match="does not excite 4 lags"):
-        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), Polynomial(4))
-
-
-def test_too_few_rows_are_refused_with_how_many_are_needed() -> None:
-    rng = np.random.default_rng(0)
-    with pytest.raises(DataError, match="28 equations for 6 parameters; give at least 30"):
-        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), Polynomial(2))
 
 
 def test_error_percent_is_zero_for_the_truth(fit: Fit[DifferenceEquation]) -> None:

@@ -14,7 +14,7 @@ from bags.designs import documents
 from bags.pictures.report import page
 from bags.samples import f1tenth
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import Infeasible
 from nlsid_core.identification import (
     LeastSquares,
     Method,
@@ -84,13 +84,6 @@ def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
     assert set(fit.methods) >= {"least_squares", "rie", "rse_certified"}
     lagged = np.array([g.coefficients[0, 0, 0] for g in fit.model.G])
     np.testing.assert_allclose(-lagged[1:] / lagged[0], TRUE_A, atol=0.02)
-
-
-def test_an_unknown_method_and_one_of_another_class_are_refused(train: Dataset) -> None:
-    with pytest.raises(DataError, match="'magic' is no method; there are: least_squares, rie"):
-        identify(train, Polynomial(2), method="magic")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match=r"is not for this model class; it has: rie, least_squares"):
-        identify(train, Polynomial(2, set="3.8"), method=Rse())
 
 
 def unstable_recordings() -> Dataset:

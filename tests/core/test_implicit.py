@@ -29,15 +29,6 @@ def test_newton_and_the_ellipsoid_method_find_the_same_next_state(name: str) -> 
         np.testing.assert_allclose(found, v[row], atol=1e-5)
 
 
-def test_a_delay_model_shifts_its_old_states() -> None:
-    model, rng = lagged(), np.random.default_rng(1)
-    x, w = rng.normal(size=(7, 2)), rng.normal(size=(7, 1))
-    after = model.step(x, w)
-    np.testing.assert_array_equal(after[:, 1], x[:, 0])
-    equation = 3.0 * after[:, 0] + after[:, 0] ** 3 - 1.5 * x[:, 0] + 0.9 * x[:, 1] - w[:, 0]
-    np.testing.assert_allclose(equation, 0.0, atol=1e-10)
-
-
 @pytest.mark.parametrize("name", EVERY)
 def test_without_newton_the_ellipsoid_method_makes_the_step(
     name: str, monkeypatch: pytest.MonkeyPatch

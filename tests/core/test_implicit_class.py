@@ -1,30 +1,25 @@
 """Implicit models searched in each stable set: bounds that hold, known truths, what is refused."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+from nlsid_core.errors import DataError
 from nlsid_core.identification import (
     Degrees,
     LeastSquares,
     Polynomial,
     identify,
-    predict,
     simulate_trial,
 )
 from nlsid_core.identification.polynomial.implicit_rie import minimise_implicit_rie
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
 from nlsid_core.identification.polynomial.options import StableSet
 from nlsid_core.models import ImplicitModel
-from nlsid_core.proofs import check, proof_document
-from tests import implicit_models
 
 WIDE = ((-30.0, 30.0),) * 3
 STATE = (1,)  # delays where the output is the state
@@ -65,14 +60,6 @@ def spring(
         x[t] = root - 2.0 / (3.0 * root)
     y = gain * (x + noise * rng.standard_normal(samples)) + mean
     return Trajectory(t=0.01 * np.arange(samples), y=y, u=u, name=f"run {seed}")
-
-
-def coupled(samples: int, seed: int) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    u = rng.uniform(-1.0, 1.0, (samples, 1))
-    x = implicit_models.coupled().simulate(np.zeros((1, 2)), u[None, :-1])[0]
-    y = (x + 0.01 * rng.standard_normal(x.shape)) * [1.0, 50.0] + [0.0, 20.0]
-    return Trajectory(t=0.1 * np.arange(samples), y=y, u=u, name=f"run {seed}")
 
 
 def decay(a: float, samples: int, noise: float) -> Dataset:
@@ -124,21 +111,6 @@ def test_the_linear_bound_is_the_best_there_is_of_first_order() -> None:
     assert min(values) * (1.0 - 1e-6) <= bound <= 1.011 * min(values)
 
 
-def test_the_linear_bound_is_above_the_lower_bound_of_proposition_2_19() -> None:
-    """sup |(zI - A)⁻¹(x̃⁺ - Ax̃ - Bw)|²_Q over |z| = 1, sample by sample, two states."""
-    trial = coupled(300, 0)
-    rows = build_implicit_rows(Dataset((trial,)), CLASSES[2])
-    fit, spread = minimise_implicit_rie(rows), rows.y_scale[1]
-    x, w = trial.y[:-1], trial.u[:-1]
-    after = fit.model.step(x, w)
-    A = fit.model.jacobian(after, x, w)[0, :, :2] * spread / spread[:, None]
-    errors = (trial.y[1:] - after) / spread
-    z = np.exp(1j * np.linspace(0.0, np.pi, 181))
-    reached = np.linalg.inv(z[:, None, None] * np.eye(2) - A) @ errors.T  # (z, state, sample)
-    lower = float(np.mean(np.max(np.sum(np.abs(reached) ** 2, axis=1), axis=0)))
-    assert 0.5 * fit.bound < lower <= fit.bound
-
-
 @pytest.mark.parametrize("name", ["2.11", "2.13"])
 def test_a_cubic_spring_without_noise_is_found(name: StableSet) -> None:
     data = Dataset((spring(300, 0, noise=0.0),))
@@ -172,20 +144,6 @@ def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> Non
     assert small == pytest.approx(plain, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_several_states_of_different_units_are_identified_together() -> None:
-    data, test = Dataset((coupled(400, 0), coupled(300, 1))), Dataset((coupled(200, 5),))
-    cubic, linear = (
-        identify(data, model_class, test=test, comparators=())
-        for model_class in (
-            Polynomial(1, STATE, Degrees(left=3), set="2.13"),
-            Polynomial(1, STATE, set="2.19"),
-        )
-    )
-    assert cubic.errors["test"]["rie"] < 0.8 * linear.errors["test"]["rie"]
-    assert cubic.model.states == ("y0(t-1)", "y1(t-1)")
-
-
 def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_squares_not_proved() -> (
     None
 ):
@@ -197,43 +155,7 @@ def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_square
     assert "squared spreads of the outputs, at most 0." in str(fit)
 
 
-def test_one_step_predictions_are_steps_of_the_model() -> None:
-    trial = spring(120, 0, noise=0.1)
-    model = identify(Dataset((trial,)), CLASSES[3], comparators=()).model
-    assert (model.lags, model.history) == (2, 2)
-    x = np.column_stack([trial.y[1:-1, 0], trial.y[:-2, 0]])
-    w = np.column_stack([trial.u[2:, 0], trial.u[1:-1, 0]])
-    np.testing.assert_allclose(predict(model, trial, 1), model.step(x, w)[:, :1], atol=1e-12)
-
-
-def test_a_model_that_diverges_scores_infinity() -> None:
-    trial = spring(100, 0, noise=0.01)
-    model = identify(Dataset((trial,)), Polynomial(1, (1,), set="2.19")).model
-    coefficients = np.array(model.h.coefficients)
-    coefficients[model.h.exponents[:, 1] == 1] *= -500.0
-    wild = replace(model, h=replace(model.h, coefficients=coefficients))
-    assert np.isinf(simulate_trial(wild, trial)[-1]).all()
-    assert np.isfinite(simulate_trial(wild, trial)[:2]).all()
-
-
 # -- files ---------------------------------------------------------------------------------------
-
-
-def test_a_coefficient_that_was_changed_with_all_digests_is_refused(tmp_path: Path) -> None:
-    fit = identify(Dataset((spring(300, 0, noise=0.01),)), SPRING, comparators=())
-    document, proof = fit.model.document(), fit.proof.document(fit.model, "model.json")
-    path = tmp_path / "model.proof.json"
-    files.write_document(tmp_path / "model.json", document)
-    files.write_document(path, proof)
-    assert check(path).statement.startswith("the implicit model with 1 state has")
-    document["h"]["coefficients"][-1][0] += -10.0
-    files.write_document(tmp_path / "model.json", document)
-    with pytest.raises(CertificateMismatch, match="is not the model"):
-        check(path)
-    proof["claim"]["about"]["model"]["digest"] = files.digest(document)
-    files.write_document(path, proof_document(proof["claim"], proof["proof"]))
-    with pytest.raises(CertificateRejected, match="inequality monotone: not positive"):
-        check(path)
 
 
 def test_the_document_keeps_signals_and_refuses_a_wrong_window() -> None:

@@ -8,12 +8,9 @@ import pytest
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError
-from nlsid_core.identification import Fit, Polynomial, identify, prove_stability
-from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.rows import build_state_affine_rows
+from nlsid_core.identification import Fit, Polynomial, identify
 from nlsid_core.models import ImplicitModel
 from nlsid_core.proofs import check
-from tests.conftest import synthetic_dataset
 
 A = np.array([[0.9, 0.2], [-0.2, 0.7]])
 B = np.array([[1.0], [0.5]])
@@ -84,25 +81,6 @@ def test_data_of_an_unstable_system_give_a_stable_model_with_a_proof(
     files.write_document(tmp_path / "model.json", other)
     with pytest.raises(CertificateRejected):
         check(path)
-
-
-def test_several_outputs_with_delays_get_a_stable_model_with_a_proof(tmp_path: Path) -> None:
-    """Linear in outputs and inputs: degrees 0, 0, 1."""
-    stacked = build_state_affine_rows(states(A, noise=0.05), Polynomial(2))
-    *_, last = robust_simulation_error(stacked.rows, iterations=5)
-    model = stacked.model(last.theta, last.p)
-    proof = prove_stability(model)
-    assert proof is not None
-    files.write_document(tmp_path / "model.json", model.document())
-    files.write_document(tmp_path / "p.json", proof.document(model, "model.json"))
-    assert "every input" in check(tmp_path / "p.json").statement
-
-
-def test_one_output_and_one_input_get_a_difference_equation_with_a_proof(tmp_path: Path) -> None:
-    fit = identify(synthetic_dataset(0.1), Polynomial(3))
-    files.write_document(tmp_path / "model.json", fit.model.document())
-    files.write_document(tmp_path / "p.json", fit.proof.document(fit.model, "model.json"))
-    assert "every input" in check(tmp_path / "p.json").statement
 
 
 def test_data_that_cannot_tell_are_refused() -> None:

@@ -82,10 +82,8 @@ def literal_margin(design: FunnelDesign, piece: int, degree: int) -> tuple[float
     ("problem", "piece"),
     [
         ("one_dimensional", 0),
-        ("one_dimensional", 17),
         ("one_dimensional", 38),
         ("hanging", 3),
-        ("hanging", 12),
     ],
 )
 def test_the_literal_formulation_lies_between_what_is_proved_and_what_is_true(

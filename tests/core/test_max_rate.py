@@ -125,12 +125,3 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
 def test_a_rate_that_is_none_is_refused(rate: float) -> None:
     with pytest.raises(OptionError, match="max_rate"):
         identify(Dataset((drifting([0.5]),)), Polynomial(1), max_rate=rate)
-
-
-def test_a_monotone_equation_can_be_held_to_it() -> None:
-    data = Dataset((drifting([0.9]),))
-    for rate in (0.6, 0.95):
-        fit = identify(
-            data, Polynomial(1, (1,), set="3.8"), method=Rie(), comparators=(), max_rate=rate
-        )
-        assert fit.proof.rate <= rate

@@ -8,11 +8,11 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification import LeastSquares, Polynomial, Rie, Sem, identify, prove_stability
+from nlsid_core.identification import LeastSquares, Polynomial, identify, prove_stability
 from nlsid_core.identification.polynomial.moment_rie import MomentFit, identify_from_repeats
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.monotone_equation import is_increasing, solve_increasing
-from tests.repeated import CLASS, pair, percent, run, truth
+from tests.repeated import CLASS, pair, percent, truth
 
 
 @pytest.fixture(scope="module")
@@ -80,20 +80,6 @@ def test_a_lightly_damped_linear_equation_is_proved_as_the_linear_model_it_equal
     assert np.sqrt(0.95) < proof.rate < 0.98, "poles of radius √0.95"
     with_ray = replace(model, e=np.array([2.0, 0.0, 1e-3]))
     assert prove_stability(with_ray) is None, "with a slope without bound it is not positive real"
-
-
-def test_every_method_of_the_class_is_offered_to_the_prover() -> None:
-    fit = identify(
-        Dataset((run(np.random.default_rng(1).uniform(-2.0, 2.0, 2000), 0.0, 1),)),
-        CLASS,
-        method=Sem(),
-        comparators=(LeastSquares(), Rie()),
-    )
-    assert fit.methods == ("least_squares", "rie", "sem")
-    for name in fit.methods:
-        proof = fit[name].proof
-        assert proof is not None, name
-        assert 0.0 < proof.rate < 1.0
 
 
 def test_a_resonance_is_identified_by_a_linear_equation() -> None:

@@ -259,17 +259,6 @@ def test_a_duffing_oscillator_is_found_and_proved(oscillator: Fit[CellNetwork]) 
         proofs.decide(document, {"m.json": oscillator.model.document()})
 
 
-@pytest.mark.slow
-def test_several_layers_are_proved_by_their_weights(oscillator: Fit[CellNetwork]) -> None:
-    """P couples no stage with another, so that no program has to be solved."""
-    n, proof = OSCILLATOR.structure.lags, prove_stability(oscillator.model)
-    assert proof is not None
-    for i in range(len(oscillator.model.start) // n):
-        rows = proof.P[i * n : (i + 1) * n]
-        assert not rows[:, : i * n].any()
-        assert not rows[:, (i + 1) * n :].any()
-
-
 def test_a_well_damped_loop_is_proved_as_it_is() -> None:
     """x'' + 2x' + x + x³ = u contracts over all of its range: nothing is unrolled."""
     made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, lags=2))

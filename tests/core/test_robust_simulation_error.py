@@ -1,7 +1,5 @@
 """The banded kernel of the robust simulation error against dense formulas and a cone solver."""
 
-from itertools import pairwise
-
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -16,13 +14,12 @@ from nlsid_core.identification.methods.newton import (
     minimise,
     smallest_eigenvalues,
 )
-from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
+from nlsid_core.identification.methods.rse import Bound
 from nlsid_core.identification.polynomial.rie import (
     IdentificationErrorBound,
     robust_identification_error,
 )
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
-from nlsid_core.identification.prediction import one_step_residual
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
 LINEAR = Polynomial(2, (0, 1, 2))  # with delays it is a state-affine model
@@ -151,13 +148,6 @@ def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
         assert pytest.approx(matrix_inequality(rows), rel=SOLVER) == found.point.J
 
 
-def test_bounds_never_go_up_over_the_iterates_of_a_nonlinear_model() -> None:
-    rows = problem(trials=2, samples=120).rows
-    bounds = [iterate.J for iterate in robust_simulation_error(rows, iterations=8)]
-    assert len(bounds) > 1
-    assert all(after <= before * (1 + EXACT) for before, after in pairwise(bounds))
-
-
 def test_robust_simulation_error_is_at_most_the_robust_identification_error() -> None:
     """Proposition 4.4 with P = I."""
     for seed in range(4):
@@ -171,52 +161,6 @@ def test_robust_simulation_error_is_at_most_the_robust_identification_error() ->
         rows = stacked.rows
         _, J_identification = robust_identification_error(stacked)
         assert J_identification >= minimise(Bound(rows, None), rows.identity).point.J
-
-
-def test_theorem_4_7_the_bound_per_sample_tends_to_an_integral_over_frequencies() -> None:
-    """J → ∫|q Y - p U|²/(2 Re q* - 1) for a scalar linear model and a finite signal."""
-    n_padding, length = 400, 30
-    rng = np.random.default_rng(0)
-    u, y = rng.standard_normal(length), rng.standard_normal(length)
-    padded_u = np.concatenate([np.zeros(n_padding), u, np.zeros(n_padding)])
-    padded_y = np.concatenate([np.zeros(n_padding), y, np.zeros(n_padding)])
-    q, p = np.array([1.0, -0.4, 0.1]), np.array([0.5, 0.2, 0.0])
-    N = len(padded_y) - 2
-    lags = [padded_y[2 - k : N + 2 - k] for k in range(3)]
-    inputs = [padded_u[2 - k : N + 2 - k] for k in range(3)]
-    errors = np.column_stack(lags) @ q - np.column_stack(inputs) @ p
-    row = np.arange(N)
-    rows = Rows(
-        offsets=(0, 1, 2),
-        weights=np.asfortranarray(np.column_stack([row >= k for k in range(3)]).astype(float)),
-        errors=np.column_stack([errors, np.zeros(N), np.zeros(N)]),
-        Q=np.eye(N)[:, -1:],  # only the last, zero, error can be moved by p
-        identity=np.array([1.0, 0.0, 0.0]),
-    )
-    K = 2 * dense(rows, q)
-    expected_dense = float(errors @ np.linalg.solve((K + K.T) / 2 - np.eye(N), errors))
-    scaled = Rows(rows.offsets, rows.weights, rows.errors / q[0], rows.Q, rows.identity)
-    J = Bound(scaled, None).at(q).J
-    z = np.exp(2j * np.pi * np.arange(4096) / 4096)
-    Y, U = (np.polyval(signal[::-1], 1 / z) for signal in (y, u))
-    Q_star, P_star = np.polyval(q[::-1], 1 / z), np.polyval(p[::-1], 1 / z)
-    integral = float(np.mean(abs(Q_star * Y - P_star * U) ** 2 / (2 * Q_star.real - 1)))
-    assert expected_dense == pytest.approx(integral, rel=1e-6)
-    assert pytest.approx(expected_dense, rel=1e-9) == J
-
-
-def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19() -> None:
-    """Σ ε² sup_z |e₁'(zI - A)⁻¹e₁|², conservative where the model is lightly damped."""
-    for seed in range(4):
-        stacked = problem(trials=1, samples=120, seed=seed, noise=0.1, model_class=LINEAR)
-        model, J = robust_identification_error(stacked)
-        trial = stacked.dataset.trajectories[0]
-        errors = one_step_residual(model, trial)[:, 0] / model.y_scale[0]
-        gains, _ = model.explicit(np.zeros((1, len(model.window))))
-        A = np.array([gains[0, 0], [1.0, 0.0]])
-        z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
-        responses = np.linalg.inv(z[:, None, None] * np.eye(2) - A)[:, 0, 0]
-        assert np.max(abs(responses)) ** 2 * (errors @ errors) <= J * (1 + SOLVER)
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

@@ -1,6 +1,5 @@
 """Simulation error: its derivatives, and the last step that keeps the certificate."""
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import ShapeError, SolverError
+from nlsid_core.errors import SolverError
 from nlsid_core.identification import (
     Degrees,
     Polynomial,
@@ -23,7 +22,6 @@ from nlsid_core.identification import (
     trail,
 )
 from nlsid_core.identification.methods import newton, rse
-from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.polynomial.certified import (
@@ -32,51 +30,20 @@ from nlsid_core.identification.polynomial.certified import (
 )
 from nlsid_core.identification.polynomial.explicit import equation_error, minimise_simulation_error
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
-from nlsid_core.identification.starts import companion, reduced, reflected, stable_starts
+from nlsid_core.identification.starts import companion, reduced, reflected
 from nlsid_core.identification.trail import tried
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
 from tests.marks import slow_among
-from tests.state_affine_rows import EXACT, dense, near_identity, problem
+from tests.state_affine_rows import EXACT, near_identity, problem
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def largest(values: FloatArray) -> float:
     return float(np.max(np.abs(values)))
-
-
-@pytest.mark.parametrize("outputs", [1, 2])
-@pytest.mark.parametrize("first", [True, False])
-def test_the_bound_and_its_derivatives_equal_the_dense_formula(outputs: int, first: bool) -> None:
-    """J = ε'P (P'G + G'P - I)⁻¹ P'ε with P = G_m⁻ᵀ, written as in the thesis."""
-    rows = problem(outputs=outputs).rows
-    theta_m = rows.identity if first else near_identity(rows, 1, 0.05)
-    theta = theta_m + 0.01 * (near_identity(rows, 0, 1.0) - rows.identity)
-    bound = Bound(rows, None if first else theta_m)
-    point = bound.at(theta)
-    P = np.linalg.inv(dense(rows, theta_m)).T
-
-    def value(theta: np.ndarray) -> float:
-        G = dense(rows, theta)
-        middle = np.linalg.inv(P.T @ G + G.T @ P - np.eye(len(rows)))
-        weight = P @ middle @ P.T
-        L = np.linalg.cholesky((weight + weight.T) / 2).T
-        left, right = L @ (rows.errors @ theta), L @ rows.Q
-        p = np.linalg.lstsq(right, left, rcond=None)[0]
-        return float(np.sum((left - right @ p) ** 2))
-
-    assert pytest.approx(value(theta), rel=EXACT) == point.J
-    gradient, hessian = bound.derivatives(point)
-    step = 1e-5
-    for i, unit in enumerate(np.eye(len(theta))):
-        ahead, behind = bound.at(theta + step * unit), bound.at(theta - step * unit)
-        slope = (ahead.J - behind.J) / (2 * step)
-        assert gradient[i] == pytest.approx(slope, rel=1e-5, abs=1e-6 * largest(gradient))
-        curvature = (bound.derivatives(ahead)[0] - bound.derivatives(behind)[0]) / (2 * step)
-        np.testing.assert_allclose(hessian[i], curvature, rtol=1e-5, atol=1e-6 * largest(hessian))
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
@@ -132,35 +99,12 @@ def test_the_last_step_of_a_linear_model_keeps_its_proof_and_never_goes_up() -> 
     assert simulation_percent(again, dataset) <= simulation_percent(fit.model, dataset) * (1 + 1e-9)
 
 
-def training_error(model: Any, rows: Rows) -> float:
-    return SimulationError(rows).at(np.concatenate([g.coefficients.ravel() for g in model.G])).J
-
-
 def checked(model: Any, folder: Path) -> str:
     proof = prove_stability(model)
     assert proof is not None
     files.write_document(folder / "model.json", model.document())
     files.write_document(folder / "model.proof.json", proof.document(model, "model.json"))
     return check(folder / "model.proof.json").statement
-
-
-@pytest.mark.slow
-def test_the_last_step_of_a_state_affine_model_keeps_its_proof(tmp_path: Path) -> None:
-    """From the first certified iterate, so that there is something left to gain."""
-    stacked = problem(
-        trials=1, samples=400, noise=0.2, model_class=Polynomial(2, degrees=Degrees(leading=2))
-    )
-    first = next(certified_simulation_error(stacked))
-    model = stacked.model(first.point.theta, first.point.p)
-    proof = prove_stability(model)
-    assert proof is not None
-    found = descend_certified(stacked, model, proof)
-    assert "every input" in checked(found, tmp_path)
-    assert training_error(found, stacked.rows) < 0.999 * training_error(model, stacked.rows)
-    proof = prove_stability(found)
-    assert proof is not None
-    again = descend_certified(stacked, found, proof)
-    assert training_error(again, stacked.rows) <= training_error(found, stacked.rows)
 
 
 def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Path) -> None:
@@ -180,19 +124,6 @@ def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Pat
     assert "every input" in checked(found, tmp_path)
     before, after = (simulation_percent(m, train) for m in (model, found))
     assert after < 0.8 * before
-
-
-def test_the_last_step_refuses_classes_it_has_no_certificate_for() -> None:
-    stacked = problem(
-        trials=1, samples=400, noise=0.2, model_class=Polynomial(2, degrees=Degrees(leading=2))
-    )
-    first = next(certified_simulation_error(stacked))
-    model = stacked.model(first.point.theta, first.point.p)
-    proof = prove_stability(model)
-    assert proof is not None
-    other = problem(model_class=Polynomial(2, (0,), Degrees(lagged=2)))
-    with pytest.raises(ShapeError, match="degree 1 at most"):
-        descend_certified(other, model, proof)
 
 
 def two_resonances(seed: int, *, noise: float) -> Dataset:
@@ -234,7 +165,7 @@ def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_mi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 11])
+@pytest.mark.parametrize("seed", [3])
 def test_three_resonances_from_rest_are_found_to_the_noise_where_the_identity_is_not(
     seed: int,
 ) -> None:
@@ -279,18 +210,6 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
 
 
 @pytest.mark.slow
-def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> None:
-    data = beside_another_output(two_resonances(1, noise=0.1))
-    rows = build_state_affine_rows(data, Polynomial(2)).rows
-    start = dict(stable_starts(data, 2))["from least squares"]
-    few = list(robust_simulation_error(rows, start=start, iterations=60, steps=2))
-    *_, last = robust_simulation_error(rows, start=start, iterations=60)
-    assert all(b.J <= a.J * (1 + 1e-9) for a, b in pairwise(few))
-    assert few[-1].J <= 1.01 * last.J
-    assert SimulationError(rows).at(few[-1].theta).J <= few[-1].J * (1 + 1e-9)
-
-
-@pytest.mark.slow
 def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
     data = two_resonances(1, noise=0.1)
     whole = identify(data, Polynomial(4), method=Rse(), comparators=())
@@ -314,26 +233,6 @@ def test_among_poles_at_the_slowest_rate_the_last_step_is_not_above_the_iterates
     assert fit.errors["train"]["sem_certified"] <= fit.errors["train"]["rse"] * (1 + 1e-9)
     assert fit.errors["train"]["rse"] < 20.0
     assert fit["rse"].proof is not None
-
-
-def test_iterates_from_a_given_start_go_on_to_the_minimum() -> None:
-    regression = build_state_affine_rows(two_resonances(1, noise=0.1), Polynomial(4))
-    start = dict(stable_starts(regression.dataset, 4))["from a longer model"]
-    found = list(robust_simulation_error(regression.rows, start=start))
-    assert len(found) > 5
-    error = SimulationError(regression.rows)
-    point = error.at(found[-1].theta)
-    minimum = newton.Descent(error, (), len(start)).to_minimum(found[-1].theta).point
-    assert point.J <= minimum.J * (1 + 1e-3)
-    assert found[0].J > 1.2 * minimum.J
-
-
-def test_reflected_poles_are_inside_and_the_others_stay() -> None:
-    theta = np.poly([0.9, 1.25, -2.0, 0.5]).real
-    assert np.sort(np.roots(reflected(theta)).real) == pytest.approx([-0.5, 0.5, 0.8, 0.9])
-    on_the_circle = reflected(np.poly([1.0, 0.0, 0.0]).real)
-    assert np.max(np.abs(np.roots(on_the_circle))) < 1.0
-    assert len(on_the_circle) == 4
 
 
 def test_reflected_poles_of_several_outputs_are_inside_and_the_others_stay() -> None:

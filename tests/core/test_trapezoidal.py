@@ -10,7 +10,7 @@ from nlsid_core import documents, files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.implicit_step import ImplicitStep
-from nlsid_core.errors import DataError, SolverError
+from nlsid_core.errors import SolverError
 from nlsid_core.identification.states import identify_states
 from nlsid_core.kernel.sampled_step import Sample, implicit_step
 from nlsid_core.models.trapezoidal import TrapezoidalModel
@@ -55,15 +55,6 @@ def test_the_accelerations_coefficients_are_the_physical_ones() -> None:
         assert coefficient(model, exponent) == pytest.approx(value, rel=0.05, abs=0.02)
 
 
-@pytest.mark.slow
-def test_free_run_of_the_identified_model_follows_the_truth() -> None:
-    data = recorded()
-    model = identified(data)
-    u = data.trajectories[0].u
-    true, free = truth().simulate([0.0, 0.0], u), model.simulate([0.0, 0.0], u)
-    assert np.linalg.norm(free - true) < 0.01 * np.linalg.norm(true)
-
-
 def test_a_step_satisfies_the_equations_it_states() -> None:
     model, x, u = truth(), np.array([0.7, -1.0]), np.array([0.4])
     following = model(x, u)
@@ -100,12 +91,6 @@ def test_a_trapezoidal_model_reads_back_from_its_document_bit_for_bit() -> None:
     again = documents.read(files.parse_document(text), source="model")
     assert isinstance(again, TrapezoidalModel)
     assert files.encode(again.document()) == text
-
-
-@pytest.mark.slow
-def test_without_repeats_nothing_is_identified() -> None:
-    with pytest.raises(DataError, match="repeated"):
-        identified(recorded(1))
 
 
 def test_the_proved_reach_of_an_implicit_step_bounds_the_models_own_steps() -> None:

@@ -8,8 +8,7 @@ import pytest
 
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, apart, percent
-from nlsid_core.identification import Degrees, Polynomial
-from nlsid_core.identification.methods.rse import robust_simulation_error
+from nlsid_core.identification import Polynomial
 from nlsid_core.identification.polynomial.explicit import equation_error
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.prediction import predict
@@ -58,25 +57,6 @@ def test_output_noise_shows_as_a_residual_that_is_not_white() -> None:
     found = validate(truth(), noisy)
     assert not found.one_step.white
     assert max(abs(found.one_step.autocorrelation[0])) > found.one_step.band
-
-
-def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
-    dataset = synthetic_dataset(0.02, trials=1, samples=80)
-    trial = dataset.trajectories[0]
-    linear = truth()
-    stacked = build_state_affine_rows(dataset, Polynomial(2, degrees=Degrees(leading=1)))
-    iterate = next(iter(robust_simulation_error(stacked.rows)))
-    for model in (linear, stacked.model(iterate.theta, iterate.p)):
-        horizon = 4
-        predicted = predict(model, trial, horizon)
-        for row, last in enumerate(range(2 + horizon - 1, len(trial))):
-            rows = slice(last - horizon - 1, last + 1)
-            part = Trajectory(t=trial.t[rows], y=trial.y[rows], u=trial.u[rows])
-            if isinstance(model, DifferenceEquation):
-                restarted = model.simulate(part.u[:, 0], part.y[:2, 0])[-1]
-            else:
-                restarted = model.simulate(part.u, part.y[:2])[-1, 0]
-            assert predicted[row, 0] == pytest.approx(restarted, abs=1e-12)
 
 
 def test_errors_grow_with_the_horizon_towards_the_simulation_error() -> None:

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 19_328,
-    ("bags",): 12_067,
+    ("nlsid_core",): 19_144,
+    ("bags",): 12_069,
     ("nlsid_ros",): 2_665,
-    ("tests",): 24_095,
+    ("tests",): 23_740,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -40,8 +40,9 @@ class Frame:
 
     def sample(self, policy: SampledPolicy, k: int) -> Sample:
         """Sample k, exactly."""
-        parts = (policy.x[k], policy.u[k], policy.K[k], policy.x[k + 1])
-        return Sample(*(exact(part) for part in (*parts, self.S[k], self.S[k + 1], self.A[k])))
+        parts = {"x": policy.x, "u": policy.u, "K": policy.K, "S": self.S, "A": self.A}
+        here = {name: exact(values[k]) for name, values in parts.items()}
+        return Sample(**here, x_next=exact(policy.x[k + 1]), S_next=exact(self.S[k + 1]))
 
 
 def exact(values: ArrayLike) -> list:  # type: ignore[type-arg]

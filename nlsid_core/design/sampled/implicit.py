@@ -12,7 +12,7 @@ from nlsid_core.design.sampled.closed_loop import Frame
 from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
-from nlsid_core.kernel.exact import Matrix, combined, product
+from nlsid_core.kernel.exact import combined, identity, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
 from nlsid_core.kernel.sampled_step import implicit_step, linear_part
 from nlsid_core.models.trapezoidal import TrapezoidalModel
@@ -186,14 +186,10 @@ def _loop(
     ST = product(sample.S, T)
     scaled = ring.product(ST, ring.variables[:n])
     unit = product(sample.S_next, product(sample.A, T))
-    slope = closed_loop.floats([row[n:] for row in linear_part(h, ring)])
+    slope = closed_loop.floats(linear_part(h, ring, n)[1])
     inverse = np.linalg.inv(slope)
     normal = ring.product(closed_loop.exact(inverse), h)
-    parts = linear_part(normal, ring)
-    B: Matrix = [row[:n] for row in parts]
-    C = [[c - (i == j) for j, c in enumerate(row[n:])] for i, row in enumerate(parts)]
-    direct = [row[:n] for row in linear_part(rows, ring)]
-    through = [row[n:] for row in linear_part(rows, ring)]
+    (B, C), (direct, through) = linear_part(normal, ring, n), linear_part(rows, ring, n)
     left = combined(combined(direct, product(through, B), -1), unit, -1)
     S_rates = [row[d:] for row in sample.S_next[d:]]
     bounds = Bounds(
@@ -201,7 +197,7 @@ def _loop(
         kappa_next=closed_loop.inverse_bound(product(S_rates, after)),
         curvature=closed_loop.curvature_bounds(normal, ring, 2),
         state=closed_loop.norm_bound(B),
-        rates=closed_loop.norm_bound(C),
+        rates=closed_loop.norm_bound(combined(C, identity(d), -1)),
         direct=closed_loop.norm_bound(left),
         through=closed_loop.norm_bound(through),
     )

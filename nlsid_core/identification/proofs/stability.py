@@ -113,7 +113,7 @@ def prove_stability(model: Any) -> StabilityProof | None:
         if len(root.E) == 1 and not form.E.ray:
             return _decided(model, _linear(search, root))
         layer = _layers(search, root)
-        if layer is not None and not search.form.E.ray and not form.E.box:
+        if layer is not None and not form.E.ray and form.E.whole == len(form.E.box):
             return _by_weights(model, search, root, layer)
         return _decided(model, _by_programs(search, root))
     except (kernel.Rejected, LinAlgError, SolverError):

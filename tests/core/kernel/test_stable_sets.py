@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from nlsid_core.kernel import positivity
+from nlsid_core.kernel import stable_set
 from tests.core.kernel import mutations
 from tests.core.kernel import oracle_polynomial as oracle
 from tests.core.kernel.mutations import Case
@@ -18,14 +18,14 @@ def test_the_kernels_polynomials_are_the_oracles_exactly(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: dict[str, oracle.P] = {}
-    decided = positivity.remainder
+    decided = stable_set.remainder
 
     def watched(c: Any, squares: Any, ring: Any, what: str) -> Any:
         terms = {bytes(ring.exponents(k)): Fraction(v, c.denominator) for k, v in c.terms.items()}
         seen[what] = oracle.P(ring.count, {tuple(e): c for e, c in terms.items()})
         return decided(c, squares, ring, what)
 
-    monkeypatch.setattr(positivity, "remainder", watched)
+    monkeypatch.setattr(stable_set, "remainder", watched)
     assert mutations.decide(case) == "proved"
     claim, proof = case.document["claim"], case.document["proof"]
     model = case.about[claim["about"]["model"]["file"]]
