@@ -5,6 +5,7 @@ not linear counts only if it is proved.
 """
 
 import math
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -43,6 +44,7 @@ OTHERS: Final = 3  # commands that are named besides
 
 SAMPLES: Final = 2000  # of the training trials, to which classes that are not linear are fitted
 START: Final = 20  # samples of each trial that are not scored: some classes read their start there
+SECONDS: Final = 30.0  # of processor time, after which no further class is begun
 ENOUGH: Final = 5.0  # % of error, below which no further class is tried
 BETTER: Final = 0.8  # of the linear model's error, that another class has to reach
 LOOP_WORTH: Final = 0.6  # of the best error so far, that an unproved loop has to reach
@@ -210,13 +212,13 @@ def tried_classes(
         {"model": "cells", "cells": 1, "limit": "friction"},
         {"model": "cells", "cells": 2, "limit": "top"},
     ]
-    best = math.inf
+    started, best = time.process_time(), math.inf
     for section in sections if excitations == 1 else (known, *sections[2:]):
         error = _error(section, judging)
         if math.isfinite(error) or section is known:
             best = min(best, error)
             yield section, error
-        if best <= ENOUGH:
+        if best <= ENOUGH or time.process_time() - started > SECONDS:
             return
 
     unproved = {"model": "feedback", "method": Sem.word, "certified": False}

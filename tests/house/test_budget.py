@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_144,
-    ("bags",): 12_069,
+    ("bags",): 12_071,
     ("nlsid_ros",): 2_665,
     ("tests",): 23_740,
     ("benchmarks", "examples"): 3_809,
