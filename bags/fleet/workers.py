@@ -42,7 +42,7 @@ class Workers:
         if self.scheduler:
             return _dask(self.scheduler)
         if self.count:
-            spawn = multiprocessing.get_context("spawn")  # fsspec's threads do not live in a fork
+            spawn = multiprocessing.get_context("spawn")  # obstore's threads do not live in a fork
             return ProcessPoolExecutor(self.count, mp_context=spawn, initializer=_end_with_parent)
         return _Here()
 

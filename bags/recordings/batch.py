@@ -9,6 +9,7 @@ import numpy as np
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
+Buffer = bytes | bytearray
 BATCH_BYTES: Final = 4 * 2**20  # of messages that a file without chunks gives at once
 
 
@@ -21,7 +22,7 @@ class Batch:
     cannot be unpacked or translated, why.
     """
 
-    buffer: bytes
+    buffer: Buffer
     start: IntArray
     size: IntArray
     log_ns: IntArray
@@ -37,7 +38,7 @@ class Batch:
         if i in self.unreadable:
             raise BagError(self.unreadable[i])
         start = int(self.start[i])
-        return self.buffer[start : start + int(self.size[i])]
+        return bytes(self.buffer[start : start + int(self.size[i])])
 
     def select(self, rows: IntArray) -> "Batch":
         """The messages `rows` (indices or a mask), of the same buffer."""
@@ -67,7 +68,7 @@ class LogOrder:
         self._count += len(log_ns)
 
 
-def batch_of(buffer: bytes, start: IntArray, size: IntArray, log_ns: IntArray) -> Batch:
+def batch_of(buffer: Buffer, start: IntArray, size: IntArray, log_ns: IntArray) -> Batch:
     """A batch whose messages have one time each, and were not counted."""
     return Batch(buffer, start, size, log_ns, log_ns, np.zeros(len(size), dtype=np.int64))
 

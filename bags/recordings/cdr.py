@@ -20,7 +20,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
-from bags.recordings.batch import Batch
+from bags.recordings.batch import Batch, Buffer
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
@@ -213,7 +213,7 @@ def _matches(layout: Layout, batch: Batch) -> Any:
     return same
 
 
-def _view(buffer: bytes, kind: str) -> Any:
+def _view(buffer: Buffer, kind: str) -> Any:
     """The buffer as numbers starting at every byte."""
     dtype = np.dtype(kind)
     return np.ndarray((max(0, len(buffer) - dtype.itemsize + 1),), dtype, buffer, strides=(1,))

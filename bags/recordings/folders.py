@@ -2,9 +2,9 @@
 
 import os
 import re
-from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -20,7 +20,7 @@ DATA_FILES: Final = (".mcap", ".db3", ROS1)
 ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
-MOST_LOOKED_AT: Final = 50  # folders, for bags that lie deeper than what was given
+MOST_LOOKED_AT: Final = 1000  # names, for bags that lie deeper than what was given
 MOST_PARTS: Final = 10_000  # of one recording; a greater number is a date
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 
@@ -89,22 +89,11 @@ def _matches(path: Path) -> list[Path]:
 
 def _deeper(folder: Path) -> str:
     """That folders in it hold bags, as one pattern for those that lie as deep as the first."""
-    waiting = deque([(folder, "")])
-    for _ in range(MOST_LOOKED_AT):
-        if not waiting:
-            break
-        place_of, pattern = waiting.popleft()
-        for path in sorted(place_of.iterdir()):
+    for stars in ("*", "*/*", "*/*/*"):
+        for path in islice(folder.glob(f"{stars}/*"), MOST_LOOKED_AT):
             if path.suffix in DATA_FILES:
-                kind = f"{pattern}/*{path.suffix}"
-            elif not path.is_dir():
-                continue
-            elif _is_bag(path):
-                kind = f"{pattern}/*"
-            else:
-                waiting.append((path, f"{pattern}/*"))
-                continue
-            return f"; folders in it do: give the pattern '{folder}{kind}', in quotes"
+                files = "" if _is_bag(path.parent) else f"/*{path.suffix}"
+                return f"; folders in it do: give the pattern '{folder}/{stars}{files}', in quotes"
     return ""
 
 

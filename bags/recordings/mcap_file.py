@@ -1,7 +1,9 @@
 """An MCAP file as blocks of messages that NumPy can index, whatever state the file is in.
 
-The file is walked record by record from its start, hopping over the chunks' contents: that needs no
-summary, so a file that was never finished or that lost its end reads like any other up to there.
+What a finished file's summary lists is read from there. Any other file is walked record by record
+from its start, hopping over the chunks' contents, so one that was never finished or that lost its
+end reads like any other up to there. Of a file that is not on this machine, what is wanted of
+several chunks is fetched together.
 Every length is held against the bytes that are there before anything is allocated.
 
 Source: the MCAP specification, https://mcap.dev/spec.
@@ -14,18 +16,16 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, BinaryIO, Final, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
 from bags.recordings.batch import Batch
+from bags.recordings.mcap_fetch import Fetching
 from bags.recordings.mcap_records import (
-    INDEX,
-    INDEX_ENTRY,
     MAGIC,
-    MESSAGE,
     MESSAGE_FIXED,
     RECORD,
     Block,
@@ -40,13 +40,15 @@ from bags.recordings.mcap_records import (
     walk_declared,
     walk_messages,
 )
-from bags.recordings.mcap_summary import Prepared, summarised
+from bags.recordings.mcap_summary import summarised
 from bags.recordings.remote import RemotePath, place
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
-SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.FOOTER)
-OF_SUMMARY: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.FOOTER)
+OF_SUMMARY: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 ATTACHMENT_FIXED: Final = 8 + 8 + 4 + 4 + 8  # bytes of two times and three lengths
+CHECKSUM_AT: Final = RECORD.size + 24  # of a chunk's record, its checksum
+SUMMARY_AT: Final = 28  # before the end of the file, where its summary begins
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
@@ -55,7 +57,6 @@ MAX_WHOLE_BYTES: Final = 256 * 2**20  # of a remote file without a summary
 LOOSE_RUN_BYTES: Final = 4 * 2**20  # messages outside chunks are read in runs of about this size
 
 _CHUNK: Final = struct.Struct("<QQQII")
-_INDEX: Final = struct.Struct("<HI")
 _COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
 
 Record = TypeVar("Record")
@@ -74,14 +75,24 @@ class McapFile:
         self.path = place(path)
         self._salvage = salvage
         self._size = self.path.stat().st_size
-        remote = isinstance(self.path, RemotePath)
-        self._stream = None if remote else self.path.open("rb", buffering=0)
-        self._prepared: Prepared | None = None
+        self._stream: BinaryIO | None = None
+        self._fetching: Fetching | None = None
         self._total: int | None = None  # messages, as the statistics state
         try:
-            if not isinstance(self.path, RemotePath) or not self._read_summary(self.path):
+            if not isinstance(self.path, RemotePath):
+                self._stream = self.path.open("rb", buffering=0)
+            found = None if salvage else summarised(self._read, self._size)
+            if found is None:
+                self._fetch_whole()
                 self.contents = self._walk()
                 self._find_channels()
+                return
+            self.contents = found
+            if isinstance(self.path, RemotePath):
+                self._fetching = Fetching(self.path, found.blocks)
+            else:
+                summary = int.from_bytes(self._read(self._size - SUMMARY_AT, 8), "little")
+                self._check_data(found, summary - 4)
         except BaseException:
             self.close()
             raise
@@ -97,20 +108,16 @@ class McapFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _read_summary(self, path: RemotePath) -> bool:
-        """Take what the summary says; False if the file, fetched whole, has to be walked."""
-        found = None if self._salvage else summarised(path)
-        if found is not None:
-            self.contents = found
-            self._prepared = Prepared(path, found.blocks)
-            return True
+    def _fetch_whole(self) -> None:
+        """Fetch a remote file that has to be walked; BagError if it is too large for that."""
+        if not isinstance(self.path, RemotePath):
+            return
         if self._size > MAX_WHOLE_BYTES:
             raise BagError(
                 f"it has {self._size} bytes and no summary that lists its chunks; copy it to this "
                 "machine, and mend it with `nlsid bag recover`"
             )
-        path.fetch([(0, self._size)])
-        return False
+        self.path.fetch([(0, self._size)])
 
     def runs(
         self, channels: Collection[int]
@@ -120,35 +127,29 @@ class McapFile:
 
         Raises BagError if a block is damaged or not what its index says.
         """
-        alone = ([block] for block in self.contents.blocks)
-        groups = alone if self._prepared is None else self._prepared.groups(channels)
+        alone = ([block] for block in self.contents.blocks if block.has(channels))
+        groups = alone if self._fetching is None else self._fetching.groups(channels)
         for blocks in groups:
             yield blocks[-1], self._batches(blocks, channels)
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Batches:
         """The messages of one block, one batch per channel that has any."""
-        return self._batches([block], channels)
+        return self._batches([block] if block.has(channels) else [], channels)
 
     def _batches(self, blocks: Sequence[Block], channels: Collection[int]) -> Batches:
-        first = blocks[0]
-        index = first.index
-        if index is not None and len(blocks) == 1 and not any(c in index for c in channels):
+        if not blocks:
             return
+        first, edges = blocks[0], None
         where = f"the message index of the chunk at byte {first.offset}"
         if len(blocks) > 1:
             where += f", or of one up to byte {blocks[-1].offset},"
-        edges = None
-        if self._prepared is not None:
-            buffer, offsets, edges = self._prepared.records(blocks, channels)
-        elif index is None:
-            where = f"the block at byte {first.offset}"
-            buffer = self.content(first)
-            walked = walk_messages(buffer)
-            offsets = {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
+        if self._fetching is not None:
+            self._fetching.hold(first, channels)
+        if self._fetching is not None and not first.compression:
+            buffer, offsets, edges = self._fetching.messages(blocks)
         else:
             buffer = self.content(first)
-            wanted = [c for c in channels if c in index]
-            offsets = {c: index_entries(self._read(*index[c]), c, where) for c in wanted}
+            offsets = self._offsets(first, buffer, channels)
         for channel in channels:
             found = offsets.get(channel)
             if found is not None and len(found):
@@ -156,12 +157,29 @@ class McapFile:
                 _refuse_earlier(batch, min(blocks, key=lambda block: block.start_ns))
                 yield channel, batch
 
+    def _offsets(
+        self, block: Block, content: bytes, channels: Collection[int]
+    ) -> dict[int, IntArray]:
+        """Where the messages of each channel begin, by the block's index if it has one."""
+        if block.index is None:
+            walked = walk_messages(content)
+            return {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
+        where = f"the message index of the chunk at byte {block.offset}"
+        wanted = [c for c in channels if c in block.index]
+        return {c: index_entries(self._read(*block.index[c]), c, where) for c in wanted}
+
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""
         raw = self._read(block.offset, block.size)
         if len(raw) != block.size:
             raise BagError(f"the chunk at byte {block.offset} is cut off")
-        return uncompressed(block, raw)
+        return uncompressed(replace(block, crc=self._checksum(block)), raw)
+
+    def _checksum(self, block: Block) -> int:
+        """What the chunk's header states, which a summary does not list."""
+        if block.index is None:
+            return block.crc
+        return int.from_bytes(self._read(block.record + CHECKSUM_AT, 4), "little")
 
     def attachments(self) -> Iterator[Attachment]:
         """The attachments, whose data are read only now."""
@@ -199,10 +217,13 @@ class McapFile:
                 found.lost.append(f"bytes {at} to {following}: no records")
                 at = following
                 continue
-            if repeating and opcode not in OF_SUMMARY:
-                pass  # what is salvaged is not what a summary says
-            else:
-                self._try_note(found, opcode, content, length)
+            try:
+                if not repeating or opcode in OF_SUMMARY:  # of what is there twice, the first
+                    self._note(found, opcode, content, length)
+            except BagError as error:
+                if not self._salvage:
+                    raise
+                found.lost.append(str(error))
             at = good_bytes = end
             repeating |= self._salvage and opcode == Opcode.DATA_END
             if opcode == Opcode.FOOTER:
@@ -211,21 +232,9 @@ class McapFile:
                 break
         if repeating:
             found.ending = None
-        if found.ending is not None and found.blocks:  # its index may be cut off
-            last = found.blocks[-1]
-            found.blocks[-1] = replace(last, index=None)
         if found.ending is not None:
             found.ending += rest_said(self._size - good_bytes)
         return found
-
-    def _try_note(self, found: Contents, opcode: int, content: int, length: int) -> None:
-        if not self._salvage:
-            self._note(found, opcode, content, length)
-        elif opcode not in SUMMARISING:
-            try:
-                self._note(found, opcode, content, length)
-            except BagError as error:
-                found.lost.append(str(error))
 
     def _next_chunk(self, start: int) -> int | None:
         """The first byte from `start` on where a compressed chunk's record begins."""
@@ -246,14 +255,9 @@ class McapFile:
             at = content - RECORD.size
             if length < MESSAGE_FIXED:
                 raise BagError(f"the message at byte {at} has {length} bytes")
-            header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
-            _add_loose(found.blocks, at, content + length, int(header["log"]))
+            _add_loose(found.blocks, at, content + length)
         elif opcode == Opcode.CHUNK:
             found.blocks.append(self._chunk(content, length))
-        elif opcode == Opcode.MESSAGE_INDEX and found.blocks:
-            self._note_index(found.blocks, content, length)
-        elif opcode == Opcode.HEADER:
-            self._parse(Header.read, content, length)
         elif opcode == Opcode.SCHEMA:
             found.declared.add(self._parse(Schema.read, content, length))
         elif opcode == Opcode.CHANNEL:
@@ -274,11 +278,9 @@ class McapFile:
                     found.lost.append(f"it has {there} {what}, its statistics say {said}")
         elif opcode == Opcode.DATA_END:
             self._check_data(found, content)
-        elif opcode == Opcode.FOOTER:
-            self._check_summary(self._parse(Footer.read, content, length), content)
 
     def _chunk(self, content: int, length: int) -> Block:
-        start, _, uncompressed, crc, letters = unpack(_CHUNK, self._read(content, _CHUNK.size))
+        _, _, uncompressed, crc, letters = unpack(_CHUNK, self._read(content, _CHUNK.size))
         if letters > 32 or length < _CHUNK.size + letters + 8:
             raise BagError(f"the chunk at byte {content} has no valid header")
         rest = self._read(content + _CHUNK.size, letters + 8)
@@ -287,60 +289,34 @@ class McapFile:
         if offset + size > content + length:
             raise BagError(f"the chunk at byte {content} is longer than its record")
         compression = rest[:letters].decode("utf-8", "replace")
-        return Block(offset, size, compression, uncompressed, crc, start)
-
-    def _note_index(self, blocks: list[Block], content: int, length: int) -> None:
-        channel, size = unpack(_INDEX, self._read(content, _INDEX.size))
-        if size % INDEX_ENTRY.itemsize or _INDEX.size + size > length:
-            raise BagError(f"the message index at byte {content} is damaged")
-        start = content - RECORD.size
-        block = blocks[-1]
-        index = dict(block.index or {})
-        if size:
-            index[channel] = start, INDEX.size + size
-        blocks[-1] = replace(block, index=index)
-
-    def _check_summary(self, footer: Footer, content: int) -> None:
-        start = footer.summary_start
-        if not footer.summary_crc or not start:
-            return
-        end = content + 16  # the sum goes over everything up to itself
-        if not len(MAGIC) <= start <= end:
-            raise BagError("the footer's summary offset is damaged")
-        if self._crc(start, end) != footer.summary_crc:
-            raise BagError("the summary is damaged: its checksum differs")
+        return Block(offset, size, compression, uncompressed, crc)
 
     def _check_data(self, found: Contents, content: int) -> None:
         """Hold all before the end of the data against its checksum, where chunks have none."""
-        stated = int.from_bytes(self._read(content, 4), "little")
-        if not stated or all(block.crc for block in found.blocks):
+        record = self._read(content - RECORD.size, RECORD.size + 4)
+        stated = int.from_bytes(record[RECORD.size :], "little")
+        if not stated or record[0] != Opcode.DATA_END:
             return
-        if self._crc(0, content - RECORD.size) != stated:
-            raise BagError("messages or other records are damaged: the checksum of all differs")
-
-    def _crc(self, start: int, end: int) -> int:
-        crc = 0
-        for at in range(start, end, SEARCH_BYTES):
+        if all(self._checksum(block) for block in found.blocks):
+            return
+        crc, end = 0, content - RECORD.size
+        for at in range(0, end, SEARCH_BYTES):
             crc = zlib.crc32(self._read(at, min(SEARCH_BYTES, end - at)), crc)
-        return crc
+        if crc != stated:
+            raise BagError("messages or other records are damaged: the checksum of all differs")
 
     def _find_channels(self) -> None:
         """Look into the blocks for channels the rest of the file does not list; count messages."""
         found = self.contents
         kept: list[Block] = []  # whole, and with a message, so that it has a time
         for block in found.blocks:
-            start_ns = block.start_ns
-            if block.index is not None and all(map(found.declared.knows, block.index)):
-                entries = {c: length - INDEX.size for c, (_, length) in block.index.items()}
-                counts = {c: length // INDEX_ENTRY.itemsize for c, length in entries.items()}
-            else:
-                try:
-                    counts, start_ns = self._declared_in(block)
-                except BagError as error:
-                    if found.ending is None and not self._salvage:
-                        raise
-                    found.lost.append(str(error))
-                    continue
+            try:
+                counts, start_ns = self._declared_in(block)
+            except BagError as error:
+                if found.ending is None and not self._salvage:
+                    raise
+                found.lost.append(str(error))
+                continue
             if counts:
                 kept.append(replace(block, start_ns=start_ns))
             for channel_id, count in counts.items():
@@ -363,7 +339,7 @@ class McapFile:
             for channel_id, at in walked.items()
         ]
         counts = {channel_id: len(at) for channel_id, at in walked.items()}
-        return counts, min(starts, default=block.start_ns)
+        return counts, min(starts, default=0)
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""
@@ -405,11 +381,11 @@ def _refuse_earlier(batch: Batch, block: Block) -> None:
         raise BagError(f"the chunk at byte {block.offset} holds messages before the time it states")
 
 
-def _add_loose(blocks: list[Block], at: int, end: int, log_ns: int) -> None:
+def _add_loose(blocks: list[Block], at: int, end: int) -> None:
     """A message outside chunks: with those before it a block that reads like a chunk."""
     last = blocks[-1] if blocks else None
     if last is None or last.end != at or last.size > LOOSE_RUN_BYTES:
-        blocks.append(Block(at, end - at, "", end - at, start_ns=log_ns))
+        blocks.append(Block(at, end - at, "", end - at))
         return
-    size, start_ns = end - last.offset, min(last.start_ns, log_ns)
-    blocks[-1] = replace(last, size=size, uncompressed_size=size, start_ns=start_ns)
+    size = end - last.offset
+    blocks[-1] = replace(last, size=size, uncompressed_size=size)

@@ -5,7 +5,7 @@ Source: the MCAP specification, https://mcap.dev/spec.
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any, Final, TypeVar
@@ -17,7 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema, Statistics
 
-from bags.recordings.batch import Batch
+from bags.recordings.batch import Batch, Buffer
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
@@ -26,6 +26,7 @@ CUSTOM_DATA: Final = "custom_data"  # the Metadata record with a bag's own key-v
 ROSBAG2: Final = "rosbag2"  # the Metadata record that names the release of ROS 2
 MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message
 RECORD: Final = struct.Struct("<BQ")
+CHUNK_FIXED: Final = RECORD.size + 40  # of a chunk's record, before the name of its compression
 MESSAGE: Final = np.dtype(
     [
         ("opcode", "u1"),
@@ -63,6 +64,20 @@ class Block:
     def end(self) -> int:
         """The byte after it."""
         return self.offset + self.size
+
+    @property
+    def record(self) -> int:
+        """Where the chunk's record begins."""
+        return self.offset - CHUNK_FIXED - len(self.compression.encode())
+
+    @property
+    def last(self) -> int:
+        """Where the last of its message index records ends."""
+        return max((at + length for at, length in (self.index or {}).values()), default=self.end)
+
+    def has(self, channels: Collection[int]) -> bool:
+        """Whether it may have messages of these channels."""
+        return self.index is None or any(channel in self.index for channel in channels)
 
 
 @dataclass
@@ -161,7 +176,7 @@ def rest_said(rest: int) -> str:
 
 
 def messages_at(
-    content: bytes, offsets: IntArray, channel: int, where: str, edges: IntArray | None = None
+    content: Buffer, offsets: IntArray, channel: int, where: str, edges: IntArray | None = None
 ) -> Batch:
     """The messages whose records are at `offsets`; BagError unless all are messages of `channel`.
 

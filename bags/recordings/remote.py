@@ -2,9 +2,8 @@
 
 A RemotePath is a Path for whoever names, lists and opens bags. What is opened delivers the bytes
 that are asked for and no others: ranges that lie close together are one request, several requests
-run beside each other, and a request that fails is repeated for a stated time. fsspec knows the
-protocols; credentials are those it finds in the environment, and are never part of a name. Where
-they are an AWS_ACCESS_KEY_ID, ranges of S3 are fetched by obstore, for a quarter of the time.
+run beside each other, and a request that fails is repeated for a stated time. obstore knows the
+protocols; credentials are those of the environment or of a profile, and are never part of a name.
 """
 
 import hashlib
@@ -14,9 +13,10 @@ import re
 import stat
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any, Final, TypeVar
@@ -31,12 +31,12 @@ TOGETHER: Final = 16  # requests that run beside each other, and fail or succeed
 PATIENCE: Final = 60.0  # s that may be lost with failing requests, of each bag
 FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before each next
 LONGEST_WAIT: Final = 10.0
-REFUSALS: Final = (FileNotFoundError, PermissionError, ImportError, ValueError, TypeError)
-MAY_PASS: Final = (408, 425, 429)  # of the HTTP statuses 400 to 499
+REFUSED: Final = re.compile(r"status code: (4\d\d)")  # what asking again does not change,
+MAY_PASS: Final = ("408", "425", "429")  # but for these
+WEB: Final = ("http:", "https:")  # where nothing can be listed
 SHORTEST_SECRET: Final = 6  # letters
 
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):/{1,2}(?=[^/])")
-_CHAINED: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*::[A-Za-z]")
 _SECRET: Final = re.compile(
     r"(?<=//)[^/\s'\"]*@|(?<=[?])[^\s'\"<>]+"
 )  # of a URL in an error's text
@@ -62,7 +62,7 @@ class Entry:
 
 
 class RemotePath(PosixPath):
-    """A file or a folder that fsspec reads; the parts of its URL are the parts of the path.
+    """A file or a folder in storage; the parts of its URL are the parts of the path.
 
     patience: s that may be lost with failing requests. Instances keep what they fetched, at most
     HELD_BYTES a file; `requests` and `fetched` (bytes) count what was asked of storage, but for
@@ -108,35 +108,35 @@ class RemotePath(PosixPath):
             self._entry = self._asked(self._described)
         return self._entry
 
-    def _described(self, left: float) -> Entry:
+    def _described(self) -> Entry:
         self.requests += 1
-        if (s3 := self._s3) is not None and (key := self._key):
-            with suppress(FileNotFoundError):  # it may be a folder
-                return _entry(s3.head(key))
-        fs, name, limit = _storage(self, left)
-        return _entry(fs.info(name, **limit))
+        with suppress(FileNotFoundError):  # it may be a folder
+            if self._key:
+                return _entry(obstore().head(self._store, self._key))
+        if not next(self._listed(), None):
+            raise FileNotFoundError(f"{self} is not there")
+        return Entry(0, True, "")
 
-    def _listed(self, left: float) -> list[dict[str, Any]]:
-        fs, name, limit = _storage(self, left)
-        found: list[dict[str, Any]] = fs.ls(name, detail=True, **limit)
-        return found
-
-    def _matching(self, left: float) -> dict[str, dict[str, Any]]:
-        fs, name, limit = _storage(self, left)
-        found: dict[str, dict[str, Any]] = fs.glob(name, detail=True, **limit)
-        return found
+    def _listed(self) -> Iterator[tuple[str, Entry]]:
+        """What lies in the folder, by its key."""
+        if self.parts[0] in WEB:
+            return
+        folder = f"{self._key}/" if self._key else None
+        found = obstore().list_with_delimiter(self._store, folder)
+        for key in found["common_prefixes"]:
+            yield key, Entry(0, True, "")
+        for described in found["objects"]:
+            yield described["path"], _entry(described)
 
     @property
     def _key(self) -> str:
-        """Of an object of S3, in its bucket."""
+        """What storage calls it, in its bucket or on its server."""
         return "/".join(self.parts[2:])
 
     @property
-    def _s3(self) -> "_ByObstore | None":
-        """What fetches ranges and heads of S3 objects for little time; None where it cannot."""
-        if self.parts[0] != "s3:" or "AWS_ACCESS_KEY_ID" not in os.environ:
-            return None
-        return _by_obstore(self.parts[1], os.environ.get("AWS_ENDPOINT_URL", ""), self.patience)
+    def _store(self) -> Any:
+        root = f"{self.parts[0]}//{self.parts[1]}"
+        return _opened(root, self.patience, os.environ.get("AWS_ENDPOINT_URL", ""))
 
     def anew(self) -> "RemotePath":
         """The same place, of which nothing is known yet; what is lost is lost for it, too."""
@@ -170,13 +170,10 @@ class RemotePath(PosixPath):
 
     def iterdir(self) -> Iterator["RemotePath"]:  # type: ignore[override]
         """What is in the folder."""
-        for found in self._asked(self._listed):
-            name = str(found["name"]).rstrip("/").rpartition("/")[2]
-            if name and name != self.name:
-                child = self / name
-                if found.get("size") is not None or found.get("type") == "directory":
-                    child._entry = _entry(found)
-                yield child
+        for key, entry in self._asked(lambda: list(self._listed())):
+            child = self / key.rpartition("/")[2]
+            child._entry = entry
+            yield child
 
     def read_bytes(self) -> bytes:
         """All of it."""
@@ -212,18 +209,17 @@ class RemotePath(PosixPath):
 
     def _fetch_all(self, spans: Sequence[Sequence[int]]) -> None:
         starts, ends = ([span[k] for span in spans] for k in (0, 1))
-        size = self.entry.size
 
-        def ask(left: float) -> list[bytes]:
+        def ask() -> list[bytes]:
             self.requests += len(starts)
-            if (s3 := self._s3) is not None:
-                parts = s3.ranges(self._key, starts, ends)
-            else:
-                fs, name, limit = _storage(self, left)
-                parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
-            return [
-                _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
-            ]
+            ranges = obstore().get_ranges(
+                self._store, self._key, starts=starts, ends=ends, coalesce=0
+            )
+            parts = [bytes(part) for part in ranges]
+            for part, start, end in zip(parts, starts, ends, strict=True):
+                if len(part) != end - start:
+                    raise OSError(f"{len(part)} bytes came of the {end - start} from {start} on")
+            return parts
 
         parts = self._asked(ask)
         self.fetched += sum(map(len, parts))
@@ -278,24 +274,21 @@ class RemotePath(PosixPath):
             held -= len(order.pop(0)[1])
         self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
-    def _asked(self, ask: Callable[[float], T]) -> T:
-        """The answer of storage, asked again with growing waits while the patience lasts.
-
-        ask: it is told how many seconds of it are left.
-        """
+    def _asked(self, ask: Callable[[], T]) -> T:
+        """The answer of storage, asked again with growing waits while the patience lasts."""
         wait = FIRST_WAIT
         while True:
             started = time.monotonic()
             try:
-                return ask(max(1.0, self.patience - self._lost))
-            except REFUSALS:
+                return ask()
+            except FileNotFoundError as error:
+                raise FileNotFoundError(f"{self} is not there") from error
+            except BagError:
                 raise
-            except Exception as error:  # every protocol raises its own
-                status = getattr(error, "status", None)
-                if isinstance(status, int) and 400 <= status < 500 and status not in MAY_PASS:
+            except Exception as error:  # obstore raises its own
+                status = REFUSED.search(str(error))
+                if status is not None and status[1] not in MAY_PASS:
                     raise StorageError(f"{self}: storage refuses it: {_short(error)}") from error
-                if "Credentials" in type(error).__name__:
-                    raise StorageError(f"{self}: {_short(error)}") from error
                 self._lost += time.monotonic() - started + wait
                 if self._lost > self.patience:
                     raise StorageError(
@@ -318,11 +311,6 @@ def place(given: Path | str, *, patience: float | None = None) -> Path:
         found = _URL.match(text)
         if text.startswith("file:/"):
             return Path("/" + text.removeprefix("file:").lstrip("/"))
-        if _CHAINED.match(text):
-            raise BagError(
-                f"{text.partition(':')[0]}::...: URLs behind each other are not read; give the "
-                "last one"
-            )
         if found is None:
             return Path(given)
         protocol, rest = found.group(1).lower(), text[found.end() :]
@@ -358,15 +346,15 @@ def matching(path: Path) -> list[Path]:
     if not isinstance(path, RemotePath):
         start = Path(path.anchor)
         return sorted(start.glob(str(path.relative_to(start))))
-    found = path._asked(path._matching)
-    protocol = path.parts[0]
-    places: list[Path] = []
-    for name, described in sorted(found.items()):
-        inside = name if _URL.match(name) is None else name.partition("://")[2]
-        known = described.get("size") is not None or described.get("type") == "directory"
-        entry = _entry(described) if known else None
-        places.append(_rebuilt(f"{protocol}//{inside}", path.patience, entry))
-    return places
+    if path.parts[0] in WEB:
+        raise BagError(f"{path}: a web server does not list its files; name each of them")
+    places = [_rebuilt(f"{path.parts[0]}//{path.parts[1]}", path.patience, None)]
+    for part in path.parts[2:]:
+        if _WILD.search(part):
+            places = [p for place in places for p in place.iterdir() if fnmatchcase(p.name, part)]
+        else:
+            places = [place / part for place in places]
+    return sorted(place for place in places if place.exists())
 
 
 def _rebuilt(text: str, patience: float, entry: Entry | None) -> RemotePath:
@@ -376,99 +364,39 @@ def _rebuilt(text: str, patience: float, entry: Entry | None) -> RemotePath:
     return path
 
 
-def _storage(path: RemotePath, left: float) -> tuple[Any, str, dict[str, float]]:
-    """The file system of a URL, its name for the file, and the limit of a request of `left` s."""
+def obstore() -> Any:
+    """The library that reads object storage; BagError where it is not installed."""
     try:
-        from fsspec.core import url_to_fs
-
-        fs, name = url_to_fs(str(path), use_listings_cache=False)
-    except (ImportError, ValueError) as error:
+        import obstore as library
+        import obstore.store
+    except ImportError as error:
         raise BagError(
-            f"{path} cannot be read: {error}; bags in object storage need `pip install "
-            "'nlsid[fleet]'`"
+            f"{error}; bags in object storage need `pip install 'nlsid[fleet]'`"
         ) from error
-    return fs, name, {"timeout": left} if fs.async_impl else {}
-
-
-@dataclass(frozen=True)
-class _ByObstore:
-    """The objects of an S3 bucket, with credentials from the environment's variables.
-
-    It does not read those of profiles. Raises FileNotFoundError, PermissionError and obstore's own.
-    """
-
-    bucket: str
-    store: Any
-    get_ranges: Callable[..., Any]
-    get_head: Callable[..., Any]
-    missing: tuple[type[Exception], ...]
-    forbidden: tuple[type[Exception], ...]
-
-    def ranges(self, key: str, starts: list[int], ends: list[int]) -> list[Any]:
-        """The bytes from each start to its end."""
-        return self._answered(
-            lambda: list(self.get_ranges(self.store, key, starts=starts, ends=ends, coalesce=0)),
-            key,
-        )
-
-    def head(self, key: str) -> dict[str, Any]:
-        """What fsspec's info says of it."""
-        found = self._answered(lambda: self.get_head(self.store, key), key)
-        return {"size": found["size"], "ETag": found["e_tag"], "mtime": found["last_modified"]}
-
-    def _answered(self, ask: Callable[[], T], key: str) -> T:
-        try:
-            return ask()
-        except self.missing as error:
-            raise FileNotFoundError(f"s3://{self.bucket}/{key} is not there") from error
-        except self.forbidden as error:
-            raise PermissionError(f"s3://{self.bucket}/{key}: {_short(error)}") from error
+    return library
 
 
 @cache
-def _by_obstore(bucket: str, endpoint: str, patience: float) -> _ByObstore | None:
-    """None where obstore is not installed."""
-    try:
-        from obstore import get_ranges, head
-        from obstore.exceptions import (
-            NotFoundError,
-            PermissionDeniedError,
-            UnauthenticatedError,
-        )
-        from obstore.store import S3Store
-    except ImportError:
-        return None
-    options: Any = {"allow_http": endpoint.startswith("http://"), "timeout": f"{patience:g}s"}
-    no_retries: Any = {"max_retries": 0}  # RemotePath repeats, and counts what it loses
-    return _ByObstore(
-        bucket,
-        S3Store(bucket, client_options=options, retry_config=no_retries),
-        get_ranges,
-        head,
-        (NotFoundError, FileNotFoundError),
-        (PermissionDeniedError, UnauthenticatedError),
+def _opened(root: str, patience: float, endpoint: str) -> Any:  # noqa: ARG001 - other stores
+    """The bucket or server, with credentials of the environment or, of S3, else of a profile."""
+    options: dict[str, Any] = {}
+    if root.startswith("s3:") and "AWS_ACCESS_KEY_ID" not in os.environ:
+        with suppress(ImportError, ValueError):  # without a profile: those of the machine
+            from obstore.auth.boto3 import Boto3CredentialProvider
+
+            options["credential_provider"] = Boto3CredentialProvider()
+    return obstore().store.from_url(
+        root,
+        client_options={"allow_http": True, "timeout": f"{patience:g}s"},
+        retry_config={"max_retries": 0},  # RemotePath repeats, and counts what it loses
+        **options,
     )
 
 
-def _entry(described: dict[str, Any]) -> Entry:
-    size, folder = described.get("size"), described.get("type") == "directory"
-    if size is None and not folder:
-        raise BagError(f"{described.get('name')}: its server does not say how long it is")
-    tags = ("ETag", "etag", "Content-MD5", "LastModified", "Last-Modified", "mtime")
-    tag = next((str(described[key]) for key in tags if described.get(key)), "")
-    return Entry(int(size or 0), folder, tag.strip('"'))
-
-
-def _whole(part: Any, start: int, end: int, size: int) -> bytes:
-    """The bytes of one range; OSError if they are not what was asked for, so that it is again."""
-    if isinstance(part, BaseException):
-        raise part
-    content = bytes(part)
-    if len(content) == size and (start, end) != (0, size):  # the server knows no ranges
-        content = content[start:end]
-    if len(content) != end - start:
-        raise OSError(f"{len(content)} bytes came of the {end - start} from byte {start} on")
-    return content
+def _entry(described: Mapping[str, Any]) -> Entry:
+    """What storage says of an object."""
+    tag = described["e_tag"] or str(described["last_modified"])
+    return Entry(int(described["size"]), False, tag.strip('"'))
 
 
 def _short(error: BaseException) -> str:

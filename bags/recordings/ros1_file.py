@@ -60,7 +60,7 @@ class Ros1File:
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """The messages of one block, one batch per channel that has any."""
-        if not any(channel in (block.index or {}) for channel in channels):
+        if not block.has(channels):
             return
         content = self._unpacked(block)
         found: dict[int, list[tuple[int, int, int]]] = {}

@@ -71,7 +71,7 @@ class SqliteFile:
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """The messages of one block, one batch per channel that has any."""
-        if not any(channel in (block.index or {}) for channel in channels):
+        if not block.has(channels):
             return
         rows: dict[int, list[tuple[int, bytes]]] = {}
         query = (

@@ -34,27 +34,6 @@ _TITLE: Final = re.compile(r"(?P<name>.+?)(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|
 
 
 @dataclass(frozen=True)
-class Assignment:
-    """A signal and the column it gets: `/joint_states:position[name=elbow]=angle`."""
-
-    path: SignalPath
-    column: str
-
-    @classmethod
-    def parse(cls, text: str) -> "Assignment":
-        """Read `signal=column`; BagError says what is wrong with it."""
-        signal, equals, column = text.rpartition("=")
-        if not equals or not column or signal.count("[") != signal.count("]"):
-            raise BagError(
-                f"'{text}' is not signal=column, e.g. /joint_states:position[name=elbow]=angle"
-            )
-        path = SignalPath.parse(signal.strip())
-        if path.every:
-            raise BagError(f"'{text}': name one element for one column")
-        return cls(path, column.strip())
-
-
-@dataclass(frozen=True)
 class Rows:
     """When the rows of a table were recorded: `period` s apart, or at the times of a column.
 
@@ -138,6 +117,19 @@ def _column(tables: Mapping[str, FloatArray], title: str) -> FloatArray:
     return tables[title]
 
 
+def _assigned(text: str) -> tuple[SignalPath, str]:
+    """A signal and its column, of `/joints:position[name=elbow]=angle`; BagError if neither."""
+    signal, equals, column = text.rpartition("=")
+    if not equals or not column or signal.count("[") != signal.count("]"):
+        raise BagError(
+            f"'{text}' is not signal=column, e.g. /joint_states:position[name=elbow]=angle"
+        )
+    path = SignalPath.parse(signal.strip())
+    if path.every:
+        raise BagError(f"'{text}': name one element for one column")
+    return path, column.strip()
+
+
 def every_column(file: Path | str, rows: Rows) -> tuple[Rows, list[str], dict[str, str]]:
     """The rows with their time column, and every other column as a number on a topic of its name.
 
@@ -191,8 +183,8 @@ def import_table(
     tables = read_table(file)
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
     for text in assignments:
-        parsed = Assignment.parse(text)
-        topics.setdefault(parsed.path.topic, {})[parsed.path] = _column(tables, parsed.column)
+        path, column = _assigned(text)
+        topics.setdefault(path.topic, {})[path] = _column(tables, column)
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     if not topics:
@@ -274,7 +266,7 @@ def said_units(assignments: Sequence[str], types: Mapping[str, str]) -> str:
     Empty if none of them has one.
     """
     store = standard_types()
-    paths = [Assignment.parse(text).path for text in assignments]
+    paths = [_assigned(text)[0] for text in assignments]
     units = [(path, Expression(path).unit(types[path.topic], store)) for path in paths]
     return ", ".join(f"{path} {unit}" for path, unit in units if unit)
 

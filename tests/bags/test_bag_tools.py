@@ -25,7 +25,7 @@ from bags.samples import schunk
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
 from bags.tools.fitness import Level, check_fitness
-from bags.tools.importing import Rows, import_table, read_table
+from bags.tools.importing import Rows, import_table
 from bags.tools.info import bag_info
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.identification import Polynomial, identify
@@ -494,73 +494,43 @@ def test_times_in_every_unit_are_read_right(
     assert np.abs(np.diff(stamps) - 25_000_000).max() < 1000
 
 
-def test_times_that_may_be_in_another_unit_are_asked_about(tmp_path: Path) -> None:
-    text = "t,speed\n0,0\n25,1\n50,2\n"
-    with pytest.raises(DataError, match=r"are 25 apart, 3 rows over 50: .*--time 't\|unit\(ms\)'"):
-        import_speed(tmp_path, text, Rows(time="t"))
-    assert import_speed(tmp_path, text, Rows(time="t|unit(s)")).startswith("3 rows over 50 s")
+BY_T, BY_S = Rows(time="t"), Rows(time="t|unit(s)")
+SEVENTIES = r"since 1970 \(1 such rows\)"
+TABLES: list[tuple[str, Rows, list[float] | str]] = [
+    ("t,speed\n0,0\n25,1\n50,2\n", BY_S, [0.0, 1.0, 2.0]),
+    ("t,speed\n0,0\n25,1\n50,2\n", BY_T, r"are 25 apart, 3 rows over 50: .*--time 't\|unit\(ms\)'"),
+    ("t,speed\n0,1\n0.1,2\n0.1,2.5\n0.2,3\n", Rows(time="t", drop_repeats=True), [1.0, 2.0, 3.0]),
+    ("t,speed\n0,1\n0.1,2\n0.1,2.5\n", BY_T, "does not increase after row 1: .*--drop-repeats"),
+    ('t,"speed",mode\n0.0,1.5,auto\n0.1,3,"by, hand"\n', BY_T, [1.5, 3.0]),
+    ("t,speed\n0,1\n,2\n1,3\n", BY_T, r"^no time in row 1 \(1 such rows\)$"),
+    ("t,speed\n0,1\n0.1,fast\n0.2,2\n", BY_T, "'fast' in line 3, column 'speed' is no number$"),
+    ("0,1\n0.1,2\n", BY_T, "its first line holds numbers; write the columns' titles there$"),
+    ("x,x\n0.1,2\n", BY_T, "two columns are called 'x'$"),
+    ("t;x\n0;1\n\n0.1\n", BY_T, "1 cells in line 4, 2 in line 1$"),
+    *((empty, BY_T, r"log\.csv holds no table of numbers$") for empty in ("", "\n\n", "t,x\n")),
+    (
+        "t,speed\n-0.1,1\n0.4,2\n",
+        BY_T,
+        rf"^the time of row 0 is -0\.1 s {SEVENTIES}.*--start 1 moves",
+    ),
+    (
+        "t,speed\n2147483647.5,1\n2147483648,2\n",
+        BY_T,
+        f"^the time of row 1 is 2147483648 s {SEVENTIES}",
+    ),
+    ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start_ns=10**8), [1.0, 2.0]),
+]
 
 
-def test_rows_with_one_time_are_dropped_only_when_asked(tmp_path: Path) -> None:
-    text = "t,speed\n0,1\n0.1,2\n0.1,2.5\n0.2,3\n"
-    with pytest.raises(DataError, match=r"does not increase after row 1: .*--drop-repeats"):
-        import_speed(tmp_path, text, Rows(time="t"))
-    import_speed(tmp_path, text, Rows(time="t", drop_repeats=True))
-    assert read_signals(tmp_path / "bag", [SPEED])[SPEED].values.tolist() == [1.0, 2.0, 3.0]
-
-
-def test_empty_cells_are_unknown_and_columns_of_words_are_left_out(tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text('t,"speed",mode\n0.0,1.5,auto\n0.1,,auto\n0.2,3,"by, hand"\n')
-    tables = read_table(tmp_path / "log.csv")
-    assert set(tables) == {"t", "speed"}
-    np.testing.assert_array_equal(tables["speed"], [1.5, np.nan, 3.0])
-    with pytest.raises(DataError, match=r"^no time in row 1 \(1 such rows\)$"):
-        import_speed(tmp_path, "t,speed\n0,1\n,2\n1,3\n", Rows(time="t"))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("t,x\n0,1\n0.1,fast\n0.2,2\n", r"'fast' in line 3, column 'x' is no number$"),
-        ("0,1\n0.1,2\n", r"its first line holds numbers; write the columns' titles there$"),
-        ("x,x\n0.1,2\n", r"two columns are called 'x'$"),
-        ("t;x\n0;1\n\n0.1\n", r"1 cells in line 4, 2 in line 1$"),
-    ],
-)
-def test_what_is_wrong_in_a_table_is_said_with_its_line(
-    tmp_path: Path, text: str, message: str
+@pytest.mark.parametrize(("text", "rows", "said"), TABLES)
+def test_a_table_is_read_or_what_is_wrong_is_said(
+    tmp_path: Path, text: str, rows: Rows, said: list[float] | str
 ) -> None:
-    (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(DataError, match=message):
-        read_table(tmp_path / "log.csv")
-
-
-@pytest.mark.parametrize("text", ["", "\n\n", "t,x\n"])
-def test_a_table_without_rows_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(DataError, match=r"log\.csv holds no table of numbers$"):
-        read_table(tmp_path / "log.csv")
-
-
-@pytest.mark.parametrize(
-    ("first", "start_ns", "message"),
-    [
-        (-0.1, 0, r"^the time of row 0 is -0\.1 s since 1970 \(1 such rows\).*--start 1 moves"),
-        (2**31 - 1, 0, r"^the time of row 2 is 2147483648 s since 1970 \(1 such rows\)"),
-        (-0.1, 10**8, None),
-    ],
-)
-def test_times_that_no_stamp_can_say_are_refused(
-    tmp_path: Path, first: float, start_ns: int, message: str | None
-) -> None:
-    text = "\n".join(["t,speed", *(f"{first + k / 2},{k}" for k in range(3))])
-    rows = Rows(time="t", start_ns=start_ns)
-    if message is None:
+    if isinstance(said, list):
         import_speed(tmp_path, text, rows)
-        stamps = read_signals(tmp_path / "bag", [SPEED])[SPEED].stamp_ns
-        assert stamps.tolist() == [0, 5 * 10**8, 10**9]
+        assert read_signals(tmp_path / "bag", [SPEED])[SPEED].values.tolist() == said
         return
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=said):
         import_speed(tmp_path, text, rows)
     assert not (tmp_path / "bag").exists()
 

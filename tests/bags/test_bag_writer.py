@@ -83,17 +83,19 @@ def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == [tmp_path / "trial"]
 
 
-def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stopped half-way"):
-        _stop_half_way(BagWriter(tmp_path / "trial"))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_exception_in_place_keeps_what_was_recorded(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stopped half-way"):
-        _stop_half_way(BagWriter(tmp_path / "trial", in_place=True))
-    with Reader(tmp_path / "trial") as reader:
-        assert reader.message_count == 1
+@pytest.mark.parametrize("in_place", [False, True])
+def test_after_an_exception_only_a_bag_in_place_keeps_what_was_written(
+    tmp_path: Path, in_place: bool
+) -> None:
+    with (
+        pytest.raises(BagError, match="is not known"),
+        BagWriter(tmp_path / "trial", in_place=in_place) as bag,
+    ):
+        write_until_it_fails(bag)
+    assert [path.name for path in tmp_path.iterdir()] == ["trial"] * in_place
+    if in_place:
+        with Reader(tmp_path / "trial") as reader:
+            assert reader.message_count == 1
 
 
 def test_a_folder_that_appears_while_writing_is_not_replaced(tmp_path: Path) -> None:
@@ -176,7 +178,6 @@ def _stamps_on_disk(bag: Path) -> list[int]:
     return stamps
 
 
-def _stop_half_way(bag: BagWriter) -> None:
-    with bag:
-        bag.write(CMD, CMD_TYPE, command(0, 0.5), log_time_ns=0, publish_time_ns=0)
-        raise RuntimeError("stopped half-way")
+def write_until_it_fails(bag: BagWriter) -> None:
+    bag.write(CMD, CMD_TYPE, command(0, 0.5), log_time_ns=0, publish_time_ns=0)
+    bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)

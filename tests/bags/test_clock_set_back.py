@@ -8,7 +8,6 @@ import pytest
 
 from bags.monitoring.replay import replay_messages
 from bags.recordings.bag import Bag
-from bags.recordings.batch import LogOrder
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import read_dataset
 from bags.signals.reader import read_signals
@@ -91,12 +90,3 @@ def test_messages_are_read_as_recorded_or_by_log_time(bag: Path) -> None:
         assert recorded[2 * SET_AT][1] < recorded[2 * SET_AT - 1][1]
         by_log = [(m.topic, m.log_time_ns) for m in source.messages()]
     assert by_log == sorted(recorded, key=lambda message: message[1])
-
-
-def test_two_channels_of_a_topic_may_overlap() -> None:
-    order = LogOrder()
-    order.add(0, np.array([5, 6, 6]))
-    order.add(1, np.array([1, 2]))
-    assert not order.back
-    order.add(0, np.array([4, 7, 3]))
-    assert order.back == [(5, 6, 4), (7, 7, 3)]

@@ -30,103 +30,136 @@ def to_trajectory(
     return trajectory
 
 
-def test_samples_on_the_grid_are_used_as_they_are() -> None:
-    y = samples([0, 10, 20, 30], [1.0, 2.0, 3.0, 4.0])
-    u = samples([0, 10, 20], [5.0, 6.0, 7.0], COMMAND)
-    trajectory = to_trajectory([y], [u], name="run")
-    assert trajectory.t.tolist() == [0.0, 0.01, 0.02, 0.03]
-    assert trajectory.y[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert trajectory.u[:, 0].tolist() == [5.0, 6.0, 7.0, 7.0]
-    assert (trajectory.y_names, trajectory.u_names) == ((SPEED,), (COMMAND,))
-    assert trajectory.name == "run"
+TENTHS, LATE = [0, 10, 20, 24, 40, 50, 54, 70, 80, 90], (np.arange(100) * 10.9).tolist()
+LINEAR, LAST = f"{SPEED}|linear(0.02 s)", f"{SPEED}|hold(0.02 s)"
+UP = list(range(6))
+# the response's path, its ms and values; the command's ms and values; rules; y, and u where it says
+GIVEN: list[tuple[Any, ...]] = [
+    # samples on the grid are used as they are
+    (SPEED, [0, 10, 20, 30], [1, 2, 3, 4], [0, 10, 20], [5, 6, 7], {}, [1, 2, 3, 4], [5, 6, 7, 7]),
+    # jitter leaves values alone; the sample at 19.6 ms was taken before the command of 20 ms
+    (
+        SPEED,
+        [0, 10.4, 19.6, 30.2],
+        [1, 2, 3, 4],
+        [0, 10, 20, 30],
+        [0, 1, 2, 3],
+        {"period": 0.01},
+        [1, 2, 3, 4],
+        [0, 1, 1, 3],
+    ),
+    # the grid follows samples that drift, here by a period, as the monitor does
+    (
+        SPEED,
+        np.cumsum([0.0, *[10.0, 12.0, 10.0] * 5]).tolist(),
+        list(range(16)),
+        [0],
+        [0],
+        {"period": 0.01, "max_gap": 1.0},
+        list(range(16)),
+        None,
+    ),
+    (
+        LINEAR,
+        TENTHS,
+        TENTHS,
+        [0],
+        [0],
+        {"period": 0.01, "max_gap": 0.1},
+        list(range(0, 100, 10)),
+        None,
+    ),
+    (
+        LAST,
+        TENTHS,
+        TENTHS,
+        [0],
+        [0],
+        {"period": 0.01, "max_gap": 0.1},
+        [0, 10, 20, 24, 40, 50, 54, 70, 80, 90],
+        None,
+    ),
+    (
+        LINEAR,
+        LATE,
+        LATE,
+        [0],
+        [0],
+        {"period": 0.02, "max_gap": 2.0},
+        list(range(0, 1080, 20)),
+        None,
+    ),
+    # a sample that is filled in has the command of its own time
+    (
+        SPEED,
+        [0, 10, 20, 40, 50],
+        [0, 1, 2, 4, 5],
+        [0, 10, 20, 30, 40, 50],
+        UP,
+        {"max_gap": 0.025},
+        UP,
+        UP,
+    ),
+    (
+        SPEED,
+        [0, 10, 20, 30, 40],
+        [0] * 5,
+        [0, 10, 40],
+        [0, 1, 2],
+        {"max_gap": 0.03},
+        [0] * 5,
+        [0, 1, 1, 1, 2],
+    ),
+    # a command just after a response does not act on it; of two with one stamp the last counts
+    (SPEED, [0, 10, 20], [0, 1, 2], [0, 10.001, 20], [5, 6, 7], {}, [0, 1, 2], [5, 5, 7]),
+    (SPEED, [0, 10, 20], [0, 1, 2], [0, 10, 10, 20], [5, 6, 7, 8], {}, [0, 1, 2], [5, 7, 8]),
+    (SPEED, [0, 20, 40], [0, 1, 2], [0, 20, 40], [0, 1, 2], {"period": 0.02}, [0, 1, 2], [0, 1, 2]),
+]
 
 
-def test_jitter_within_the_tolerance_leaves_the_values_alone() -> None:
-    y = samples([0, 10.4, 19.6, 30.2], [1.0, 2.0, 3.0, 4.0])
-    u = samples([0, 10, 20, 30], [0.0, 1.0, 2.0, 3.0], COMMAND)
-    trajectory = to_trajectory([y], [u], period=0.01)
-    assert trajectory.t.tolist() == [0.0, 0.01, 0.02, 0.03]
-    assert trajectory.y[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
-    # the sample at 19.6 ms was taken before the command of 20 ms
-    assert trajectory.u[:, 0].tolist() == [0.0, 1.0, 1.0, 3.0]
+@pytest.mark.parametrize("case", GIVEN)
+def test_samples_are_what_the_rules_say(case: tuple[Any, ...]) -> None:
+    path, at, values, when, told, rules, y, u = case
+    found = to_trajectory([samples(at, values, path)], [samples(when, told, COMMAND)], **rules)
+    np.testing.assert_allclose(found.y[:, 0], y, rtol=1e-12)
+    assert u is None or found.u[:, 0].tolist() == u
+    assert found.period == rules.get("period", found.period)
+    assert (found.y_names, found.u_names, found.t[0]) == ((path,), (COMMAND,), 0.0)
+    assert ('"filled":1' in found.provenance) is (u == UP)
 
 
-def test_the_grid_follows_samples_that_drift_as_the_monitor_does() -> None:
-    stamps = np.cumsum([0.0, *[10.0, 12.0, 10.0] * 5])  # one whole period late at the end
-    values = np.arange(16.0).tolist()
-    u = samples([0], [0.0], COMMAND)
-    trajectory = to_trajectory([samples(stamps.tolist(), values)], [u], period=0.01, max_gap=1.0)
-    assert trajectory.y[:, 0].tolist() == values
-    assert trajectory.period == 0.01
+GAP = r"trial: /odom.*a gap of 0\.02 s after sample 2 at 1700000000\.020000000 s; at most 0"
+OTHER = r"sampled every 0\.0109 s, asked for was 0\.02 s; .*resample"
+REFUSED: list[tuple[Any, ...]] = [
+    (
+        SPEED,
+        TENTHS,
+        [0],
+        {"max_gap": 0.1},
+        r"2 of 10 samples are up to 60 % of a period off a grid",
+    ),
+    (SPEED, LATE, [0], {"period": 0.02, "max_gap": 2.0}, OTHER),
+    (LINEAR, LATE, [0], {"period": 0.005, "max_gap": 2.0}, "no rule makes more samples than there"),
+    (SPEED, [0, 10, 20, 40, 50], [0, 10, 20, 30, 40, 50], {}, GAP),
+    (
+        SPEED,
+        [0, 10, 20, 30, 40],
+        [0, 10, 40],
+        {},
+        r"/cmd_vel.*nothing for 0\.02 s; at most 0\.015 s",
+    ),
+    (SPEED, [0, 10, 20], [100, 110], {}, "overlap in 0 samples"),
+    (SPEED, [0, 10, 10, 20], [0], {}, r"messages 1 and 2 have the same stamp 1700000000\.01"),
+    (SPEED, [0], [0], {}, "has 1 sample; a sample time needs two"),
+    (SPEED, [0, 20, 40], [0, 20, 40], {"period": 0.025}, r"every 0\.02 s, asked for was"),
+    (SPEED, [0, 20, 40], [0, 20, 40], {"period": 0.01}, r"every 0\.02 s, asked for was"),
+]
 
 
-def test_stamps_between_the_points_of_the_grid_are_refused_with_the_key_to_set() -> None:
-    stamps = [0.0, 10, 20, 24, 40, 50, 54, 70, 80, 90]
-    y = samples(stamps, stamps)
-    u = samples([0], [0.0], COMMAND)
-    with pytest.raises(DataError, match=r"2 of 10 samples are up to 60 % of a period off a grid"):
-        to_trajectory([y], [u], max_gap=0.1)
-    linear = replace(y, path=f"{SPEED}|linear(0.02 s)")
-    found = to_trajectory([linear], [u], period=0.01, max_gap=0.1)
-    np.testing.assert_allclose(found.y[:, 0], np.arange(10) * 10.0, rtol=1e-15)
-    last = replace(y, path=f"{SPEED}|hold(0.02 s)")
-    found = to_trajectory([last], [u], period=0.01, max_gap=0.1)
-    assert found.y[:, 0].tolist() == [0.0, 10.0, 20.0, 24.0, 40.0, 50.0, 54.0, 70.0, 80.0, 90.0]
-
-
-def test_another_rate_is_resampled_only_by_a_stated_rule_and_never_upwards() -> None:
-    stamps = (np.arange(100) * 10.9).tolist()
-    y = samples(stamps, [3.0 * stamp for stamp in stamps])
-    u = samples([0], [0.0], COMMAND)
-    with pytest.raises(
-        DataError, match=r"sampled every 0\.0109 s, asked for was 0\.02 s; .*resample"
-    ):
-        to_trajectory([y], [u], period=0.02, max_gap=2.0)
-    linear = replace(y, path=f"{SPEED}|linear(0.02 s)")
-    found = to_trajectory([linear], [u], period=0.02, max_gap=2.0)
-    assert found.period == 0.02
-    np.testing.assert_allclose(found.y[:, 0], 60.0 * np.arange(len(found)), rtol=1e-12)
-    with pytest.raises(DataError, match="no rule makes more samples than there are"):
-        to_trajectory([linear], [u], period=0.005, max_gap=2.0)
-
-
-def test_a_filled_sample_has_the_command_of_its_own_time() -> None:
-    y = samples([0, 10, 20, 40, 50], [0.0, 1.0, 2.0, 4.0, 5.0])
-    u = samples([0, 10, 20, 30, 40, 50], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], COMMAND)
-    trajectory = to_trajectory([y], [u], max_gap=0.025)
-    assert trajectory.y[:, 0].tolist() == trajectory.u[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
-    assert '"filled":1' in trajectory.provenance
-
-
-def test_a_missing_sample_is_refused_unless_the_gap_was_allowed() -> None:
-    y = samples([0, 10, 20, 40, 50], [0.0, 1.0, 2.0, 4.0, 5.0])
-    u = samples([0, 10, 20, 30, 40, 50], [0.0] * 6, COMMAND)
-    message = r"trial: /odom.*a gap of 0\.02 s after sample 2 at 1700000000\.020000000 s; at most 0"
-    with pytest.raises(DataError, match=message):
-        to_trajectory([y], [u], name="trial")
-    trajectory = to_trajectory([y], [u], max_gap=0.025)
-    np.testing.assert_allclose(trajectory.y[:, 0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], rtol=1e-15)
-
-
-def test_a_command_held_for_longer_than_the_gap_is_refused() -> None:
-    y = samples([0, 10, 20, 30, 40], [0.0] * 5)
-    u = samples([0, 10, 40], [0.0, 1.0, 2.0], COMMAND)
-    with pytest.raises(DataError, match=r"/cmd_vel.*nothing for 0\.02 s; at most 0\.015 s"):
-        to_trajectory([y], [u])
-    held = to_trajectory([y], [u], max_gap=0.03)
-    assert held.u[:, 0].tolist() == [0.0, 1.0, 1.0, 1.0, 2.0]
-
-
-def test_a_command_stamped_just_after_a_response_does_not_act_on_it() -> None:
-    y = samples([0, 10, 20], [0.0, 1.0, 2.0])
-    u = samples([0, 10.001, 20], [5.0, 6.0, 7.0], COMMAND)
-    assert to_trajectory([y], [u]).u[:, 0].tolist() == [5.0, 5.0, 7.0]
-
-
-def test_the_last_of_two_commands_with_one_stamp_counts() -> None:
-    y = samples([0, 10, 20], [0.0, 1.0, 2.0])
-    u = samples([0, 10, 10, 20], [5.0, 6.0, 7.0, 8.0], COMMAND)
-    assert to_trajectory([y], [u]).u[:, 0].tolist() == [5.0, 7.0, 8.0]
+@pytest.mark.parametrize(("path", "at", "when", "rules", "reason"), REFUSED)
+def test_what_is_no_grid_is_refused(path: str, at: Any, when: Any, rules: Any, reason: str) -> None:
+    with pytest.raises(DataError, match=reason):
+        to_trajectory([samples(at, at, path)], [samples(when, when, COMMAND)], **rules)
 
 
 def test_samples_without_a_command_are_left_out_and_logged(
@@ -140,32 +173,6 @@ def test_samples_without_a_command_are_left_out_and_logged(
     assert trajectory.u[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 4.0]
     assert trajectory.t[0] == 0.0
     assert "trial: 3 of 8 samples left out" in caplog.text
-
-
-def test_signals_that_do_not_overlap_are_refused() -> None:
-    y = samples([0, 10, 20], [0.0, 1.0, 2.0])
-    u = samples([100, 110], [1.0, 2.0], COMMAND)
-    with pytest.raises(DataError, match="overlap in 0 samples"):
-        to_trajectory([y], [u])
-
-
-def test_repeated_stamps_and_single_samples_are_refused() -> None:
-    u = samples([0, 10, 20], [0.0, 1.0, 2.0], COMMAND)
-    with pytest.raises(DataError, match=r"messages 1 and 2 have the same stamp 1700000000\.01"):
-        to_trajectory([samples([0, 10, 10, 20], [0.0, 1.0, 1.0, 2.0])], [u])
-    with pytest.raises(DataError, match="has 1 sample; a sample time needs two"):
-        to_trajectory([samples([0], [0.0])], [u])
-    with pytest.raises(DataError, match="at least one response and one excitation"):
-        to_trajectory([], [u])
-
-
-def test_another_period_than_asked_for_is_refused() -> None:
-    y = samples([0, 20, 40], [0.0, 1.0, 2.0])
-    u = samples([0, 20, 40], [0.0, 1.0, 2.0], COMMAND)
-    for period in (0.025, 0.01):
-        with pytest.raises(DataError, match=r"is sampled every 0\.02 s, asked for was"):
-            to_trajectory([y], [u], period=period)
-    assert to_trajectory([y], [u], period=0.02).period == 0.02
 
 
 def test_responses_on_two_topics_are_paired_by_equal_stamps_or_resampled() -> None:

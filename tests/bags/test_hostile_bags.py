@@ -22,13 +22,12 @@ from mcap.writer import CompressionType, Writer
 from bags.recordings.bag import Bag
 from bags.recordings.mcap_file import McapFile
 from bags.recordings.message_types import standard_types
-from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
-from bags.signals.signal import SignalPath, numeric_paths
+from bags.signals.signal import numeric_paths
 from bags.tools.info import bag_info
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError, NlsidError
-from tests.bag_messages import CMD, CMD_TYPE, ODOM_TYPE, SPEED, command, speed_bag
+from tests.bag_messages import CMD_TYPE, ODOM_TYPE, SPEED, command, speed_bag
 from tests.mcap_files import write_mcap
 
 FILES: Final = 20_000
@@ -85,7 +84,7 @@ def test_a_type_made_of_itself_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BagError):
         read_signals(file, ["/x:a.a.a"])
     with pytest.raises(NlsidError):
-        run_all(file, tmp_path / "out")
+        _read(file, tmp_path / "out")
 
 
 @pytest.mark.slow
@@ -151,21 +150,6 @@ def bomb_file(packed: bytes, *stated: int) -> bytes:
         chunk += struct.pack("<Q", len(packed)) + packed
         content += struct.pack("<BQ", 6, len(chunk)) + chunk
     return content
-
-
-def run_all(file: Path, out: Path) -> None:
-    """What a user does with a bag: look, read every number, recover."""
-    bag_info(file)
-    with Bag(file, unfinished=True) as bag:
-        topics = list(bag.topics)
-        paths = []
-        for topic in topics:
-            kind, types = bag.types_on(topic)
-            texts = [path for path, *_ in numeric_paths(kind, types)][:4]
-            paths += [str(SignalPath.parse(f"{topic}:{text}")) for text in texts]
-    with Bag(file, unfinished=True) as bag:
-        read_signals(bag, paths, sort=True)
-    recover(file, out)
 
 
 def seeds(folder: Path) -> list[bytes]:
@@ -324,15 +308,3 @@ def test_a_few_mutated_files_give_data_or_our_error(tmp_path: Path) -> None:
                 step(file, tmp_path / "out")
             except NlsidError as error:
                 assert str(file) in str(error)  # noqa: PT017
-
-
-def test_nothing_is_left_of_a_bag_whose_writing_failed(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="is not known"):
-        write_until_it_fails(tmp_path / "x")
-    assert list(tmp_path.iterdir()) == []
-
-
-def write_until_it_fails(path: Path) -> None:
-    with BagWriter(path) as bag:
-        bag.write(CMD, CMD_TYPE, command(1, 0.5), log_time_ns=1, publish_time_ns=1)
-        bag.write(CMD + "x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)

@@ -1,6 +1,7 @@
 """Samples live: those of the grid whatever the order of topics, and nothing lost silently."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,56 +45,78 @@ def sample(stamp_ns: int, y: float, u: float) -> Sample:
     return Sample(stamp_ns, (y,), (u,))
 
 
-def test_a_response_waits_for_an_excitation_at_or_after_its_stamp() -> None:
+# a number of a signal (0 responds, 1 drives) with its stamp, or a stamp to which all is flushed;
+# the samples that are certain then; late, late responses, duplicates and incomplete ones at the end
+STORIES: list[tuple[list[tuple[Any, list[Sample]]], tuple[int, int, int, int]]] = [
+    (  # a response waits for an excitation at or after its stamp
+        [
+            ((1, 5, 0.5), []),
+            ((0, 10, 1.0), []),
+            ((1, 9, 0.9), []),  # a command at 10 may still come
+            ((1, 12, 1.2), [sample(10, 1.0, 0.9)]),
+            ((0, 12, 2.0), [sample(12, 2.0, 1.2)]),
+            ((0, 13, 3.0), []),
+            (13, [sample(13, 3.0, 1.2)]),
+        ],
+        (0, 0, 0, 0),
+    ),
+    (  # before the first command there are no samples
+        [
+            ((0, 10, 1.0), []),
+            ((0, 20, 2.0), []),
+            (19, []),
+            ((1, 20, 0.5), [sample(20, 2.0, 0.5)]),
+        ],
+        (0, 0, 0, 1),
+    ),
+    (  # those that wait are released in the order of their stamps
+        [
+            ((1, 5, 0.0), []),
+            ((0, 30, 3.0), []),
+            ((0, 10, 1.0), []),
+            ((0, 20, 2.0), []),
+            ((1, 30, 0.0), [sample(10, 1.0, 0.0), sample(20, 2.0, 0.0), sample(30, 3.0, 0.0)]),
+        ],
+        (0, 0, 0, 0),
+    ),
+    (  # what cannot be released is counted
+        [
+            ((0, 10, 1.0), []),
+            ((0, 10, 1.5), []),
+            ((1, 10, 0.0), [sample(10, 1.0, 0.0)]),
+            ((0, 10, 1.0), []),
+            ((0, 9, 0.9), []),
+        ],
+        (0, 1, 2, 0),
+    ),
+    (  # a command that comes too late still holds afterwards
+        [
+            ((1, 0, 0.0), []),
+            ((0, 10, 1.0), []),
+            (10, [sample(10, 1.0, 0.0)]),
+            ((1, 8, 0.8), []),
+            ((0, 11, 1.1), []),
+            (11, [sample(11, 1.1, 0.8)]),
+        ],
+        (1, 0, 0, 0),
+    ),
+]
+
+
+@pytest.mark.parametrize(("story", "counts"), STORIES)
+def test_a_sample_is_given_as_soon_as_it_is_certain(
+    story: list[tuple[Any, list[Sample]]], counts: tuple[int, int, int, int]
+) -> None:
     pairing = sampler()
-    assert pairing.feed(1, 5, 0.5) == []
-    assert pairing.feed(0, 10, 1.0) == []
-    assert pairing.feed(1, 9, 0.9) == [], "a command at 10 may still come"
-    assert pairing.feed(1, 12, 1.2) == [sample(10, 1.0, 0.9)]
-    assert pairing.feed(0, 12, 2.0) == [sample(12, 2.0, 1.2)]
-    assert pairing.feed(0, 13, 3.0) == []
-    assert pairing.flush(13) == [sample(13, 3.0, 1.2)]
-
-
-def test_responses_before_the_first_command_are_counted_and_no_samples() -> None:
-    pairing = sampler()
-    pairing.feed(0, 10, 1.0)
-    pairing.feed(0, 20, 2.0)
-    assert pairing.flush(19) == []
-    assert pairing.incomplete == 1
-    assert pairing.feed(1, 20, 0.5) == [sample(20, 2.0, 0.5)]
-
-
-def test_responses_that_wait_are_released_in_order_of_stamps() -> None:
-    pairing = sampler()
-    pairing.feed(1, 5, 0.0)
-    for stamp in (30, 10, 20):
-        assert pairing.feed(0, stamp, float(stamp)) == []
-    assert [s.stamp_ns for s in pairing.feed(1, 30, 0.0)] == [10, 20, 30]
-    assert (pairing.late_responses, pairing.duplicate_responses) == (0, 0)
-
-
-def test_what_cannot_be_released_is_counted() -> None:
-    pairing = sampler()
-    pairing.feed(0, 10, 1.0)
-    assert pairing.feed(0, 10, 1.5) == []
-    assert pairing.duplicate_responses == 1
-    assert pairing.feed(1, 10, 0.0) == [sample(10, 1.0, 0.0)]
-    assert pairing.feed(0, 10, 1.0) == []
-    assert pairing.duplicate_responses == 2
-    assert pairing.feed(0, 9, 0.9) == []
-    assert pairing.late_responses == 1
-
-
-def test_an_excitation_that_comes_too_late_is_counted_and_still_holds_afterwards() -> None:
-    pairing = sampler()
-    pairing.feed(1, 0, 0.0)
-    pairing.feed(0, 10, 1.0)
-    assert pairing.flush(10) == [sample(10, 1.0, 0.0)]
-    assert pairing.feed(1, 8, 0.8) == []
-    assert pairing.late == 1
-    pairing.feed(0, 11, 1.1)
-    assert pairing.flush(11) == [sample(11, 1.1, 0.8)]
+    for event, given_then in story:
+        found = pairing.flush(event) if isinstance(event, int) else pairing.feed(*event)
+        assert found == given_then
+    assert counts == (
+        pairing.late,
+        pairing.late_responses,
+        pairing.duplicate_responses,
+        pairing.incomplete,
+    )
 
 
 @given(st.data())

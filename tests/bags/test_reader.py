@@ -14,11 +14,9 @@ from bags.signals.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_origin, 
 from bags.tools.recover import recover
 from tests.bag_messages import (
     COMMAND,
-    JOINT_TYPE,
     PERIOD_NS,
     SPEED,
     START_NS,
-    joints,
     serialised,
     speed_bag,
     twist,
@@ -50,11 +48,6 @@ def test_a_single_mcap_file_reads_as_its_folder_does(tmp_path: Path) -> None:
     assert bag_digest(bag) == "sha256:" + hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_a_bag_without_metadata_of_its_own_has_none(tmp_path: Path) -> None:
-    bag = speed_bag(tmp_path / "trial", [0.1], [0.3])
-    assert bag_origin(bag)["custom"] == bag_origin(bag / "trial.mcap")["custom"] == {}
-
-
 def test_a_type_without_a_header_is_stamped_by_log_time_and_says_so(tmp_path: Path) -> None:
     kind = "geometry_msgs/msg/Twist"
     with BagWriter(tmp_path / "plain") as bag:
@@ -66,16 +59,6 @@ def test_a_type_without_a_header_is_stamped_by_log_time_and_says_so(tmp_path: Pa
     assert samples.clock == LOG_TIME
     assert samples.stamp_ns.tolist() == [START_NS, START_NS + 1, START_NS + 2]
     assert samples.values.tolist() == [0.0, 0.5, 1.0]
-
-
-def test_elements_of_a_dynamic_array_are_signals(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "arm") as bag:
-        for k in range(2):
-            data = joints(START_NS + k, [k + 0.25, k + 0.75])
-            bag.write("/joint_states", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
-    paths = ["/joint_states:position[1]", "/joint_states:position[0]"]
-    read = read_signals(tmp_path / "arm", paths)
-    assert [read[path].values.tolist() for path in paths] == [[0.75, 1.75], [0.25, 1.25]]
 
 
 def test_messages_come_in_log_order_with_ties_as_recorded(tmp_path: Path) -> None:

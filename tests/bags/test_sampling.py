@@ -17,9 +17,7 @@ from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.grid import filled_samples, read_dataset
-from bags.signals.reader import read_signals
 from bags.signals.sampling import LOST, MOST_LOST, Grid, Sample, Sampler
-from bags.tools.listing import bag_signals
 from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
@@ -34,7 +32,6 @@ from tests.bag_messages import (
     SPEED,
     START_NS,
     command,
-    header,
     odometry,
     serialised,
     speed_bag,
@@ -326,16 +323,6 @@ def test_a_lost_sample_has_the_commands_of_its_time_where_they_are_known() -> No
     assert [sample.missing for sample in far.flush()].count(LOST) == MOST_LOST
 
 
-def test_what_answers_is_no_product_and_has_no_lag() -> None:
-    for text in (f"{Y} * {Z}", f"{Y}|lag(1 s)", f"{Y}|delay(1 s)"):
-        with pytest.raises(BagError, match="for what drives, not for a response"):
-            Sampler([text], [U], period=0.1)
-    with pytest.raises(BagError, match="leave out linear"):
-        Expression.parse(f"{U}|lag(1 s)|linear(1 s)")
-    with pytest.raises(BagError, match="at most 4"):
-        Sampler([Y], [" * ".join([U] * 5)], period=0.1)
-
-
 @pytest.mark.parametrize("resample", ["none", "linear"])
 def test_signals_of_several_topics_and_products_give_the_same_bits(
     tmp_path: Path, resample: str
@@ -478,67 +465,26 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
 
 
-def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
-    types = standard_types().types
-    kind = "tf2_msgs/msg/TFMessage"
-    with BagWriter(tmp_path / "tf") as bag:
-        for k in range(60):
-            stamp = START_NS + k * 10 * MS
-            names = ("camera",) if k % 3 == 2 else ("odom", "base")
-            transforms = [
-                types["geometry_msgs/msg/TransformStamped"](
-                    header(stamp),
-                    name,
-                    types["geometry_msgs/msg/Transform"](
-                        types["geometry_msgs/msg/Vector3"](0.1 * k, 0.0, float(len(name))),
-                        types["geometry_msgs/msg/Quaternion"](
-                            0.0, 0.0, math.sin(0.01 * k), math.cos(0.01 * k)
-                        ),
-                    ),
-                )
-                for name in names
-            ]
-            data = serialised(kind, types[kind](transforms))
-            bag.write("/tf", kind, data, log_time_ns=stamp, publish_time_ns=stamp)
-    base = "/tf:transforms[child_frame_id=base].transform"
-    signals = [f"{base}.translation.x", f"{base}.rotation.yaw", f"{base}.translation.z"]
-    read = read_signals(tmp_path / "tf", signals)
-    rows = [k for k in range(60) if k % 3 != 2]
-    assert read[signals[0]].values.tolist() == [0.1 * k for k in rows]
-    np.testing.assert_allclose(read[signals[1]].values, [0.02 * k for k in rows], atol=1e-15)
-    assert read[signals[1]].stamp_ns.tolist() == [START_NS + k * 10 * MS for k in rows]
-    with Bag(tmp_path / "tf") as source:
-        listed = {entry.signal: entry for entry in bag_signals(source)}
-        assert (listed[signals[2]].low, listed[signals[2]].high) == (4.0, 4.0)
-        camera = "/tf:transforms[child_frame_id=camera].transform.rotation.yaw"
-        assert listed[camera].unit == "rad"
-        assert listed[camera].low == pytest.approx(0.04)
-        sampler = Sampler([f"{signals[1]}|clock(log)"], [f"{signals[0]}|clock(log)"], period=0.01)
-        sampler.check("/tf", *source.types_on("/tf"))
-        given = [
-            sample
-            for message in source.messages(["/tf"])
-            for sample in sampler.message(
-                "/tf",
-                sampler.stamp(message.data, message.log_time_ns),
-                decode(message.data, *source.types_on("/tf")),
-            )
-        ]
-    assert [sample.y[0] for sample in came(given)] == read[signals[1]].values.tolist()
-    with pytest.raises(BagError, match="'frame' on 'tf2_msgs/msg/TFMessage' is not an array of"):
-        read_signals(tmp_path / "tf", ["/tf:transforms[frame=base].transform.translation.x"])
-    with pytest.raises(BagError, match=r"is nan in message 0 .*not finite"):
-        read_signals(tmp_path / "tf", [signals[0].replace("base", "wheel")])
-
-
-def test_signals_on_two_clocks_or_of_two_rules_are_refused() -> None:
-    with pytest.raises(BagError, match="two clocks cannot be paired: /y:data by its header time"):
-        Sampler([Y], [f"{U}|clock(log)"], period=0.1)
-    with pytest.raises(BagError, match=r"/z:data is sampled as it comes, /y:data.* on a grid"):
-        Sampler([f"{Y}|linear(1 s)", Z], [U], period=0.1)
-    for text in (f"{U}|hold(1 s)|linear(1 s)", f"{U}|clock(log)|clock(log)", f"{U}|clock(sun)"):
-        with pytest.raises(BagError):
-            Expression.parse(text)
+@pytest.mark.parametrize(
+    ("responses", "drive", "reason"),
+    [
+        ([f"{Y} * {Z}"], U, "for what drives, not for a response"),
+        ([f"{Y}|lag(1 s)"], U, "for what drives, not for a response"),
+        ([f"{Y}|delay(1 s)"], U, "for what drives, not for a response"),
+        ([Y], f"{U}|lag(1 s)|linear(1 s)", "leave out linear"),
+        ([Y], " * ".join([U] * 5), "at most 4"),
+        ([Y], f"{U}|clock(log)", "two clocks cannot be paired: /y:data by its header time"),
+        ([f"{Y}|linear(1 s)", Z], U, r"/z:data is sampled as it comes, /y:data.* on a grid"),
+        ([Y], f"{U}|hold(1 s)|linear(1 s)", "says twice when the signal is sampled"),
+        ([Y], f"{U}|clock(log)|clock(log)", "says twice when the signal is sampled"),
+        ([Y], f"{U}|clock(sun)", r"clock\(header\) or clock\(log\)"),
+    ],
+)
+def test_signals_that_are_never_one_sample_are_refused(
+    responses: list[str], drive: str, reason: str
+) -> None:
+    with pytest.raises(BagError, match=reason):
+        Sampler(responses, [drive], period=0.1)
 
 
 def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:

@@ -6,18 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
-from bags.recordings.cdr import Step
 from bags.recordings.message_types import header_stamp_ns, is_stamped, standard_types, types_in_bag
 from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError
 from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, START_NS, joints, odometry
-
-
-def test_a_path_parses_into_topic_and_steps_and_prints_back() -> None:
-    path = SignalPath.parse("/arm/joint_states:position[2]")
-    assert path == SignalPath("/arm/joint_states", (Step("position", 2),))
-    assert str(path) == "/arm/joint_states:position[2]"
-    assert str(SignalPath.parse("/odom:twist.twist.linear.x")) == "/odom:twist.twist.linear.x"
 
 
 @pytest.mark.parametrize(
@@ -93,12 +85,6 @@ def test_values_come_from_nested_fields_fixed_arrays_and_dynamic_arrays() -> Non
     position.check(JOINT_TYPE, types)
     arm = types.deserialize_cdr(joints(START_NS, [0.5, -0.25]), JOINT_TYPE)
     assert position.value(arm) == -0.25
-
-
-def test_an_index_past_the_end_of_a_dynamic_array_is_a_bag_error() -> None:
-    arm = standard_types().deserialize_cdr(joints(START_NS, [0.5]), JOINT_TYPE)
-    with pytest.raises(BagError, match="'position' has 1 elements"):
-        SignalPath.parse("/joint_states:position[1]").value(arm)
 
 
 def test_header_stamps_are_read_from_serialised_bytes_of_either_byte_order() -> None:

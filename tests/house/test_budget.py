@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_144,
-    ("bags",): 12_071,
-    ("nlsid_ros",): 2_665,
-    ("tests",): 23_740,
+    ("bags",): 11_947,
+    ("nlsid_ros",): 2_661,
+    ("tests",): 23_443,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 try:
-    import aiohttp  # noqa: F401
-    import fsspec  # noqa: F401
+    import obstore  # noqa: F401
 except ImportError:
     collect_ignore = ["test_remote.py"]
 
@@ -32,10 +31,10 @@ class Bucket:
 
 @pytest.fixture(scope="session")
 def s3() -> Iterator[Any]:
-    """A client of moto's server; s3fs finds the server by the environment."""
+    """A client of moto's server; obstore finds the server by the environment."""
     moto = pytest.importorskip("moto.server")
     boto3 = pytest.importorskip("boto3")
-    pytest.importorskip("s3fs")
+    pytest.importorskip("obstore")
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = moto.ThreadedMotoServer(port=0, verbose=False)
     server.start()

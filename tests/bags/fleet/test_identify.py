@@ -225,8 +225,7 @@ def test_a_bag_that_changes_while_it_is_read_is_named_and_not_kept(
     tmp_path: Path, config: Path
 ) -> None:
     """Chunks of one recording and the end of another would pass for a third."""
-    pytest.importorskip("fsspec")
-    pytest.importorskip("aiohttp")
+    pytest.importorskip("obstore")
     local = drive(tmp_path / "web" / "drive.mcap", samples=120, image_bytes=1000)
     other = drive(tmp_path / "other.mcap", seed=1, samples=120, image_bytes=1000)
     assert local.stat().st_size == other.stat().st_size
@@ -372,8 +371,7 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: Path) -> None:
     """Busy for ever, vanished after it was listed, busy for a while, of another type: each once."""
-    pytest.importorskip("fsspec")
-    pytest.importorskip("aiohttp")
+    pytest.importorskip("obstore")
     for k in range(4):
         drive(tmp_path / "web" / f"drive_{k}.mcap", seed=k, samples=120)
     with (tmp_path / "web" / "drive_4.mcap").open("wb") as stream:

@@ -138,7 +138,6 @@ def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
         "https://user:secret@host/d.mcap?secret",
         "https://host/d.mcap#token=secret",
         "s3://bucket/d.mcap?X-Amz-Signature=secret",
-        "simplecache::https://user:secret@host/d.mcap",
         " s3://key:secret@bucket/d.mcap",
     ],
 )
@@ -171,8 +170,6 @@ def test_a_server_that_never_answers_is_given_up_after_the_patience(
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Asked for ranges, for what a file is, and for what a pattern means."""
-    s3fs = pytest.importorskip("s3fs")
-    monkeypatch.setattr(s3fs.S3FileSystem, "_cache", {})  # those of other tests know their server
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
@@ -186,63 +183,41 @@ def test_a_server_that_never_answers_is_given_up_after_the_patience(
             lambda: remote(f"{begin}/d.mcap", patience=1.0).entry,
             lambda: expand_bags([remote(f"{begin}/folder/*.mcap", patience=1.0)]),
         ):
-            with pytest.raises(BagError, match="did not deliver; 1 s were lost"):
+            with pytest.raises(BagError, match=r"did not deliver; 1 s were lost|does not list"):
                 ask()
 
 
-def test_a_server_that_is_busy_is_asked_again(tmp_path: Path) -> None:
-    local = drive(tmp_path / "d.mcap")
-    with web_server(tmp_path, lambda _, number: 503 if number <= 2 else None) as url:
-        found = read_signals(f"{url}/d.mcap", [SPEED])
-    np.testing.assert_array_equal(found[SPEED].values, read_signals(local, [SPEED])[SPEED].values)
-
-
-def test_half_an_answer_is_asked_for_again(tmp_path: Path) -> None:
-    local = drive(tmp_path / "d.mcap")
-    with web_server(tmp_path, lambda _, number: 200 if number == 1 else None) as url:
-        found = read_signals(f"{url}/d.mcap", [SPEED])
-    np.testing.assert_array_equal(found[SPEED].values, read_signals(local, [SPEED])[SPEED].values)
-
-
-def test_a_server_that_stays_busy_is_given_up_after_the_patience(tmp_path: Path) -> None:
-    drive(tmp_path / "d.mcap")
-    with (
-        web_server(tmp_path, lambda *_: 503) as url,
-        pytest.raises(BagError, match=r"did not deliver; 1 s were lost .*503"),
-    ):
-        read_signals(remote(f"{url}/d.mcap", patience=1.0), [SPEED])
-
-
-@pytest.mark.slow
-def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
+def test_credentials_of_a_profile_do_as_those_of_the_environment(
     bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("obstore")
-    url = bucket.put(drive(tmp_path / "d.mcap", samples=60, image_bytes=40_000), "d.mcap")
-    by_obstore, by_fsspec = remote(url), RemotePath(place(url))
-    found = read_signals(by_obstore, WANTED)
-    monkeypatch.setattr("bags.recordings.remote._by_obstore", lambda *_: None)
-    wanted = read_signals(by_fsspec, WANTED)
-    for text in WANTED:
-        np.testing.assert_array_equal(found[text].values, wanted[text].values)
-    assert (by_obstore.requests, by_obstore.fetched) == (by_fsspec.requests, by_fsspec.fetched)
-    assert by_obstore.fetched < 0.1 * (tmp_path / "d.mcap").stat().st_size
+    url = bucket.put(drive(tmp_path / "d.mcap", samples=10), "d.mcap")
+    profile = "[robots]\naws_access_key_id = test\naws_secret_access_key = test\n"
+    (tmp_path / "credentials").write_text(profile)
+    for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(key)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
+    monkeypatch.setenv("AWS_PROFILE", "robots")
+    assert len(read_signals(remote(url, patience=5.0), [SPEED])[SPEED]) == 10
 
 
-@pytest.mark.usefixtures("s3")  # its credentials; the server is another one, which fails
+@pytest.mark.parametrize("protocol", ["http", "s3"])
 @pytest.mark.parametrize(
     ("statuses", "said"),
     [
         ((503, 503), ""),
+        ((200,), ""),  # half an answer
         ((503,) * 99, r"did not deliver; 1 s were lost .*503"),
-        ((403,), "s3://bucket/d.mcap"),
-        ((404,), "s3://bucket/d.mcap is not there"),
+        ((403,), "storage refuses it: .*403"),
+        ((404,), "bucket/d.mcap is not there"),
     ],
 )
-def test_ranges_of_s3_are_asked_again_or_refused_as_others_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, statuses: tuple[int, ...], said: str
+def test_ranges_are_asked_for_again_or_refused_at_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    protocol: str,
+    statuses: tuple[int, ...],
+    said: str,
 ) -> None:
-    pytest.importorskip("obstore")
     local = drive(tmp_path / "bucket" / "d.mcap", samples=10)
     asked = []
 
@@ -250,9 +225,12 @@ def test_ranges_of_s3_are_asked_again_or_refused_as_others_are(
         asked.append(path)
         return statuses[number - 1] if number <= len(statuses) else None
 
+    for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
+        monkeypatch.setenv(key, "test")
     with web_server(tmp_path, fault) as url:
         monkeypatch.setenv("AWS_ENDPOINT_URL", url)
-        path = remote("s3://bucket/d.mcap", patience=1.0 if said else 60.0)
+        begin = url if protocol == "http" else "s3:/"
+        path = remote(f"{begin}/bucket/d.mcap", patience=1.0 if said else 60.0)
         path._entry = remote(f"{url}/bucket/d.mcap").entry
         if not said:
             assert path.read_range(10, 500) == local.read_bytes()[10:500]
@@ -261,22 +239,6 @@ def test_ranges_of_s3_are_asked_again_or_refused_as_others_are(
         with pytest.raises((BagError, OSError), match=said):
             path.read_range(10, 500)
         assert (len(asked) == 1) == (statuses[0] != 503)
-
-
-def test_what_is_forbidden_is_not_asked_again(tmp_path: Path) -> None:
-    drive(tmp_path / "d.mcap")
-    asked = []
-
-    def forbid(path: str, _: int) -> int:
-        asked.append(path)
-        return 403
-
-    with (
-        web_server(tmp_path, forbid) as url,
-        pytest.raises(BagError, match=r"storage refuses it: .*403"),
-    ):
-        read_signals(f"{url}/d.mcap", [SPEED])
-    assert len(asked) == 1
 
 
 def test_an_object_that_vanishes_is_no_bag(bucket: Bucket, tmp_path: Path) -> None:
@@ -414,11 +376,11 @@ def test_chunks_that_are_listed_in_any_order_are_read_in_theirs_and_each_once(
     (tmp_path / "twice.mcap").write_bytes(content)
     with web_server(tmp_path) as url:
         found = read_signals(f"{url}/reversed.mcap", WANTED)
-        with pytest.raises(BagError, match=r"twice.mcap.*the summary's chunks at bytes .* overlap"):
-            read_signals(f"{url}/twice.mcap", WANTED)
+        twice = read_signals(f"{url}/twice.mcap", WANTED)  # which is walked
     for text, samples in read_signals(local, WANTED).items():
         np.testing.assert_array_equal(found[text].values, samples.values)
         np.testing.assert_array_equal(found[text].stamp_ns, samples.stamp_ns)
+        np.testing.assert_array_equal(twice[text].stamp_ns, samples.stamp_ns)
 
 
 def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
     design: Path, tmp_path: Path
 ) -> None:
     """Size, time of change, tag and end of the file: a copy is what has the same samples."""
-    pytest.importorskip("aiohttp")
+    pytest.importorskip("obstore")
     web = tmp_path / "web"
     for name, seed in (("a", 1), ("b", 2), ("c", 1)):
         os.utime(
@@ -403,8 +403,7 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
     design: Path, tmp_path: Path, verb: str
 ) -> None:
     """Cut off, busy for ever, busy for a while, vanished, too slow: each with its reason."""
-    pytest.importorskip("fsspec")
-    pytest.importorskip("aiohttp")
+    pytest.importorskip("obstore")
     web = tmp_path / "web"
     for seed, name in enumerate(("cut", "busy", "late", "gone", "slow", "good")):
         drive(web / f"{name}.mcap", samples=117, seed=seed)
