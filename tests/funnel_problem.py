@@ -10,7 +10,7 @@ from nlsid_core.design import Goal
 from nlsid_core.dynamics import Nominal, VectorField
 
 
-def document(field: VectorField, nominal: Nominal, goal: Goal | None, **options: Any) -> Json:
+def document(field: VectorField, nominal: Nominal, goal: Goal, **options: Any) -> Json:
     """The JSON form of a problem; every number round-trips exactly."""
     return {
         "format": "nlsid/funnel_problem",
@@ -21,6 +21,6 @@ def document(field: VectorField, nominal: Nominal, goal: Goal | None, **options:
             "x": nominal.x.control.tolist(),
             "u": nominal.u.control.tolist(),
         },
-        "goal": goal and {"centre": goal.centre.tolist(), "P": goal.P.tolist()},
+        "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()},
         **{name: np.asarray(value).tolist() for name, value in options.items()},
     }

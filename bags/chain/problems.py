@@ -8,7 +8,6 @@ from bags.monitoring.catching import Breaking, breaking
 from bags.signals.grid import read_dataset
 from bags.signals.sampling import Grid
 from nlsid_core import files
-from nlsid_core.arrays import Json
 from nlsid_core.design import ContinuousTracking, Goal
 from nlsid_core.designs import Wiring
 from nlsid_core.dynamics import (
@@ -58,8 +57,10 @@ def load_problem(path: Path) -> ContinuousTracking:
         else:
             shape = shapes.get(name, (None, 3))
             options[name] = files.array(document, name, shape, source=source)
-    goal = _goal(document, field.n, source)
-    return ContinuousTracking(field, Nominal(x, u), goal=goal, **options)
+    goal = files.member(document, "goal", dict, source=source)
+    centre = files.array(goal, "centre", (field.n,), source=source)
+    P = files.array(goal, "P", (field.n, field.n), source=source)
+    return ContinuousTracking(field, Nominal(x, u), Goal(centre, P), **options)
 
 
 def measured(
@@ -79,13 +80,3 @@ def measured(
     trials = read_dataset(bags, responses=wiring.response, excitations=wiring.command, grid=grid)
     push = measured_push(field, trials, seconds=seconds, safety_factor=safety_factor)
     return push, breaking(trials, lambda trial: push.used(field, trial))
-
-
-def _goal(document: Json, n: int, source: str) -> Goal | None:
-    if "goal" not in document:
-        raise DocumentError(f"{source}: 'goal' is missing; null asks for the largest at the end")
-    if document["goal"] is None:
-        return None
-    goal = files.member(document, "goal", dict, source=source)
-    centre = files.array(goal, "centre", (n,), source=source)
-    return Goal(centre, files.array(goal, "P", (n, n), source=source))

@@ -3,7 +3,8 @@
 A bag does not say who sent a message. Two publishers show in counts of what was sent that go back
 and forth, and in values that jump from one curve to another and back: each curve is smooth, the two
 together are not. Which message is on which curve the stamps say, as each publisher sends evenly; or
-every second message is. One publisher that takes the place of another shows in none of these.
+every second message is. Up to four that send in turn are told where their stamps are uneven. One
+publisher that takes the place of another shows in none of these.
 """
 
 from bisect import bisect_left
@@ -20,6 +21,7 @@ EVEN: Final = 0.15  # of the time between messages of one publisher: it varies b
 UNEVEN: Final = 0.3  # of the median time between messages of all: it varies by more
 LEAST: Final = 6  # messages of each publisher in a window
 SMOOTH: Final = 10.0  # times less do squared second differences of the curves add up to; noise: 1
+TURNS: Final = (2, 3, 4)  # publishers that send in turn
 DISTINCT: Final = 24  # values in a window; fewer are those of a coarse sensor, which flickers
 
 
@@ -57,12 +59,32 @@ def _has_two_curves(stamp_ns: IntArray, values: FloatArray) -> bool:
     """Whether two smooth curves make the values of one window, stamps ascending."""
     if len(np.unique(values)) < DISTINCT:
         return False
+    together = _roughness(stamp_ns, values)
+    return any(
+        together > SMOOTH * sum(_roughness(stamp_ns[sender], values[sender]) for sender in senders)
+        for senders in _ways_to_part(stamp_ns)
+    )
+
+
+def _roughness(stamp_ns: IntArray, values: FloatArray) -> float:
+    """How far values are from the lines between their neighbours, squared and summed up.
+
+    In time or in order, whichever is less: stamps may be those of arrival, in bursts.
+    """
+    share = np.diff(stamp_ns)[:-1] / np.maximum(stamp_ns[2:] - stamp_ns[:-2], 1)
+    in_time = values[1:-1] - values[:-2] - share * (values[2:] - values[:-2])
+    in_order = np.diff(values, 2) / 2.0
+    return float(min(np.sum(in_time**2), np.sum(in_order**2)))
+
+
+def _ways_to_part(stamp_ns: IntArray) -> list[list[BoolArray]]:
+    """Which messages each publisher may have sent: evenly, or in turn."""
     first = _evenly_sent(stamp_ns)
-    if first is None:
-        first = np.arange(len(values)) % 2 == 0
-    together = np.sum(np.diff(values, 2) ** 2)
-    apart = np.sum(np.diff(values[first], 2) ** 2) + np.sum(np.diff(values[~first], 2) ** 2)
-    return bool(together > SMOOTH * apart)
+    if first is not None:
+        return [[first, ~first]]
+    turns = TURNS[:1] if _is_even(stamp_ns, UNEVEN) else TURNS
+    number = np.arange(len(stamp_ns))
+    return [[number % turn == k for k in range(turn)] for turn in turns]
 
 
 def _evenly_sent(stamp_ns: IntArray) -> BoolArray | None:

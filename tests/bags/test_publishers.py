@@ -64,6 +64,8 @@ TWO = {
     "between the robot's": (ROBOT, Sent(1.0, late=0.051)),
     "faster": (ROBOT, Sent(1.0, every=0.04)),
     "slower": (ROBOT, Sent(1.0, every=0.25)),
+    "three": (ROBOT, Sent(1.0), Sent(1.0, late=0.0005)),
+    "four": (ROBOT, Sent(1.0), Sent(0.9, late=0.0005), Sent(1.0, late=0.002)),
     "for a while": (ROBOT, Sent(1.0, during=(10.0, 25.0))),
 }
 ONE = {
@@ -132,21 +134,28 @@ def test_a_signal_of_one_publisher_after_another_is_known(
 
 
 @pytest.mark.parametrize(
-    "kind", ["white", "coarse", "steps", "irregular", "square", "walk", "in pairs"]
+    "kind",
+    ["white", "coarse", "steps", "irregular", "square", "walk", "in pairs", "in threes", "bursts"],
 )
 def test_noise_steps_and_uneven_stamps_are_not_two_curves(kind: str) -> None:
     rng = np.random.default_rng(5)
     n = 5000
     t = 0.025 * np.arange(n)
+    if kind == "bursts":
+        t = 0.05 * (np.arange(n) // 2) + 0.001 * (np.arange(n) % 2)
     values = {
         "coarse": np.round(8.0 * np.sin(t) + 0.5 * rng.standard_normal(n)) / 8.0,
         "steps": np.sign(np.sin(3.0 * t)) + 0.01 * rng.standard_normal(n),
         "square": np.where(np.arange(n) % 9 < 4, 1.0, 0.0) + 0.01 * rng.standard_normal(n),
         "walk": np.cumsum(rng.standard_normal(n)),
         "in pairs": np.sin(t) + 0.01 * rng.standard_normal(n),
+        "bursts": np.sin(5.0 * t) + 0.001 * rng.standard_normal(n),
+        "in threes": np.sin(5.0 * t) + 0.001 * rng.standard_normal(n),
     }.get(kind, rng.standard_normal(n))
     if kind == "irregular":
         t = np.cumsum(rng.exponential(0.025, n))
     if kind == "in pairs":
         t = t - 0.02 * (np.arange(n) % 2)
+    if kind == "in threes":
+        t = t - 0.02 * (np.arange(n) % 3)
     assert not two_curves(np.round(t * 1e9).astype(np.int64), values)

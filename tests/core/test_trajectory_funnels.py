@@ -110,13 +110,6 @@ def test_p_grows_beyond_rho_and_is_proved() -> None:
     assert np.min(P.found.proved.margins) > 0
 
 
-def test_only_dynamics_nominal_and_weights_are_needed() -> None:
-    field, nominal = hanging(9)
-    design = design_funnel(ContinuousTracking(damped, nominal, Q=np.eye(2), R=np.eye(1)))
-    assert np.min(design.found.proved.margins) > 0
-    assert design.model.document() == field.document()
-
-
 @pytest.mark.slow
 def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
     t = np.linspace(-1, 1, 401)
