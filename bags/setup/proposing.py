@@ -147,7 +147,9 @@ def propose(
     in_training = _ranges(trials.train)
     if all(_is_constant(*ends) for ends in in_training):
         _refuse_constant(excitations, in_training, "drives", "the training trials")
+    asked = len(proposal.doubts)
     say_direction(proposal, found, trials.every)
+    is_swapped = len(proposal.doubts) > asked
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
@@ -171,7 +173,7 @@ def propose(
             without = f"; without it models are off by {proposal.error:.3g} %"
             wider.why |= {text: wider.why[text] + without for text in others}
             return wider
-    if len(responses) == 1:
+    if len(responses) == 1 and not is_swapped:  # who swapped them has to say so first
         say_class(proposal, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)

@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_006,
-    ("bags",): 11_942,
+    ("bags",): 11_944,
     ("nlsid_ros",): 2_661,
     ("tests",): 23_397,
     ("benchmarks", "examples"): 3_809,
