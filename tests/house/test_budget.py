@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_998,
+    ("nlsid_core",): 18_963,
     ("bags",): 11_944,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_397,
+    ("tests",): 23_393,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
