@@ -165,7 +165,7 @@ class Controller:
         """The moment of the next input, as the funnels count."""
         if self._continuous:
             return max(self._origin, self._origin + t - self._grid.start)
-        return self.k - 1 + self._observer.ahead
+        return self.k - 1 + int(self._observer.ahead)
 
     def _stage(self, when: float) -> tuple[Any, Any, Any]:
         """The stage that is on: of a composition the first that has not ended."""
