@@ -30,7 +30,8 @@ from typing import Any, Final
 from nlsid_core import kernel
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.kernel import Verdict
-from nlsid_core.kernel.files import digest, read_regular
+from nlsid_core.kernel.checking import read_regular
+from nlsid_core.kernel.files import digest
 
 PATIENCE: Final = 30  # times the seconds on the wall, on a machine that has other work
 KERNEL: Final = Path(kernel.__file__).parent

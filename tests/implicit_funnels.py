@@ -16,19 +16,19 @@ STEPS, BOUND = 14, 0.02
 
 
 @cache
-def designed(form: str = "response", goal: float = 0.1) -> TrackingDesign:
+def designed(goal: float = 0.1) -> TrackingDesign:
     """The funnel around a short motion of the trapezoidal pendulum."""
     model = truth()
     x, u = plan_motion(model, [0.0, 0.0], [goal, 0.0], steps=STEPS)
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
     return design_state_funnel(
-        SampledTracking(model, policy, feedback, assumption=assumption(form, BOUND))
+        SampledTracking(model, policy, feedback, assumption=assumption(BOUND))
     )
 
 
 @cache
-def two_joints(form: str = "response") -> TrackingDesign:
+def two_joints() -> TrackingDesign:
     """The funnel around two steps of rest of two coupled joints with a torque each."""
     exponents = [[1, 0, 0, 0], [0, 1, 0, 0], [3, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     pull = [[-9.8, 1.0], [1.0, -9.8], [1.6, 0.0], [-0.5, 0.0], [0.0, -0.5]]
@@ -49,5 +49,5 @@ def two_joints(form: str = "response") -> TrackingDesign:
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
     return design_state_funnel(
-        SampledTracking(model, policy, feedback, assumption=assumption(form, BOUND))
+        SampledTracking(model, policy, feedback, assumption=assumption(BOUND))
     )

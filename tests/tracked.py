@@ -67,22 +67,17 @@ def tracked(goal: float = 0.4) -> Tracked:
     return Tracked(model, track(model, x, u, feedback), feedback)
 
 
-RATES = {"energy": (1.0, 60.0), "fading": (0.99, 90.0)}  # rate and gain, of this loop
-
-
-def assumption(form: str = "response", bound: float = BOUND) -> DisturbanceAssumption:
+def assumption(bound: float = BOUND) -> DisturbanceAssumption:
     """As measured on one commissioning run."""
-    rate, gain = RATES.get(form, (1.0, 1.0))
-    measured_on = (("drive", f"sha256:{2:064x}"),)
-    return DisturbanceAssumption(form, bound, 0.625 * bound, 1.5, measured_on, rate, gain)
+    return DisturbanceAssumption(bound, 0.625 * bound, 1.5, (("drive", f"sha256:{2:064x}"),))
 
 
 @cache
-def designed(form: str = "response", goal: float = 0.4) -> TrackingDesign:
+def designed(goal: float = 0.4) -> TrackingDesign:
     """The funnel around that motion."""
     base = tracked(goal)
     return design_state_funnel(
-        SampledTracking(base.model, base.policy, base.feedback, assumption=assumption(form))
+        SampledTracking(base.model, base.policy, base.feedback, assumption=assumption())
     )
 
 

@@ -54,9 +54,9 @@ class FunnelProblem:
 
     field: VectorField
     nominal: Nominal
+    goal: Goal
     Q: FloatArray | None = None
     R: FloatArray | None = None
-    goal: Goal | None = None
     shape: str = "rho"
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
@@ -65,7 +65,6 @@ class FunnelProblem:
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
-        goal = self.goal and {"centre": self.goal.centre.tolist(), "P": self.goal.P.tolist()}
         return {
             "format": FORMAT,
             "version": files.VERSION,
@@ -76,7 +75,7 @@ class FunnelProblem:
                 "x": self.nominal.x.control.tolist(),
                 "u": self.nominal.u.control.tolist(),
             },
-            "goal": goal,
+            "goal": {"centre": self.goal.centre.tolist(), "P": self.goal.P.tolist()},
             "Q": None if self.Q is None else self.Q.tolist(),
             "R": None if self.R is None else self.R.tolist(),
             "limits": self.limits.tolist(),
@@ -113,9 +112,9 @@ class FunnelProblem:
         return cls(
             field,
             Nominal(*parts),
+            _goal(document, field.n, source),
             _array(document, "Q", (field.n, field.n), source),
             _array(document, "R", (field.m, field.m), source),
-            _goal(document, field.n, source),
             files.member(words, "shape", str, source=source),
             _limits(document, source),
             hold,
@@ -179,11 +178,7 @@ def _limits(document: Json, source: str) -> FloatArray:
     return files.array(document, "limits", (len(rows), 3), source=source)
 
 
-def _goal(document: Json, n: int, source: str) -> Goal | None:
-    if "goal" not in document:
-        raise DocumentError(f"{source}: 'goal' is missing; null asks for the largest at the end")
-    if document["goal"] is None:
-        return None
+def _goal(document: Json, n: int, source: str) -> Goal:
     goal = files.member(document, "goal", dict, source=source)
     centre = files.array(goal, "centre", (n,), source=source)
     return Goal(np.array(centre), np.array(files.array(goal, "P", (n, n), source=source)))

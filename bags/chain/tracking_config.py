@@ -1,7 +1,7 @@
 """The YAML configuration of one robot's tracking funnel: from its recordings to its monitor."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
@@ -81,18 +81,11 @@ class MotionConfig(Section):
 class DisturbanceConfig(Section):
     """What is assumed of the disturbance."""
 
-    form: Annotated[
-        Literal["response", "peak", "energy", "fading"],
-        Key("of the assumption", example="fading"),
-    ] = "response"
     safety_factor: Annotated[
         float,
         Field(ge=1.0, allow_inf_nan=False),
         Key("over the largest of the commissioning runs", example=1.2),
     ] = 1.3
-    rate: Annotated[
-        float, Field(gt=0.0, le=1.0), Key("by which a fading assumption forgets a sample", "", 0.9)
-    ] = 1.0
 
 
 class SimulationConfig(Section):

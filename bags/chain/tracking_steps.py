@@ -20,7 +20,7 @@ from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress
-from nlsid_core.running.assumption import disturbance_of, meter_of
+from nlsid_core.running.assumption import DisturbanceMeter, disturbance_of
 
 
 def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path) -> StateFit:
@@ -68,16 +68,8 @@ def design_tracking_funnel(
     feedback = feedback_of(model, policy.x, policy.u, config)
     if not np.array_equal(feedback.K, policy.K):
         raise DataError("policy.json was made with other weights than this configuration's")
-    options, recorded = config.disturbance, read_signals_of(runs, config)
-    assumption = assume(
-        model,
-        policy,
-        feedback,
-        recorded,
-        form=options.form,
-        safety_factor=options.safety_factor,
-        rate=options.rate,
-    )
+    recorded, factor = read_signals_of(runs, config), config.disturbance.safety_factor
+    assumption = assume(model, policy, feedback, recorded, safety_factor=factor)
     problem = SampledTracking(model, policy, feedback, assumption)
     made = design(problem, progress=progress)
     made.save(folder)
@@ -93,7 +85,7 @@ def widest_start(made: TrackingDesign, runs: Dataset) -> float:
 
 def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
     """By fault, how many of these runs' copies that have it break the proof's assumption."""
-    meter = meter_of(made.funnel)
+    meter = DisturbanceMeter(made.funnel.S, made.funnel.A)
 
     def used(run: Trajectory) -> float:
         sizes = disturbance_of(made.model, made.policy, run, meter)

@@ -36,7 +36,7 @@ def funnel(bags: Sequence[Path], config: TrackingConfig, folder: Path) -> Tracki
     out.print(_widths_table(made))
     a = made.funnel.assumption
     out.print(
-        f"assumed: the disturbance's {a.form} is at most {a.bound:.4g}, {a.safety_factor:g} times "
+        f"assumed: the disturbance's response is at most {a.bound:.4g}, {a.safety_factor:g} times "
         f"the largest of {len(a.measured_on)} runs; the monitor watches it",
         soft_wrap=True,
     )

@@ -23,7 +23,7 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.kernel.files import read_regular
+from nlsid_core.kernel.checking import read_regular
 from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy

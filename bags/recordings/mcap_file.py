@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
@@ -37,8 +36,7 @@ from bags.recordings.mcap_records import (
     rest_said,
     uncompressed,
     unpack,
-    walk_declared,
-    walk_messages,
+    walk_chunk,
 )
 from bags.recordings.mcap_summary import summarised
 from bags.recordings.remote import RemotePath, place
@@ -162,8 +160,7 @@ class McapFile:
     ) -> dict[int, IntArray]:
         """Where the messages of each channel begin, by the block's index if it has one."""
         if block.index is None:
-            walked = walk_messages(content)
-            return {c: np.array(found, dtype=np.int64) for c, found in walked.items()}
+            return walk_chunk(content)[1]
         where = f"the message index of the chunk at byte {block.offset}"
         wanted = [c for c in channels if c in block.index]
         return {c: index_entries(self._read(*block.index[c]), c, where) for c in wanted}
@@ -331,15 +328,15 @@ class McapFile:
     def _declared_in(self, block: Block) -> tuple[dict[int, int], int]:
         """Note the schemas and channels a block declares; each channel's messages, first time."""
         content = self.content(block)
-        for record in walk_declared(content):
+        declared, walked = walk_chunk(content)
+        for record in declared:
             self.contents.declared.add(record)
-        walked, where = walk_messages(content), f"the block at byte {block.offset}"
+        where = f"the block at byte {block.offset}"
         starts = [
-            int(messages_at(content, np.array(at, np.int64), channel_id, where).log_ns.min())
-            for channel_id, at in walked.items()
+            int(messages_at(content, at, channel, where).log_ns.min())
+            for channel, at in walked.items()
         ]
-        counts = {channel_id: len(at) for channel_id, at in walked.items()}
-        return counts, min(starts, default=0)
+        return {channel: len(at) for channel, at in walked.items()}, min(starts, default=0)
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""

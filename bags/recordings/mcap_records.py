@@ -150,24 +150,21 @@ def walk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
         at = end
 
 
-def walk_messages(content: bytes) -> dict[int, list[int]]:
-    """Channel -> offsets of its message records in a chunk without an index."""
+def walk_chunk(content: bytes) -> tuple[list[Schema | Channel], dict[int, IntArray]]:
+    """What a chunk declares, and each channel's message records, as offsets, without an index."""
+    declared: list[Schema | Channel] = []
     found: dict[int, list[int]] = {}
     for opcode, at, end in walk_records(content):
-        if opcode == Opcode.MESSAGE:
+        if opcode == Opcode.SCHEMA:
+            declared.append(parse(Schema.read, content[at + RECORD.size : end]))
+        elif opcode == Opcode.CHANNEL:
+            declared.append(parse(Channel.read, content[at + RECORD.size : end]))
+        elif opcode == Opcode.MESSAGE:
             if end - at < MESSAGE.itemsize:
                 raise BagError(f"a message record of {end - at} bytes")
             channel = int.from_bytes(content[at + RECORD.size : at + RECORD.size + 2], "little")
             found.setdefault(channel, []).append(at)
-    return found
-
-
-def walk_declared(content: bytes) -> Iterator[Schema | Channel]:
-    """The schemas and channels declared in a chunk."""
-    readers = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read}
-    for opcode, at, end in walk_records(content):
-        if opcode in readers:
-            yield parse(readers[Opcode(opcode)], content[at + RECORD.size : end])
+    return declared, {channel: np.array(at, np.int64) for channel, at in found.items()}
 
 
 def rest_said(rest: int) -> str:

@@ -1,4 +1,4 @@
-"""`SignalVector`: several signals of one topic, read and written as one vector."""
+"""`SignalVector`: several signals of one topic, read as one vector."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -48,8 +48,3 @@ class SignalVector:
     def value(self, message: Any) -> FloatArray:
         """The numbers in a decoded message; BagError as `SignalPath.value`."""
         return np.array([path.value(message) for path in self.paths])
-
-    def assign(self, message: Any, values: FloatArray) -> None:
-        """Put the numbers in a decoded message; BagError as `SignalPath.assign`."""
-        for path, value in zip(self.paths, values, strict=True):
-            path.assign(message, float(value))

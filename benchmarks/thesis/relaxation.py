@@ -40,7 +40,7 @@ def sample_funnel(
     dynamics: VectorField | Callable[..., Any],
     nominal: Nominal,
     *,
-    goal: Goal | ArrayLike | None = None,
+    goal: Goal | ArrayLike,
     policy: ContinuousPolicy | None = None,
     samples: int = 4,
     Q: ArrayLike | None = None,

@@ -7,38 +7,28 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.factor import rounding_of
 from nlsid_core.funnels.tube import FORMAT
 
 KIND = "sampled"
 _AXES = {"S": 3, "A": 3, "tube": 1, "inlet": 1, "half_widths": 2, "roots": 1}
-FORMS = ("response", "peak", "energy", "fading")  # how the disturbance is bounded
+FORM = "response"  # how the disturbance is bounded; the format has others, nothing makes them
 
 
 @dataclass(frozen=True)
 class DisturbanceAssumption:
     """What the tube rests on: d_k = x̂_{k+1} - f(x̂_k, u_k), the observer's correction, stays small.
 
-    form `response`: r_{k+1} = A_k r_k + d_k, r_0 = 0, and |S_k r_k| ≤ bound. `peak`:
-    |S_{k+1} d_k| ≤ bound. `energy` and `fading`: E_{k+1} = rate·E_k + gain·|S_{k+1} d_k|²,
-    E_0 = 0, and √E_k ≤ bound; rate is 1 for `energy`, below 1 for `fading`. bound ≥ safety_factor ·
-    measured, measured being the largest over the commissioning runs `measured_on` (name, digest),
-    none of which the model was fitted on.
+    r_{k+1} = A_k r_k + d_k, r_0 = 0, and |S_k r_k| ≤ bound. bound ≥ safety_factor · measured,
+    measured being the largest over the commissioning runs `measured_on` (name, digest), none of
+    which the model was fitted on.
     """
 
-    form: str
     bound: float
     measured: float
     safety_factor: float
     measured_on: tuple[tuple[str, str], ...]
-    rate: float = 1.0
-    gain: float = 1.0
-
-    @property
-    def widens(self) -> float:
-        """What is added to a radius for it: the bound, but for `peak`, which is in the radius."""
-        return 0.0 if self.form == "peak" else self.bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +37,11 @@ class SampledFunnel:
 
     S: (N + 1, n, n), upper triangular, S'S the shape. A: (N, n, n), of the disturbance's response.
     tube: (N + 1,) radii of what starts with |S_0 x̄_0| ≤ tube_0 do; inlet: (N + 1,) radii from
-    which the goal inlet_N is reached. Unless the form is `peak` the radius is tube + bound. Radii
-    are in the norm of S, without unit. half_widths: (N + 1, n) the largest |x̄_i| in the tube, in
-    the signals' units, rounded up; they are part of what is proved. roots, of an implicit model
-    only: (N + 1,), at sample k + 1 the next rates v are claimed to be within
-    |S_vv (v - v_{k+1})| ≤ roots_{k+1}, S_vv the block of the rates; farther ones are spurious.
-    `model` and `policy` are digests.
+    which the goal inlet_N is reached. The radius is tube + the assumption's bound. Radii are in the
+    norm of S, without unit. half_widths: (N + 1, n) the largest |x̄_i| in the tube, in the signals'
+    units, rounded up; they are part of what is proved. roots, of an implicit model only: (N + 1,),
+    at sample k + 1 the next rates v are claimed to be within |S_vv (v - v_{k+1})| ≤ roots_{k+1},
+    S_vv the block of the rates; farther ones are spurious. `model` and `policy` are digests.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -91,8 +80,8 @@ class SampledFunnel:
                 raise DataError(f"funnel: roots should be {length} positive radii")
         if not ((self.tube > 0).all() and (self.inlet > 0).all() and self.tube[0] <= self.inlet[0]):
             raise DataError("funnel: radii should be positive, and the tube start in the inlet")
-        if self.assumption.form not in FORMS or self.assumption.bound < 0:
-            raise DataError(f"funnel: unknown form '{self.assumption.form}' or negative bound")
+        if self.assumption.bound < 0:
+            raise DataError(f"funnel: the assumption's bound is {self.assumption.bound}")
 
     def __len__(self) -> int:
         """The number of steps N."""
@@ -106,7 +95,7 @@ class SampledFunnel:
     @property
     def margin(self) -> float:
         """What the disturbance adds to a radius."""
-        return self.assumption.widens
+        return self.assumption.bound
 
     @property
     def made_for(self) -> tuple[str, str]:
@@ -148,14 +137,14 @@ class SampledFunnel:
             "format": FORMAT,
             "version": files.VERSION,
             "kind": KIND,
-            "set": "|S[k] (xhat - x[k])| <= tube[k] (+ bound, unless form peak)",
+            "set": "|S[k] (xhat - x[k])| <= tube[k] + bound",
             "model": self.model,
             "policy": self.policy,
             "assumption": {
-                "form": a.form,
+                "form": FORM,
                 "bound": a.bound,
-                "rate": a.rate,
-                "gain": a.gain,
+                "rate": 1.0,
+                "gain": 1.0,
                 "measured": a.measured,
                 "safety_factor": a.safety_factor,
                 "measured_on": [{"name": n, "digest": d} for n, d in a.measured_on],
@@ -174,6 +163,8 @@ class SampledFunnel:
         files.header(document, FORMAT, source=source, kind=KIND)
         nested = files.member(document, "assumption", dict, source=source)
         where = f"{source} assumption"
+        if (form := files.member(nested, "form", str, source=where)) != FORM:
+            raise DocumentError(f"{where}: form is '{form}'; known: {FORM}")
         runs = files.member(nested, "measured_on", list, source=where)
         arrays = {
             key: files.array(document, key, (None,) * axes, source=source)
@@ -182,10 +173,7 @@ class SampledFunnel:
         }
         return cls(
             assumption=DisturbanceAssumption(
-                form=files.member(nested, "form", str, source=where),
                 bound=files.number(nested, "bound", source=where),
-                rate=files.number(nested, "rate", source=where),
-                gain=files.number(nested, "gain", source=where),
                 measured=files.number(nested, "measured", source=where),
                 safety_factor=files.number(nested, "safety_factor", source=where),
                 measured_on=tuple(files.named_digests(runs, source=where)),

@@ -14,9 +14,9 @@ from statistics import NormalDist
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
+from nlsid_core.identification.validation import cross_correlation
 
 LEVEL = 1e-4  # probability of calling repeats different when they are not, per pair
 INPUT_TOLERANCE = 0.05  # difference of the inputs over their spread: more is another excitation
@@ -75,34 +75,12 @@ def compare_repeats(first: Trajectory, second: Trajectory, *, transient: int = 0
         raise DataError(f"{first.name}: a constant excitation; repeats of it cannot be compared")
     input_difference = float(np.max(np.sqrt(np.mean((u - other) ** 2, axis=0)) / spread))
     difference = first.y[rows] - second.y[rows]
-    correlation, lag = 0.0, 0
-    for d in difference.T:
-        for excitation in ((u + other) / 2).T:
-            scores = correlation_scores(d, excitation)
-            at = int(np.argmax(np.abs(scores)))
-            if abs(scores[at]) > correlation:
-                correlation, lag = float(abs(scores[at])), at - LAGS
-    comparisons = (2 * LAGS + 1) * u.shape[1] * difference.shape[1]
-    limit = NormalDist().inv_cdf(1.0 - LEVEL / (2.0 * comparisons))
+    crossed, deviation = cross_correlation([difference], [(u + other) / 2], LAGS)
+    scores = np.abs(crossed) / deviation[:, :, None]
+    lag = int(np.argmax(scores.max(axis=(0, 1)))) - LAGS
+    limit = NormalDist().inv_cdf(1.0 - LEVEL / (2.0 * scores.size))
+    correlation = float(scores.max())
     return RepeatTest(first.name, second.name, input_difference, correlation, lag, limit)
-
-
-def correlation_scores(d: FloatArray, u: FloatArray) -> FloatArray:
-    """(2·LAGS + 1,) correlations of d(t) with u(t - lag), lag = -LAGS …, in standard deviations."""
-    N = len(d)
-    d, u = d - d.mean(), u - u.mean()
-    if not d.any():
-        return np.zeros(2 * LAGS + 1)
-    size = 1 << (2 * N - 1).bit_length()
-    D, U = np.fft.rfft(d, size), np.fft.rfft(u, size)
-    crossed = np.fft.irfft(D * U.conj(), size)
-    own = [np.fft.irfft(np.abs(X) ** 2, size)[:N] for X in (D, U)]
-    horizon = max(LAGS, N // 4)  # autocorrelations beyond have too few products
-    rho = [r[: horizon + 1] / r[0] for r in own]
-    variance = (1.0 + 2.0 * float(rho[0][1:] @ rho[1][1:])) / N
-    variance = max(variance, 1.0 / N)
-    lags = np.r_[crossed[-LAGS:], crossed[: LAGS + 1]]
-    return np.asarray(lags / np.sqrt(own[0][0] * own[1][0] * variance))
 
 
 def refuse_false_repeats(data: Dataset, *, transient: int = 0) -> tuple[RepeatTest, ...]:

@@ -209,7 +209,7 @@ def residual_tests(
             for i in range(n_y)
         ]
     )
-    cross, deviation = _cross(residuals, inputs, lags)
+    cross, deviation = cross_correlation(residuals, inputs, lags)
     largest = np.max(np.abs(cross[:, :, lags:]), axis=2) / deviation
     chance = (1.0 - CONFIDENCE) / (lags + 1)
     return Residual(
@@ -307,7 +307,7 @@ def _correlation(first: list[FloatArray], second: list[FloatArray], lags: int) -
     return total / scale if scale > 0.0 else total
 
 
-def _cross(
+def cross_correlation(
     residuals: Sequence[FloatArray], inputs: Sequence[FloatArray], lags: int
 ) -> tuple[FloatArray, FloatArray]:
     """Correlations (n_y, n_u, 2·lags + 1) and their standard deviations (n_y, n_u)."""

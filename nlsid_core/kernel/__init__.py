@@ -9,8 +9,8 @@ Read in this order: `files` (untrusted input), `exact` (definite matrices), `pol
 `positivity` (positive polynomials), then the claims, each a module with one `decide`.
 """
 
-from .checking import KINDS, LEFT, check, decide
-from .files import REASONS, Rejected
+from .checking import KINDS, LEFT, REASONS, check, decide
+from .files import Rejected
 from .text import Verdict
 
 __all__ = ["KINDS", "LEFT", "REASONS", "Rejected", "Verdict", "check", "decide"]

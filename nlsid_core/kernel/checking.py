@@ -1,12 +1,14 @@
 """`check`: a proof file in, a verdict out, or `Rejected` with the reason."""
 
 import os
+import stat
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from .files import (
+    MAX_BYTES,
     MAX_TOTAL,
     Node,
     Read,
@@ -16,7 +18,6 @@ from .files import (
     limit,
     parse,
     plain,
-    read_regular,
     refuse_if,
 )
 from .text import Verdict
@@ -40,6 +41,22 @@ LEFT = (
     "falsification",
 )
 
+# Why a proof is refused: the code of each "no".
+REASONS = {
+    "malformed": "a file is not as its page says",
+    "too_large": "a stated limit on sizes is exceeded, or memory",
+    "too_long": "it takes more processor time than is allowed",
+    "mismatch": "a file is not the one that the proof is about",
+    "unknown": "the kind of claim is not known",
+    "left": "the kind of claim, or the version of the file, is not decided any more",
+    "not_definite": "a matrix is not positive definite, or semidefinite",
+    "not_positive": "a polynomial is not shown to be positive",
+    "not_below": "a number exceeds its bound",
+    "not_covered": "a piece, a vertex or a mode is missing",
+    "not_valid": "the claim leaves where its model or equations hold",
+    "not_decided": "the kernel met what it did not expect",
+}
+
 
 def check(path: str | os.PathLike[str]) -> Verdict:
     """Decide the proof file at `path` about the files beside it.
@@ -51,14 +68,25 @@ def check(path: str | os.PathLike[str]) -> Verdict:
     return decide(read_regular(Path(path)), lambda name: read_regular(folder / name))
 
 
+def read_regular(path: Path) -> bytes:
+    """A regular file's bytes; OSError for anything else, Rejected if it is too large."""
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with os.fdopen(handle, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise OSError(0, "not a regular file", str(path))
+        content = stream.read(MAX_BYTES + 1)
+    limit(len(content), MAX_BYTES, f"{plain(path.name)}: bytes")
+    return content
+
+
 def decide(content: bytes, read: Read) -> Verdict:
     """Decide a proof's bytes; `read` gives those of the files it names. Raises Rejected."""
-    total, files = len(content), {}
+    sizes, files = [len(content)], {}
 
     def limited(name: str) -> bytes:
-        nonlocal total
         found = read(name)
-        total = limit(total + len(found), MAX_TOTAL, "bytes of all files of the claim")
+        sizes.append(len(found))
+        limit(sum(sizes), MAX_TOTAL, "bytes of all files of the claim")
         files[name] = digest(found)
         return found
 

@@ -1,10 +1,8 @@
 """A closed loop around its nominal, and what holding and mismeasuring an input changes in it.
 
 On a part of an interval it is polynomials in x̄, and in s on it, with numbers in the place of w and
-of δ, what the input is off: u = clip(ũ) + δ, |δ_i| <= W_i. A held input is the policy's of some
-time at most a period ago. Pieces of rates show that |dũ_i/dt| < R_i in the funnel, so it is off by
-the period times R at most, and an error e of the state by |Ke| more. Why that is enough: "The hold
-between samples" in docs/theory-funnels.md.
+of δ, what the input is off: u = clip(ũ) + δ, |δ_i| <= W_i. Pieces of rates show |dũ_i/dt| < R_i in
+the funnel. Why that is enough: "The hold between samples" in docs/theory-funnels.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -82,11 +80,9 @@ class ClosedLoop:
 
     def taken(self, taus: Node, held: list[Polynomial], sides: Node) -> list[Polynomial]:
         """-τ q for everything that is nonnegative here, τ sums of squares in `sides`."""
-        found = []
-        for node, q in zip(taus.items(len(held), len(held)), held, strict=True):
-            tau = read_squares(node.members("columns squares") | {"basis": sides}, self.ring)
-            found.append(-1 * (expanded(tau, self.ring) * q))
-        return found
+        pairs = zip(taus.items(len(held), len(held)), held, strict=True)
+        read = ((node.members("columns squares") | {"basis": sides}, q) for node, q in pairs)
+        return [-1 * (expanded(tau, self.ring) * q) for tau, q in read]
 
     def _gains(self, i: int) -> list[list[Fraction]]:
         """Control points of row i of K."""

@@ -1,15 +1,10 @@
 """Claim: {x : |x - x₀(t)|²_{P(t)} <= ρ(t)} is a funnel of ẋ = f(t, x, u, w), for every t and w.
 
 With x̄ = x - x₀, W = x̄'Px̄ and s in [0, 1] along an interval of length h between knots, on which P
-and ρ are linear, every piece [index, index + 1] / 2^level of every interval has to show
-    c(s, x̄) = dρ/ds - dW/ds - margin h ρ + μ (ρ - W) - Σ_l τ_l q_l > 0,
-    dW/ds = 2x̄'P(h f - dx₀/ds) + x̄'(dP/ds)x̄,
-for every x̄: then V = W/ρ falls by margin or more, in 1/s, where V = 1 (thesis (5.5), Lemma 5.2).
-f is affine in each entry of w, so a vertex of its box each is enough; or, where w only pushes, with
-ẋ = ... + Gw, h |2x̄'Pg| r <= h r (κ(x̄'Pg)² + 1/κ) is added for each w instead, r half its range.
-Where u = clip(ũ), ũ = u₀ - Kx̄, each clipped input is free, low or high; τ_l >= 0 multiplies
-q_l >= 0 of that mode. Where the input is held, it is clip(ũ) + δ: every corner of δ's box is a case
-as every vertex of w is. Why that is enough: docs/certificate_continuous_funnel.md.
+and ρ are linear, every piece of time, vertex of w's box, and mode of clipped inputs has to show
+    c(s, x̄) = dρ/ds - dW/ds - margin h ρ + μ (ρ - W) - Σ_l τ_l q_l > 0
+for every x̄: then V = W/ρ falls by margin or more, in 1/s, where V = 1. A corner of the box of δ,
+what a held input is off, is a case as a vertex is. docs/certificate_continuous_funnel.md, 1. to 8.
 """
 
 from collections.abc import Iterable, Sequence
@@ -52,16 +47,11 @@ def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[text.Verdict, M
     parts = claim.members("kind about", "goal hold error")
     documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
     motion = read_motion(documents, digests)
-    table: Table = {"basis": itself, "multiplier": itself, "pieces": itself, "margin": ()}
-    if "goal" in parts:
-        table["goal_multiplier"] = ()
-    if "hold" in parts:
-        table |= {"rates": itself, "rate_pieces": itself}
-    if "hold" in parts or motion.limits:
-        table["sides"] = itself
-    if motion.box:
-        table["kappa?"] = itself
-    stated = proof.read(table)
+    held = "hold" in parts
+    names = "basis multiplier pieces" + " rates rate_pieces" * held
+    names += " sides" * bool(held or motion.limits) + " kappa?" * bool(motion.box)
+    ends: Table = {"margin": (), **({"goal_multiplier": ()} if "goal" in parts else {})}
+    stated = proof.read({**ends, **dict.fromkeys(names.split(), itself)})
     proof.require({"the margin should be positive": stated["margin"] > 0}, "not_below")
     read_hold(claim, stated, motion)
 
@@ -114,11 +104,8 @@ def _decide_valid(motion: Motion) -> None:
     """x and the input stay where the equations are valid.
 
     |g'x̄| <= d wherever W <= ρ if ρ g'P⁻¹g <= d², so if d²P - ρgg' ⪰ 0, which holds between knots if
-    it does at them. A state has to stay away from its bounds, so that the equations hold around it;
-    an input may reach them. A held input is within W of clip(ũ), and within the limits.
-    Centres and gains between knots are convex combinations of their control points. A limit within
-    the bounds keeps its side by itself. Of another side the other limit has to be W away: it is the
-    input where ũ is beyond it, and a held one may be from before these bounds began.
+    it does at them. A state stays away from its bounds; an input may reach them. A limit within the
+    bounds keeps its side by itself; of another side the other limit has to be W away (page, 4.).
     """
     n = motion.n
     for k, entries in enumerate(motion.bounds):

@@ -6,15 +6,12 @@ changed digit goes unnoticed. Numbers arrive as `int` or `Fraction`, never as `f
 
 import hashlib
 import json
-import os
 import re
-import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from math import lcm
-from pathlib import Path
 from typing import Any, TypeAlias
 
 MAX_BYTES = 32 * 2**20  # of one file; real proofs are a few MB
@@ -38,22 +35,6 @@ NOTHING: dict[str, str] = {}
 Terms = list[tuple[bytes, Fraction]]
 
 RATIONAL = re.compile(rf"-?[0-9]{{1,{MAX_DIGITS}}}(/(?!0+$)[0-9]{{1,{MAX_DIGITS}}})?")
-
-# Why a proof is refused: the code of each "no".
-REASONS = {
-    "malformed": "a file is not as its page says",
-    "too_large": "a stated limit on sizes is exceeded, or memory",
-    "too_long": "it takes more processor time than is allowed",
-    "mismatch": "a file is not the one that the proof is about",
-    "unknown": "the kind of claim is not known",
-    "left": "the kind of claim, or the version of the file, is not decided any more",
-    "not_definite": "a matrix is not positive definite, or semidefinite",
-    "not_positive": "a polynomial is not shown to be positive",
-    "not_below": "a number exceeds its bound",
-    "not_covered": "a piece, a vertex or a mode is missing",
-    "not_valid": "the claim leaves where its model or equations hold",
-    "not_decided": "the kernel met what it did not expect",
-}
 
 
 class Rejected(Exception):  # noqa: N818 - a verdict
@@ -99,7 +80,7 @@ class Node:
         wanted, allowed = required.split(), optional.split()
         self.require({"should be an object": type(self.value) is dict})
         missing = {f"'{name}' is missing": False for name in wanted if name not in self.value}
-        others = [name for name in self.value if name not in (*wanted, *allowed)]
+        others = sorted(set(self.value).difference(wanted, allowed))
         self.require(missing | {f"unknown member {plain(name)!r}": False for name in others})
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
@@ -301,17 +282,6 @@ def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], d
         refuse_if(digests[role] != stated["digest"], other, "mismatch")
         documents[role] = parse(content, role)
     return documents, digests
-
-
-def read_regular(path: Path) -> bytes:
-    """A regular file's bytes; OSError for anything else, Rejected if it is too large."""
-    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    with os.fdopen(handle, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OSError(0, "not a regular file", str(path))
-        content = stream.read(MAX_BYTES + 1)
-    limit(len(content), MAX_BYTES, f"{plain(path.name)}: bytes")
-    return content
 
 
 def plain(text: str) -> str:

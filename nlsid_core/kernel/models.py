@@ -16,7 +16,7 @@ from typing import Any
 
 from . import text
 from .exact import Matrix, identity, unit
-from .files import Node, Table, Terms, each, itself, limit, one_of, refuse_if
+from .files import Node, Table, each, itself, limit, one_of, refuse_if
 from .implicit_models import derivative, read_implicit
 from .increments import MAX_POWER, Box, Entries, Hull, Linear, Model
 from .signals import ranges, read_signal, signals
@@ -163,7 +163,8 @@ def _read_recorded_implicit(node: Node, bounds: Node | None) -> Model:
     slopes = [[derivative(row, j) for j in range(n)] for row in shift]
     linear = not any(any(e) for row in slopes for entry in row for e, _ in entry)
     node.require({"the shift should be linear in the states": linear})
-    F = identity(p + n)[:p] + [[ZERO] * p + [_constant(entry) for entry in row] for row in slopes]
+    rows = [[sum((c for _, c in entry), ZERO) for entry in row] for row in slopes]
+    F = identity(p + n)[:p] + [[ZERO] * p + row for row in rows]
 
     E = [[derivative(row, j) for j in range(p + n)] for row in model["h"]]
     powers = [e for row in E for entry in row for e, _ in entry]
@@ -201,10 +202,6 @@ def _pointed(E: Entries) -> Hull | None:
         return None
     least = a - b**2 / (4 * c)
     return Hull([[[(bytes(len(slope[0][0])), least)], *lags]], ray=True)
-
-
-def _constant(p: Terms) -> Fraction:
-    return sum((c for _, c in p), ZERO)
 
 
 def _require_window(window: Any, inputs: int, delays: int | None, node: Node) -> None:

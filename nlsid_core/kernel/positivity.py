@@ -2,13 +2,9 @@
 
 The witness states monomials v of x, a power of two `columns[k]` for each, and whole factors R_j:
     scale · c(s, x) = Σ_j B_j(s) Σ_i weights[i] (R_j[i] · V v)² / 4^unit + r(s, x),
-B_j the Bernstein polynomials of degree (number of factors - 1), V = diag 2^columns. r is not
-stated: it is the difference. In Bernstein form of degree D, r = Σ_k b_k(x) s^k (1-s)^(D-k), and
-each b_k has to be diagonally dominant in V v: a square of a monomial of v counts on the diagonal;
-any other monomial is charged, by halves of its size, to a pair of v whose product it is, the first
-of those with the largest powers of two.
-So c >= Σ_i left[i] v_i², left[i] >= 0 being the least that any b_k leaves on the diagonal: c > 0
-if something is left for the monomial 1.
+B_j Bernstein polynomials, V = diag 2^columns. r is the difference: each of its Bernstein
+coefficients in s has to be diagonally dominant in V v, so c >= Σ_i left[i] v_i² with the least that
+is left on the diagonal: c > 0 if something is left for the monomial 1. docs/certificate.md.
 """
 
 from collections.abc import Mapping
@@ -62,15 +58,16 @@ def powers_of_two(node: Node, size: int) -> list[int]:
     return shifts
 
 
-def expanded(squares: Squares, ring: Ring) -> Polynomial:
-    """The squares as a polynomial in s and x: a multiplier that is never negative."""
-    parts, J = [], len(squares.grams) - 1
+def expanded(parts: Mapping[str, Node], ring: Ring) -> Polynomial:
+    """Squares that are stated as a polynomial in s and x: a multiplier that is never negative."""
+    squares = read_squares(parts, ring)
+    summands, J = [], len(squares.grams) - 1
     for j, gram in enumerate(squares.grams):
         norm = sum(map(abs, gram.values()))
         constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, norm)
         basis = ring.bernstein([Fraction(i == j) for i in range(J + 1)])
-        parts.append((squares.weight, basis * constants))
-    return ring.weighted(parts)
+        summands.append((squares.weight, basis * constants))
+    return ring.weighted(summands)
 
 
 def positive(

@@ -103,8 +103,8 @@ def _prove_chain(
 
 def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polynomial:
     """-σ (radius² - size), σ a sum of squares: not positive where size <= radius²."""
-    squares = read_squares(node.members("columns squares") | {"basis": basis}, size.ring)
-    return expanded(squares, size.ring) * (size - radius**2)
+    stated = node.members("columns squares") | {"basis": basis}
+    return expanded(stated, size.ring) * (size - radius**2)
 
 
 def _equations(node: Node, basis: Node, h: list[Polynomial]) -> list[Polynomial]:

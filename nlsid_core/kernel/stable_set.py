@@ -88,7 +88,7 @@ def _positive_on(c: Polynomial, domain: Vector, parts: Mapping[str, Node], what:
     for entry in parts["multipliers"].items(0, len(domain)) if "multipliers" in parts else []:
         members = entry.members(f"of {WITNESS}")
         last = members["of"].whole(last + 1, len(domain) - 1)
-        terms.append(-1 * (expanded(read_squares(members, c.ring), c.ring) * domain[last]))
+        terms.append(-1 * (expanded(members, c.ring) * domain[last]))
     remainder(c.ring.sum(terms), read_squares(parts, c.ring), c.ring, what)
 
 

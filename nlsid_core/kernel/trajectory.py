@@ -80,7 +80,7 @@ def _read_field(node: Node, motion: Motion) -> None:
     given = node.document("vector_field", table)
     n, m, box, breaks = motion.n, motion.m, given["uncertain"], given["breaks"]
     count, first, sizes = len(breaks) + 1, 1 + n + m, (given["states"], given["inputs"])
-    knots = {*motion.t}.issuperset(t for t in breaks if motion.t[0] < t < motion.t[-1])
+    knots = all(t in motion.t for t in breaks if motion.t[0] < t < motion.t[-1])
     node.require(
         {
             "other states and inputs than the policy's": sizes == (n, m),

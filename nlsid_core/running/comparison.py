@@ -21,7 +21,7 @@ from nlsid_core.models import DifferenceEquation
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
-from nlsid_core.running.assumption import meter_of
+from nlsid_core.running.assumption import DisturbanceMeter
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Level, unsaid
 from nlsid_core.running.stage import Stage
@@ -202,10 +202,9 @@ class SampledComparison:
         refuse_unmonitorable(funnel)
         refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
         self.period, self.last = model.period, funnel.last
-        a = funnel.assumption
-        self.assuming = f"the disturbance's {a.form} ≤ {a.bound:.4g}"
+        self.assuming = f"the disturbance's response ≤ {funnel.assumption.bound:.4g}"
         self.over = f"{len(policy) * model.period:g} s"
-        self._meter = meter_of(funnel)
+        self._meter = DisturbanceMeter(funnel.S, funnel.A)
         self._up = 1.0 + float(np.max(funnel.rounding))  # no size is below its exact value
         self.restart()
 
@@ -258,7 +257,7 @@ class SampledComparison:
             return f"the model's step ended at a root beyond the proved ones at t = {t:g} s"
         if not disturbance <= a.bound:
             return (
-                f"disturbance {a.form} {disturbance:.4g} above the assumed {a.bound:.4g} "
+                f"disturbance response {disturbance:.4g} above the assumed {a.bound:.4g} "
                 f"at t = {t:g} s"
             )
         if u is None or k > self._policy.last:

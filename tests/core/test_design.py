@@ -186,4 +186,4 @@ def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesi
 def test_a_continuous_problem_names_what_it_knows(options: dict[str, Any], reason: str) -> None:
     at_rest = integrate_nominal(lambda x: -x, lambda _: [], t=[0.0, 1.0], start=[0.0])
     with pytest.raises(OptionError, match=reason):
-        ContinuousTracking(lambda x: -x, at_rest, **options)
+        ContinuousTracking(lambda x: -x, at_rest, goal=[1.0], **options)

@@ -46,7 +46,7 @@ def random_policy(gain: str, n: int = 3, m: int = 2, knots: int = 6) -> Continuo
 
 def discrete_documents() -> dict[str, Any]:
     """The other kinds of funnels and policies."""
-    assumption = DisturbanceAssumption("response", 0.2, 0.1, 2.0, (("run", "sha256:0"),))
+    assumption = DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),))
     two = np.array([np.eye(2)] * 3)
     ones, trial = np.ones(1), (("trial", "sha256:1"),)
     tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, 1.0, 2.0, (), trial)

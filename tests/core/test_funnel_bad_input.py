@@ -18,7 +18,7 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
-from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
+from nlsid_core.errors import DataError, NlsidError, NotPolynomial, OptionError
 from tests.marks import slow_among
 
 KNOTS = 9
@@ -38,14 +38,15 @@ def hanging() -> tuple[VectorField, Nominal]:
 def fair() -> Json:
     """A problem with nothing wrong."""
     goal = Goal(np.zeros(2), 20 * np.eye(2))
-    return FunnelProblem(*hanging(), np.eye(2), np.eye(1), goal).document()
+    return FunnelProblem(*hanging(), goal, np.eye(2), np.eye(1)).document()
 
 
-def other(field: VectorField, **options: Any) -> Json:
-    """A problem of other dynamics, at rest, without a goal unless given."""
+def other(field: VectorField) -> Json:
+    """A problem of other dynamics, at rest."""
     t = np.linspace(0, 1, 5)
     rest = integrate_nominal(field, lambda _: np.zeros(field.m), t=t, start=np.zeros(field.n))
-    return FunnelProblem(field, rest, np.eye(field.n), np.eye(field.m), **options).document()
+    goal = Goal(np.zeros(field.n), np.eye(field.n))
+    return FunnelProblem(field, rest, goal, np.eye(field.n), np.eye(field.m)).document()
 
 
 def nominal_bent(problem: Json) -> Json:
@@ -70,12 +71,6 @@ def goal_indefinite(problem: Json) -> Json:
 
 def a_search_that_no_file_chooses(problem: Json) -> Json:
     return problem | {"search": "alternation"}
-
-
-def uncontrollable(problem: Json) -> Json:
-    del problem
-    field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
-    return other(field)
 
 
 def state_weight_indefinite(problem: Json) -> Json:
@@ -103,7 +98,7 @@ def broken_power(problem: Json) -> Json:
 def degree_too_high(problem: Json) -> Json:
     del problem
     field = VectorField.from_function(lambda x, u: np.array([u[0] - x[0] ** 7]), 1, 1)
-    return other(field, goal=Goal(np.zeros(1), np.eye(1)))
+    return other(field)
 
 
 def pushed_out(problem: Json) -> Json:
@@ -111,7 +106,7 @@ def pushed_out(problem: Json) -> Json:
     field = VectorField.from_function(
         lambda x, u, w: np.array([x[0] + 0 * u[0] + w[0]]), 1, 1, uncertain=[[-9, 9]]
     )
-    return other(field, goal=Goal(np.zeros(1), np.eye(1)))
+    return other(field)
 
 
 def knots_that_stand_still(problem: Json) -> Json:
@@ -135,7 +130,6 @@ CASES: list[tuple[Callable[[Json], Json], str]] = [
     (goal_elsewhere, r"the nominal ends outside the goal: \|x - centre\|² = 5 > 1"),
     (goal_indefinite, "the goal's matrix should be symmetric positive definite"),
     (a_search_that_no_file_chooses, "'search' is no member of a funnel problem; it has: .*shape"),
-    (uncontrollable, "cannot be stabilised by any gain .* it is uncontrollable"),
     (state_weight_indefinite, r"Q should be positive semidefinite; its smallest .* is -0\.5"),
     (input_weight_zero, "R should be positive definite; its smallest eigenvalue is 0"),
     (weight_not_symmetric, "Q should be a symmetric 2x2 matrix"),
@@ -248,8 +242,6 @@ def test_an_uncontrollable_linearisation_may_still_have_a_goal_and_a_riccati_sol
     field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
     t = np.linspace(0, 1, 5)
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=[0.0, 0.0])
-    with pytest.raises(Infeasible, match="uncontrollable"):
-        design_funnel(ContinuousTracking(field, nominal))
     assert tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).S.shape == (5, 2, 2)
 
 

@@ -371,7 +371,7 @@ def test_what_is_no_problem_is_not_designed() -> None:
 
 def test_a_design_without_a_motion_says_what_is_missing() -> None:
     with pytest.raises(DataError, match="nominal is None; it should be a Nominal"):
-        ContinuousTracking(pendulum, None)  # type: ignore[arg-type]
+        ContinuousTracking(pendulum, None, goal=[0.1, 0.1])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def overflowing() -> tuple[StateModel, SampledPolicy, SampledFunnel]:
         tube=radii,
         inlet=radii,
         half_widths=radii[:, None],
-        assumption=DisturbanceAssumption("peak", 1e9, 1.0, 1.5, (("run", "sha256:0"),)),
+        assumption=DisturbanceAssumption(1e-3, 1e-4, 1.5, (("run", "sha256:0"),)),
         model=digest,
         policy=files.digest(policy.document()),
     )
@@ -200,7 +200,7 @@ def test_a_disturbance_above_its_bound_by_less_than_rounding_is_not_kept() -> No
         for y in rng.uniform(0.9, 1.1, 100).tolist()
         if Fraction(S) * Fraction(y) > Fraction(S * y)
     )
-    assumed = DisturbanceAssumption("peak", S * y, 0.0, 1.5, ())
+    assumed = DisturbanceAssumption(S * y, 0.0, 1.5, ())
     for bound, status in ((S * y, Status.ASSUMPTION_VIOLATED), (S * y * 1.0001, Status.INSIDE)):
         narrow = replace(funnel, S=np.full((4, 1, 1), S), assumption=replace(assumed, bound=bound))
         monitor = Monitor([Stage(model, policy, narrow)])
@@ -227,7 +227,7 @@ def test_a_size_is_never_below_the_true_one_and_hardly_above(
         tube=radii,
         inlet=radii,
         half_widths=np.ones((2, n)),
-        assumption=DisturbanceAssumption("peak", 0.0, 0.0, 1.5, ()),
+        assumption=DisturbanceAssumption(0.0, 0.0, 1.5, ()),
         model="",
         policy="",
     )

@@ -9,10 +9,8 @@ import pytest
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.design import SampledTracking
-from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
-from nlsid_core.design.sampled.motion import tvlqr
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, Infeasible
+from nlsid_core.design.sampled.design import TrackingDesign
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.proofs import check
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -21,16 +19,15 @@ from tests import forged_tracking
 from tests.implicit_funnels import STEPS, designed
 from tests.implicit_pendulum import PERIOD, truth
 from tests.marks import slow_among
-from tests.tracked import assumption, resigned, step, write
+from tests.tracked import resigned, step, write
 
 ROLES = ("model", "policy", "funnel")
 
 
-@pytest.mark.parametrize("form", ["response", "peak"])
-def test_a_funnel_of_an_implicit_model_is_proved_exactly(form: str, tmp_path: Path) -> None:
-    verdict = check(write(designed(form), tmp_path))
+def test_a_funnel_of_an_implicit_model_is_proved_exactly(tmp_path: Path) -> None:
+    verdict = check(write(designed(), tmp_path))
     assert verdict.margin > 0
-    assert form in verdict.assumptions[0]
+    assert "response" in verdict.assumptions[0]
     assert "roots" in verdict.assumptions[2]
 
 
@@ -48,9 +45,8 @@ def test_the_reaches_of_an_implicit_model_are_tight_to_one_percent() -> None:
         assert 0.99 * reach < farthest <= reach
 
 
-@pytest.mark.parametrize("form", slow_among(["response", "peak"], {"peak"}))
-def test_the_worst_disturbance_of_an_implicit_model_stays_in_the_tube(form: str) -> None:
-    design = designed(form)
+def test_the_worst_disturbance_of_an_implicit_model_stays_in_the_tube() -> None:
+    design = designed()
     funnel, policy = design.funnel, design.policy
     rng = np.random.default_rng(2)
     closest = 0.0
@@ -62,9 +58,8 @@ def test_the_worst_disturbance_of_an_implicit_model_stays_in_the_tube(form: str)
             away = funnel.S[k + 1] @ (step(design, k, x) - policy.x[k + 1])
             worst = np.linalg.solve(funnel.S[k + 1], away / np.linalg.norm(away))
             d = 0.999 * funnel.assumption.bound * worst
-            if form == "response":
-                d = (1 if run % 2 else -1) * d - funnel.A[k] @ r
-                r = funnel.A[k] @ r + d
+            d = (1 if run % 2 else -1) * d - funnel.A[k] @ r
+            r = funnel.A[k] @ r + d
             x = step(design, k, x) + d
             size = float(np.linalg.norm(funnel.S[k + 1] @ (x - policy.x[k + 1])))
             assert size <= funnel.radius[k + 1]
@@ -82,9 +77,6 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         return resigned(design, funnel=replace(funnel, roots=1e4 * funnel.roots))
     if what in OF_EVERY_MODEL:
         return forged_tracking.forged(design, what)
-    if what == "a form that is not for implicit models":
-        other = replace(funnel.assumption, form="energy", gain=60.0)
-        return resigned(design, funnel=replace(funnel, assumption=other))
     if what == "another nominal":
         return resigned(design, policy=designed(goal=0.05).policy)
     if what == "another model":
@@ -133,7 +125,6 @@ FORGERIES = [
     *OF_EVERY_MODEL,
     "no bound on the roots",
     "a bound that lets spurious roots in",
-    "a form that is not for implicit models",
     "another nominal",
     "another model",
     "narrower data box",
@@ -181,13 +172,6 @@ def test_the_bound_on_the_roots_is_no_decoration(tmp_path: Path) -> None:
         files.write_document(tmp_path / name, document)
     with pytest.raises(CertificateRejected, match="should have shape"):
         check(tmp_path / "funnel.proof.json")
-
-
-def test_energy_is_refused_for_an_implicit_model_before_any_work() -> None:
-    design, a = designed(), assumption("energy")
-    feedback = tvlqr(design.model, design.policy.x, design.policy.u, input_weight=0.3)
-    with pytest.raises(Infeasible, match="response or peak"):
-        design_state_funnel(SampledTracking(design.model, design.policy, feedback, assumption=a))
 
 
 def test_the_monitor_flags_a_step_that_ends_at_a_root_beyond_the_proved_ones() -> None:

@@ -313,9 +313,9 @@ def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> No
     asked = FunnelProblem(
         field,
         still(field, 13, 0.3),
+        Goal(np.zeros(2), GOAL),
         pendulum.Q,
         pendulum.R,
-        Goal(np.zeros(2), GOAL),
         limits=np.array([[0, -LIMIT, LIMIT]]),
     )
     file = tmp_path / "problem.json"

@@ -110,13 +110,6 @@ def test_p_grows_beyond_rho_and_is_proved() -> None:
     assert np.min(P.found.proved.margins) > 0
 
 
-def test_only_dynamics_nominal_and_weights_are_needed() -> None:
-    field, nominal = hanging(9)
-    design = design_funnel(ContinuousTracking(damped, nominal, Q=np.eye(2), R=np.eye(1)))
-    assert np.min(design.found.proved.margins) > 0
-    assert design.model.document() == field.document()
-
-
 @pytest.mark.slow
 def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
     t = np.linspace(-1, 1, 401)
@@ -303,7 +296,7 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     field, nominal = hanging(9)
     goal = Goal(np.zeros(2), 20 * np.eye(2))
     problem_file = tmp_path / "problem.json"
-    asked = FunnelProblem(field, nominal, np.eye(2), np.eye(1), goal)
+    asked = FunnelProblem(field, nominal, goal, np.eye(2), np.eye(1))
     files.write_document(problem_file, asked.document())
     runner = CliRunner()
     made = runner.invoke(app, ["funnel", str(tmp_path), "--problem", str(problem_file)])

@@ -134,7 +134,7 @@ def _reached(setting: Setting, again: Again | None) -> Setting | None:
             return None
         if found.size < 1:
             steps.tightness = found.tightness
-            rho, _ = final_level(steps, policy, found.P, setting.goal, setting.expansion)
+            rho = final_level(policy, found.P, setting.goal, setting.expansion)
             return replace(setting, P=found.P, rho_final=rho)
         more = int(found.coarse.sum())
         if again is None or not more or len(policy.t) + more > MOST_KNOTS:

@@ -38,11 +38,11 @@ class ContinuousTracking:
     dynamics: a VectorField, or a function of some of t, x, u, w, named so; one that is no
     polynomial is expanded on every interval around what the funnel needs there, see
     `dynamics.taylor`. uncertain: rows (low, high) of the w of such a function. goal: half-widths
-    (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal` (None: the largest set
-    that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
-    R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
-    given policy P(t) solves the Lyapunov equation with Q. limits: rows (input, low, high), or one
-    pair (low, high) for each input, at which inputs saturate; the proof then covers every mode.
+    (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal`. policy: None is a
+    time-varying LQR with Q (n, n) and R (m, m) (None: on the goal's scale, see `default_weights`),
+    and P(t) its cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. limits:
+    rows (input, low, high), or one pair (low, high) for each input, at which inputs saturate; the
+    proof then covers every mode.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
     ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
@@ -56,7 +56,7 @@ class ContinuousTracking:
 
     dynamics: VectorField | Callable[..., Any]
     nominal: Nominal
-    goal: Goal | ArrayLike | None = None
+    goal: Goal | ArrayLike
     policy: ContinuousPolicy | None = None
     shape: Shape = "rho"
     Q: ArrayLike | None = None

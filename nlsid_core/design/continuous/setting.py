@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
@@ -16,7 +15,6 @@ from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     MAX_DEGREE,
     LSteps,
-    Section,
     refuse_degree,
     section_at,
 )
@@ -27,7 +25,7 @@ from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvl
 from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
 from nlsid_core.dynamics.vector_field import FEW_STATES
-from nlsid_core.errors import DataError, Infeasible, NotPolynomial
+from nlsid_core.errors import DataError, NotPolynomial
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -107,7 +105,7 @@ def prepare(problem: ContinuousTracking) -> Setting:
     weights = default_weights(field, nominal, wanted)
     Q = definite(weights[0] if problem.Q is None else problem.Q, field.n, "Q", strict=False)
     R = definite(weights[1] if problem.R is None else problem.R, field.m, "R", strict=True)
-    final = _final_shape(field, nominal, wanted, (Q, R))
+    final = GOAL_ROOM * wanted.P
     if problem.policy is None:
         linear = problem.hold is not None  # a held input may not jump
         tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, linear=linear)
@@ -126,20 +124,18 @@ def prepare(problem: ContinuousTracking) -> Setting:
     steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
     if held is not None:
         held.refuse(field, policy)
-    rho_final, target = final_level(steps, policy, S, wanted, expansion)
-    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held)
+    rho_final = final_level(policy, S, wanted, expansion)
+    return Setting(steps, policy, S, rho_final, wanted, (Q, R), expansion, held)
 
 
 def default_weights(
-    field: VectorField, nominal: Nominal, goal: Goal | None
+    field: VectorField, nominal: Nominal, goal: Goal
 ) -> tuple[FloatArray, FloatArray]:
-    """Q (n, n) and R (m, m) on the scale of the goal: identities without one.
+    """Q (n, n) and R (m, m) on the scale of the goal.
 
     Q = P/τ, and R_j = τ |B_j|²_P: a state that an input drives directly then returns with time
     constant τ, a share of the motion's length, at a cost-to-go like the goal's.
     """
-    if goal is None:
-        return np.eye(field.n), np.eye(field.m)
     t, x, u = nominal.t, nominal.x.ends(), nominal.u.ends()
     tau = TIME_CONSTANT * float(t[-1] - t[0])
     B = np.array([field.jacobians(float(s), x[k], u[k])[1] for k, s in enumerate(t)])
@@ -227,8 +223,8 @@ def refuse_saturated(policy: ContinuousPolicy) -> None:
             )
 
 
-def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goal | None:
-    if goal is None or isinstance(goal, Goal):
+def _wanted_goal(goal: Goal | ArrayLike, nominal: Nominal, n: int) -> Goal:
+    if isinstance(goal, Goal):
         wanted = goal
     else:
         P = numbers(goal, "the goal")
@@ -237,44 +233,19 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
                 raise DataError(f"the goal's half-widths should be positive numbers, are {P}")
             P = np.diag(P**-2.0)
         wanted = Goal(nominal.x.ends()[-1], P)
-    if wanted is not None:
-        if wanted.P.shape != (n, n) or wanted.centre.shape != (n,):
-            raise DataError(
-                f"the goal should be {n} half-widths, or an ellipsoid's ({n}, {n}) matrix; its "
-                f"shape is {wanted.P.shape}"
-            )
-        P = (wanted.P + wanted.P.T) / 2
-        skew = np.abs(wanted.P - P).max(initial=0.0)
-        if not skew <= ASYMMETRY * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0:
-            raise DataError("the goal's matrix should be symmetric positive definite")
-        wanted = Goal(wanted.centre, P)
-        d = nominal.x.ends()[-1] - wanted.centre
-        if d @ wanted.P @ d >= 1:
-            raise DataError(
-                f"the nominal ends outside the goal: |x - centre|² = {d @ wanted.P @ d:.3g} > 1"
-            )
-    return wanted
-
-
-def _final_shape(
-    field: VectorField,
-    nominal: Nominal,
-    goal: Goal | None,
-    weights: tuple[FloatArray, FloatArray],
-) -> FloatArray:
-    """P(t_f): a little more than the goal's, or of the LQR that holds at the end."""
-    if goal is not None:
-        return GOAL_ROOM * goal.P
-    A, B = field.jacobians(float(nominal.t[-1]), nominal.x.ends()[-1], nominal.u.ends()[-1])
-    try:
-        final = solve_continuous_are(A, B, *weights)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise Infeasible(
-            "the linearisation at the nominal's end cannot be stabilised by any gain "
-            f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal "
-            "and a policy."
-        ) from error
-    return np.asarray((final + final.T) / 2)
+    if wanted.P.shape != (n, n) or wanted.centre.shape != (n,):
+        raise DataError(
+            f"the goal should be {n} half-widths, or an ellipsoid's ({n}, {n}) matrix; its "
+            f"shape is {wanted.P.shape}"
+        )
+    P = (wanted.P + wanted.P.T) / 2
+    skew = np.abs(wanted.P - P).max(initial=0.0)
+    if not skew <= ASYMMETRY * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0:
+        raise DataError("the goal's matrix should be symmetric positive definite")
+    d = nominal.x.ends()[-1] - wanted.centre
+    if d @ P @ d >= 1:
+        raise DataError(f"the nominal ends outside the goal: |x - centre|² = {d @ P @ d:.3g} > 1")
+    return Goal(wanted.centre, P)
 
 
 def refuse_other(policy: ContinuousPolicy, field: VectorField, nominal: Nominal) -> None:
@@ -286,49 +257,14 @@ def refuse_other(policy: ContinuousPolicy, field: VectorField, nominal: Nominal)
         raise DataError("the policy is around another nominal")
 
 
-def _kept(
-    steps: LSteps,
-    policy: ContinuousPolicy,
-    S: FloatArray,
-    section: Section,
-    rho: float,
-    expansion: Expansion | None,
-) -> bool:
-    """True if V falls on the whole boundary at one instant."""
-    if expansion is not None:
-        try:
-            around = expansion.around(policy, S, section.interval, (rho, rho))
-        except NoExpansion:  # the box is too wide to expand anything
-            return False
-        steps.local[section.interval] = around
-    steps.bound_pushes(section, rho)
-    return min(s.m for s in steps.solve(section, rho)) > 0
-
-
 def final_level(
-    steps: LSteps,
     policy: ContinuousPolicy,
     S: FloatArray,
-    goal: Goal | None,
+    goal: Goal,
     expansion: Expansion | None,
-) -> tuple[float, Goal]:
-    """ρ(t_f) and the goal: the largest level inside a given goal, or one the end itself keeps."""
+) -> float:
+    """ρ(t_f): the largest level inside the goal, and small enough to be expanded."""
     end = policy.x.ends()[-1]
-    if goal is None:
-        section = section_at(steps, policy, S, len(S) - 2, 1.0)
-        low, high = 0.0, np.inf
-        rho = 1.0
-        for _ in range(24):
-            kept = _kept(steps, policy, S, section, rho, expansion)
-            low, high = (rho, high) if kept else (low, rho)
-            rho = 4 * low if np.isinf(high) else (high / 4 if low == 0 else (low + high) / 2)
-            if low and high / low < 1.05:
-                break
-        if low == 0:
-            raise Infeasible(
-                "the closed loop keeps no set at the end: give a goal, or another Q and R"
-            )
-        return low, Goal(end, S[-1] / (GOAL_ROOM * low))
     low, high = 0.0, 1.0
     d, rho = end - goal.centre, 1.0
     if d.any():
@@ -339,4 +275,4 @@ def final_level(
         rho = low * (1 - 1e-6)
     if expansion is not None:
         rho *= expansion.room(policy, S, len(S) - 2, rho)
-    return rho, goal
+    return rho

@@ -67,7 +67,7 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
     model, policy, assumption = problem.model, problem.policy, problem.assumption
     refuse_assumption(model, assumption)
     norms = frame(model, policy, problem.feedback)
-    cap = norms.cap - assumption.widens
+    cap = norms.cap - assumption.bound
     if np.min(cap) <= 0:
         k = int(np.argmin(cap))
         raise Infeasible(
@@ -77,10 +77,8 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
     implicit = isinstance(model, TrapezoidalModel)
     kind: Any = ImplicitFunnelStep if implicit else ExplicitStep
     steps = [kind.at(model, policy, norms, k, assumption) for k in range(len(policy))]
-    for k, step in enumerate(steps):
-        cap[k] = step.largest(float(cap[k]))
     inlet, to_goal = _inlet(steps, cap, problem.goal, progress)
-    roots = ROOTS * (inlet + assumption.widens)
+    roots = ROOTS * (inlet + assumption.bound)
     first = float(inlet[0]) if problem.start is None else problem.start
     if not 0 < first <= inlet[0]:
         raise DataError(
@@ -92,7 +90,7 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
         A=norms.A,
         tube=tube,
         inlet=inlet,
-        half_widths=half_widths(norms.S, tube, assumption.widens),
+        half_widths=half_widths(norms.S, tube, assumption.bound),
         assumption=assumption,
         model=policy.model,
         policy=files.digest(policy.document()),
@@ -115,29 +113,21 @@ def assume(
     feedback: Feedback,
     runs: Dataset,
     *,
-    form: str = "response",
     safety_factor: float = 1.5,
-    rate: float = 1.0,
 ) -> DisturbanceAssumption:
     """The bound that commissioning runs of the policy give: safety_factor times their largest.
-
-    rate: by which `fading` forgets a sample, below 1.
 
     Raises DataError if a run is shorter than the policy, CertificateRejected if one of them is a
     recording the model was fitted on.
     """
     norms = frame(model, policy, feedback)
-    gain = _gain(norms, rate) if form in ("energy", "fading") else 1.0
-    meter = DisturbanceMeter(norms.S, norms.A, form, rate, gain)
+    meter = DisturbanceMeter(norms.S, norms.A)
     measured = max(float(np.max(disturbance_of(model, policy, run, meter))) for run in runs)
     assumption = DisturbanceAssumption(
-        form=form,
         bound=float(np.nextafter(safety_factor * measured, np.inf)),
         measured=measured,
         safety_factor=safety_factor,
         measured_on=tuple((run.name, run.digest) for run in runs),
-        rate=rate,
-        gain=gain,
     )
     refuse_assumption(model, assumption)
     return assumption
@@ -150,9 +140,6 @@ class FunnelStep(Protocol):
 
     def from_radius(self, radius: float, roots: float, /) -> tuple[Any, float]:
         """What is found from `radius`, next rates within `roots`, and the radius it needs next."""
-
-    def largest(self, cap: float) -> float:
-        """The largest radius up to `cap` at which the form's own condition holds."""
 
     def proof(self, found: Any, /) -> Json:
         """The proof of what was found."""
@@ -175,7 +162,7 @@ def _inlet(
     for k in range(N - 1, -1, -1):
         target = float(radii[k + 1])
         radius = min(target * growth, float(cap[k]))
-        roots = ROOTS * (target + steps[k].assumption.widens)
+        roots = ROOTS * (target + steps[k].assumption.bound)
         best: tuple[float, Any] | None = None
         for _ in range(ATTEMPTS):
             proof, needed = steps[k].from_radius(radius, roots)
@@ -207,21 +194,6 @@ def _tube(
         proofs.append(proof)
         progress("tube", (k + 1) / len(steps))
     return np.array(radii), proofs
-
-
-def _gain(norms: Frame, rate: float) -> float:
-    """c of E⁺ = rate·E + c|d|², with half of what the linear part leaves kept for curvature."""
-    linear = max(
-        float(np.linalg.norm(S @ A @ T, 2))
-        for S, A, T in zip(norms.S[1:], norms.A, norms.T[:-1], strict=True)
-    )
-    mu = (linear + np.sqrt(rate)) / 2
-    if linear >= np.sqrt(rate):
-        raise Infeasible(
-            f"the loop shrinks deviations by {linear:.4g} a sample; a rate of {rate:g} forgets "
-            f"faster; use one above {linear**2:.4g}"
-        )
-    return float(rate / (rate - mu**2))
 
 
 def refuse_assumption(model: MeasuredState, a: DisturbanceAssumption) -> None:

@@ -8,7 +8,6 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.closed_loop import Frame
 from nlsid_core.design.sampled.reach import Reach, bases, reach
-from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.kernel.exact import Matrix, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
@@ -17,13 +16,11 @@ from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 
 UP = 1.0 + 1e-9  # a radius written down is above its value by more than rounding
-BISECTIONS = 40
-SMALLEST = 1e-3  # of the box: below it no radius is worth having
 
 
 @dataclass(frozen=True, eq=False)
 class ExplicitStep:
-    """The exact step S⁺f̄(Tz) of z, |S T z|², and the bounds that the disturbance's form needs."""
+    """The exact step S⁺f̄(Tz) of z, |S T z|², and the bounds that the disturbance needs."""
 
     T: FloatArray
     ring: Ring
@@ -49,11 +46,9 @@ class ExplicitStep:
         rows = explicit_step(closed_loop.map_of(model), sample, T, ring)
         ST: Matrix = product(sample.S, T)
         scaled = ring.product(ST, ring.variables)
-        moved = rows
-        if assumption.form == "response":
-            unit = product(sample.S_next, product(sample.A, T))
-            carried = ring.product(unit, ring.variables)
-            moved = [p - q for p, q in zip(rows, carried, strict=True)]
+        unit = product(sample.S_next, product(sample.A, T))
+        carried = ring.product(unit, ring.variables)
+        moved = [p - q for p, q in zip(rows, carried, strict=True)]
         return cls(
             T=norms.T[k],
             ring=ring,
@@ -68,31 +63,7 @@ class ExplicitStep:
     def from_radius(self, radius: float, _roots: float) -> tuple[Reach, float]:
         """The reach from `radius`, and the radius it needs next."""
         found = reach(self.rows, self.ring, radius, self.degree)
-        bound = self.assumption.bound
-        added = {"peak": bound, "response": bound * self.stretch(radius)}
-        return found, (found.bound + added.get(self.assumption.form, 0.0)) * UP
-
-    def largest(self, cap: float) -> float:
-        """The largest radius up to `cap` from which deviations shrink as the form needs."""
-        a = self.assumption
-        if a.form not in ("energy", "fading"):
-            return cap
-        low, high, radius = 0.0, cap, cap  # usually there is nothing to search for
-        for _ in range(BISECTIONS):
-            mu = self.stretch(radius) * UP
-            if a.gain * mu**2 > (a.gain - 1.0) * a.rate:
-                if radius < SMALLEST * cap:
-                    raise Infeasible(
-                        f"deviations shrink by {mu:.6g} a step at radius {radius:.4g}, too little "
-                        f"for rate {a.rate:g} and gain {a.gain:g}; use the form response"
-                    )
-                high = radius
-            else:
-                low = radius
-            if low == cap:
-                break
-            radius = (low + high) / 2
-        return low
+        return found, (found.bound + self.assumption.bound * self.stretch(radius)) * UP
 
     def stretch(self, radius: float) -> float:
         """μ of the kernel: what a deviation up to the bound is stretched by, from `radius`."""

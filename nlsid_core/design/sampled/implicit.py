@@ -82,40 +82,24 @@ class ImplicitFunnelStep:
         assumption: DisturbanceAssumption,
     ) -> "ImplicitFunnelStep":
         """The step from sample k."""
-        if assumption.form not in ("response", "peak"):
-            raise Infeasible(
-                f"form {assumption.form} is not for implicit models; use response or peak"
-            )
         ratio = 2.0 ** round(log2(norms.cap[k + 1] / norms.cap[k]))
-        weights = RATES_SHRUNK if assumption.form == "response" else RATES_SHRUNK[:1]
-        loops = [_loop(model, policy, norms, k, ratio * weight) for weight in weights]
+        loops = [_loop(model, policy, norms, k, ratio * weight) for weight in RATES_SHRUNK]
         return cls(loops, norms.T[k], assumption)
 
     def from_radius(self, radius: float, roots: float) -> tuple[Json, float]:
         """The proof of one step from `radius` to rates within `roots`, and the radius it needs."""
         if len(self._loops) > 1:  # the best coordinates for a radius are kept for others
             self._loops = [min(self._loops, key=lambda loop: self._added(loop, radius, roots))]
-        (loop,), a = self._loops, self.assumption
-        far, stated = closed_loop.above(Fraction(loop.bounds.kappa_next) * Fraction(roots)), {}
-        found = None
-        if a.form == "response":
-            found = self._spread(loop, radius, roots)
-            if found is None:
-                raise Infeasible(
-                    "roots may differ by more than a disturbance explains; cut the bound or the "
-                    "radius"
-                )
-            far = found.far
-        proof = ImplicitStep(loop.ring, loop.rows, loop.h, loop.size, radius, far).proof()
-        added = a.bound
-        if found is not None:
-            near, added = self._after(loop, found, radius, proof["reach"])
-            stated = {"spread": found.spread, "extents": [found.wide, near]}
+        (loop,) = self._loops
+        found = self._spread(loop, radius, roots)
+        if found is None:
+            raise Infeasible(
+                "roots may differ by more than a disturbance explains; cut the bound or the radius"
+            )
+        proof = ImplicitStep(loop.ring, loop.rows, loop.h, loop.size, radius, found.far).proof()
+        near, added = self._after(loop, found, radius, proof["reach"])
+        stated = {"spread": found.spread, "extents": [found.wide, near]}
         return proof | stated, float((Fraction(proof["reach"]) + Fraction(added)) * Fraction(UP))
-
-    def largest(self, cap: float) -> float:
-        """The largest radius up to `cap` to begin with; all of it."""
-        return cap
 
     def proof(self, found: Json) -> Json:
         """The proof of what was found."""

@@ -137,9 +137,13 @@ def cells_in_a_row(
     elif made.limit == "top":
         limits = list(product(TOPS, repeat=made.cells - 1))
     tried, steps = [], []
+    begun: list[FloatArray] = []
     for poles in _best_poles(short, made.cells, slowest):
         for levels in limits:
             start = _start(short, poles, levels, made.limit, -scaled.y[0] / scaled.y[1])
+            if any(np.allclose(start[1], known) for known in begun):
+                continue  # such as two tops that no trial reaches
+            begun.append(start[1])
             problem = start[0].problem(start[2], slowest)
             found = minimise(problem, start[1], steps=START_STEPS, tolerance=TOLERANCE)
             tried.append((start[0], found))

@@ -23,11 +23,15 @@ SMALLEST = 1e-3  # rms error in spreads of y, below which a start is not trusted
 def network_of(
     signals: Signals, found: Minimum, scaled: Scaled, train: Dataset, start_samples: int
 ) -> CellNetwork:
-    """The network of these signals, with states as they are along the minimum's trials."""
+    """The network of these signals, with states as they are along the minimum's trials.
+
+    Its usual start is the mean of the states that these trials begin with.
+    """
     theta = found.parameters
     into, after, y = _rows(signals, theta)
     m, size = len(into), len(after)
-    x = np.concatenate([_states(signals, theta, trial) for trial in found.trials])
+    along = [_states(signals, theta, trial) for trial in found.trials]
+    x, begun = np.concatenate(along), np.mean([states[0] for states in along], axis=0)
     middle, spread = x.mean(axis=0), x.std(axis=0)
     C = (
         np.cov((x - middle).T).reshape(size, size)
@@ -59,7 +63,7 @@ def network_of(
         into=recorded(into),
         next=solve_triangular(T, following, lower=True),
         output=output,
-        start=np.zeros(size),
+        start=solve_triangular(T, begun - middle, lower=True),
         start_samples=start_samples,
         period=train.period,
         y=signals_of(first, "y"),

@@ -26,6 +26,7 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.identification.methods.inequalities import MatrixInequality
 from nlsid_core.identification.polynomial.moments import (
     Moments,
     Offsets,
@@ -132,26 +133,6 @@ def equation(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class AffineMatrix:
-    """svec(G(x)) = slope x + constant for unknowns x, G of this order."""
-
-    order: int
-    slope: sp.csr_matrix
-    constant: FloatArray
-
-    def at(self, x: FloatArray) -> FloatArray:
-        """G(x)."""
-        return conic.smat(self.slope @ x + self.constant)
-
-    def scaled(self, rows: FloatArray, columns: FloatArray) -> "AffineMatrix":
-        """diag(rows) G(columns·x) diag(rows)."""
-        i, j = conic.triangle(self.order)
-        factor = rows[i] * rows[j]
-        slope = sp.diags(factor) @ self.slope @ sp.diags(columns)
-        return AffineMatrix(self.order, sp.csr_matrix(slope), factor * self.constant)
-
-
 @dataclass(frozen=True)
 class Layout:
     """Where the unknowns are: lags n, window entries m, degree D of e."""
@@ -191,41 +172,43 @@ class Layout:
         """Columns of c that multiply y(t-1) … y(t-n)."""
         return self.c[self.degree + 1 : self.degree + 1 + self.lags]
 
-    def stability(self, delta: float, rate: float = 1.0) -> AffineMatrix:
+    def stability(self, delta: float, rate: float = 1.0) -> MatrixInequality:
         """G₈, with rate² P in the place of the P of Δ."""
         n, d, sd = self.lags, self.lags, self.lags + 1
-        G = _Entries(n + 1 if self.degree == 1 else n + 2)
+        size = n + 1 if self.degree == 1 else n + 2
+        G = np.zeros((1 + self.unknowns, size, size))
         self._storage(G, 0, d, rate)
         for k in range(n):
-            G.add(k, k, None, -delta)
-            G.add(k, d, self.past[k], 1.0)
-        G.add(d, d, self.c[0], 2.0)
+            _add(G, k, k, None, -delta)
+            _add(G, k, d, self.past[k], 1.0)
+        _add(G, d, d, self.c[0], 2.0)
         if self.degree == 3:
-            G.add(d, sd, self.c[1], 1.0)
-            G.add(sd, sd, self.c[2], 1.5)
-        return G.matrix(self.unknowns)
+            _add(G, d, sd, self.c[1], 1.0)
+            _add(G, sd, sd, self.c[2], 1.5)
+        return MatrixInequality(G)
 
-    def error_bound(self) -> AffineMatrix:
+    def error_bound(self) -> MatrixInequality:
         """G₉."""
         n, L, D = self.lags, self.monomials, self.degree
         d, yd, dd = L + n, L + n + 1, L + n + 2
-        G = _Entries(L + n + 1 if D == 1 else L + n + 3)
+        size = L + n + 1 if D == 1 else L + n + 3
+        G = np.zeros((1 + self.unknowns, size, size))
         for i in range(L):
             for j in range(i, L):
-                G.add(i, j, self.R[i, j], 1.0)
-            G.add(i, d, self.c[i], 1.0)
+                _add(G, i, j, self.R[i, j], 1.0)
+            _add(G, i, d, self.c[i], 1.0)
         self._storage(G, L, d)
-        G.add(L, L, None, -1.0)
+        _add(G, L, L, None, -1.0)
         for k in range(n):
-            G.add(L + k, d, self.past[k], 1.0)
-        G.add(d, d, self.c[0], 2.0)
+            _add(G, L + k, d, self.past[k], 1.0)
+        _add(G, d, d, self.c[0], 2.0)
         if D == 3:
             second, third = self.c[1], self.c[2]
-            G.add(d, yd, second, 2.0)
-            G.add(d, dd, second, 1.0)
-            G.add(yd, yd, third, 6.0)
-            G.add(yd, dd, third, 3.0)
-            G.add(dd, dd, third, 2.0)
+            _add(G, d, yd, second, 2.0)
+            _add(G, d, dd, second, 1.0)
+            _add(G, yd, yd, third, 6.0)
+            _add(G, yd, dd, third, 3.0)
+            _add(G, dd, dd, third, 2.0)
             y, y2, y3, one = range(4)
             tau = self.unknowns - SPLITS
             # The same monomial twice: what one entry gives, the other takes.
@@ -239,17 +222,17 @@ class Layout:
                     ((y2, dd), (yd, yd), 2.0),
                 )
             ):
-                G.add(*plus, tau + k, 1.0)
-                G.add(*minus, tau + k, -weight)
-        return G.matrix(self.unknowns)
+                _add(G, *plus, tau + k, 1.0)
+                _add(G, *minus, tau + k, -weight)
+        return MatrixInequality(G)
 
-    def _storage(self, G: "_Entries", start: int, d: int, rate: float = 1.0) -> None:
+    def _storage(self, G: FloatArray, start: int, d: int, rate: float = 1.0) -> None:
         """rate²|Δ|²_P - |[d; Δ_1 … Δ_{n-1}]|²_P, Δ from index `start` on."""
         place = [d, *range(start, start + self.lags - 1)]
         for k in range(self.lags):
             for j in range(k, self.lags):
-                G.add(start + k, start + j, self.P[k, j], rate**2)
-                G.add(place[k], place[j], self.P[k, j], -1.0)
+                _add(G, start + k, start + j, self.P[k, j], rate**2)
+                _add(G, place[k], place[j], self.P[k, j], -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,8 +243,7 @@ class Problem:
     M: FloatArray
     unit: float
     columns: FloatArray
-    stability: AffineMatrix
-    error_bound: AffineMatrix
+    blocks: tuple[MatrixInequality, MatrixInequality]
 
     @classmethod
     def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "Problem":
@@ -287,21 +269,22 @@ class Problem:
             M=M,
             unit=unit,
             columns=columns,
-            stability=layout.stability(DELTA, slowest).scaled(rows8, columns),
-            error_bound=layout.error_bound().scaled(rows9, columns),
+            blocks=(
+                _scaled(layout.stability(DELTA, slowest), rows8, columns),
+                _scaled(layout.error_bound(), rows9, columns),
+            ),
         )
 
     def solve(self) -> conic.ConeSolution:
         """Minimise tr(R M)."""
         q = np.zeros(self.layout.unknowns)
         np.add.at(q, self.layout.R.ravel(), self.M.ravel())
-        blocks = [self.stability, self.error_bound]
         program = ConeProgram(
             P=sp.csc_matrix((len(q), len(q))),
             q=q,
-            A=sp.csc_matrix(sp.vstack([-block.slope for block in blocks])),
-            b=np.concatenate([block.constant for block in blocks]),
-            cones=tuple(Cone("psd", block.order) for block in blocks),
+            A=sp.csc_matrix(np.vstack([-conic.svec(block.F[1:]).T for block in self.blocks])),
+            b=np.concatenate([conic.svec(block.F[0]) for block in self.blocks]),
+            cones=tuple(Cone("psd", block.order) for block in self.blocks),
         )
         return conic.solve(program)
 
@@ -323,31 +306,18 @@ def _sizes(M: FloatArray, degree: int) -> FloatArray:
     return np.asarray(np.where(sizes > 0, sizes, 1.0))
 
 
-class _Entries:
-    """Collects G[i, j] += value · x[column] (None: a constant), symmetric."""
+def _add(G: FloatArray, i: int, j: int, column: int | None, value: float) -> None:
+    """G[i, j] += value · x[column] (None: a constant), symmetric."""
+    place = 0 if column is None else 1 + column
+    G[place, i, j] += value
+    if i != j:
+        G[place, j, i] += value
 
-    def __init__(self, order: int) -> None:
-        self.order = order
-        self._rows: list[int] = []
-        self._columns: list[int] = []
-        self._values: list[float] = []
-        self._constant = np.zeros(order * (order + 1) // 2)
 
-    def add(self, i: int, j: int, column: int | None, value: float) -> None:
-        low, high = min(i, j), max(i, j)
-        row = high * (high + 1) // 2 + low
-        value = value if i == j else value * conic.SQRT2
-        if column is None:
-            self._constant[row] += value
-        else:
-            self._rows.append(row)
-            self._columns.append(int(column))
-            self._values.append(value)
-
-    def matrix(self, unknowns: int) -> AffineMatrix:
-        shape = (len(self._constant), unknowns)
-        slope = sp.csr_matrix((self._values, (self._rows, self._columns)), shape)
-        return AffineMatrix(self.order, slope, self._constant)
+def _scaled(G: MatrixInequality, rows: FloatArray, columns: FloatArray) -> MatrixInequality:
+    """diag(rows) G(columns·x) diag(rows)."""
+    unknowns = np.concatenate([[1.0], columns])
+    return MatrixInequality(G.F * np.outer(rows, rows) * unknowns[:, None, None])
 
 
 def _symmetric(start: int, size: int) -> IntArray:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from nlsid_core import kernel
 from nlsid_core.kernel import Rejected, text
+from nlsid_core.kernel.checking import read_regular
 from nlsid_core.kernel.exact import at_most, definite, semidefinite
 from nlsid_core.kernel.files import (
     MAX_DEGREE,
@@ -27,7 +28,6 @@ from nlsid_core.kernel.files import (
     digest,
     parse,
     plain,
-    read_regular,
 )
 from nlsid_core.kernel.polynomials import Ring
 from nlsid_core.kernel.positivity import read_squares

@@ -63,29 +63,19 @@ def value(p: Polynomial, ring: Ring, point: list[Fraction]) -> Fraction:
     return total
 
 
-CASES = [(explicit, "response"), (implicit, "peak")] + [
-    pytest.param(make, form, marks=pytest.mark.slow)
-    for make, form in (
-        (explicit, "peak"),
-        (explicit, "energy"),
-        (explicit, "fading"),
-        (implicit, "response"),
-        (two_joints, "response"),
-    )
-]
+CASES = [explicit, *(pytest.param(make, marks=pytest.mark.slow) for make in (implicit, two_joints))]
 
 
-@pytest.mark.parametrize(("make", "form"), CASES)
+@pytest.mark.parametrize("make", CASES)
 def test_every_rebuilt_polynomial_is_the_oracles_at_rational_points(
-    make: Callable[[str], TrackingDesign],
-    form: str,
+    make: Callable[[], TrackingDesign],
     rebuilt: list[tuple[str, Polynomial, Ring]],
 ) -> None:
-    design = make(form)
+    design = make()
     documents = {name.removesuffix(".json"): part for name, part in design.documents().items()}
     rebuilt.clear()  # making the design has decided it once
     decide(design)
-    rng = random.Random(form)
+    rng = random.Random(0)
     del rebuilt[: -2 * len(design.policy)]  # of widths that were too narrow
     for i, (what, c, ring) in enumerate(rebuilt):
         k, chain = i // 2, ("tube", "inlet")[i % 2]
@@ -98,14 +88,14 @@ def test_every_rebuilt_polynomial_is_the_oracles_at_rational_points(
             assert value(c, ring, point) == claimed
 
 
-@pytest.mark.parametrize(("make", "form"), CASES)
+@pytest.mark.parametrize("make", CASES)
 def test_a_reach_holds_for_the_oracle_at_random_states_of_the_set(
-    make: Callable[[str], TrackingDesign], form: str
+    make: Callable[[], TrackingDesign],
 ) -> None:
     """|S x̄| <= radius implies |S⁺ f̄(x̄)| <= reach, at rational points; an implicit one by roots."""
-    design = make(form)
+    design = make()
     model, policy = design.model.document(), design.policy.document()
-    rng = random.Random(form)
+    rng = random.Random(0)
     for k in range(len(design.policy)):
         S, S_next = (oracle.fractions(design.funnel.S[i].tolist()) for i in (k, k + 1))
         for chain in ("tube", "inlet"):
@@ -142,7 +132,7 @@ def test_a_spurious_root_within_the_bound_makes_a_claim_false_and_is_refused() -
     feedback = tvlqr(model, x, u, input_weight=0.3)
     policy = track(model, x, u, feedback)
     design = design_state_funnel(
-        SampledTracking(model, policy, feedback, assumption=assumption("peak", 0.01), goal=0.2)
+        SampledTracking(model, policy, feedback, assumption=assumption(0.001), goal=0.05)
     )
     spurious, rest = [Fraction(4)], [Fraction(0)] * 2
     after, h = oracle.implicit_next(model.document(), policy.document(), 0, rest, spurious)
