@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 19_006,
-    ("bags",): 12_514,
+    ("bags",): 12_524,
     ("nlsid_ros",): 2_661,
-    ("tests",): 23_651,
+    ("tests",): 23_666,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
