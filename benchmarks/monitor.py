@@ -91,7 +91,13 @@ def timing_funnel(rate: int) -> OutputTubeDesign:
     rng = np.random.default_rng(1)
     a, b = np.array([1.9, -0.905]), np.array([0.0, 0.003, 0.002])
     blank = DifferenceEquation(
-        a, b, 0.0, period, Signal("state", "1", STATE), Signal("command", "1", COMMAND), (-1.0, 1.0)
+        a,
+        b,
+        0.0,
+        Signal("state", "1", STATE),
+        Signal("command", "1", COMMAND),
+        (-1.0, 1.0),
+        period=period,
     )
     trials = []
     for index in range(3):

@@ -274,7 +274,6 @@ def measure(case: Case) -> dict[str, float | int]:
         held_back=case.judged,
         calibration=case.calibration,
         ranges=ranges,
-        remedy="",
     )
     untouched, *faults = caught.rows
     after = [row.funnel.after for row in faults if np.isfinite(row.funnel.after)]

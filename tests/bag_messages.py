@@ -1,6 +1,6 @@
 """Serialised standard messages and small bags for the tests of bags."""
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.tools.copying import Copied
 from bags.tools.edit import convert, stretch
+from nlsid_core.arrays import FloatArray
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 25_000_000
@@ -94,6 +95,20 @@ def speed_bag(
             bag.write(CMD, CMD_TYPE, command(stamp, value), **times)
             if k not in lost:
                 bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
+    return path
+
+
+def number_bag(path: Path, values: Mapping[str, FloatArray], *, period: float) -> Path:
+    """Numbers without stamps, each on a topic of its own, `period` s apart; NaN is not written."""
+    kind = "std_msgs/msg/Float64"
+    number = standard_types().types[kind]
+    with BagWriter(path) as writer:
+        for k, row in enumerate(zip(*values.values(), strict=True)):
+            stamp_ns = START_NS + round(1e9 * period * k)
+            times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
+            for topic, value in zip(values, row, strict=True):
+                if not np.isnan(value):
+                    writer.write(topic, kind, serialised(kind, number(float(value))), **times)
     return path
 
 

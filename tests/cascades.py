@@ -39,7 +39,7 @@ def wiener() -> BlockCascade:
     """No second filter: nothing of a measured output is needed to start it."""
     model = truth()
     return BlockCascade(
-        model.a1, model.b1, model.f, np.zeros(0), model.b2, model.period, model.y, model.u
+        model.a1, model.b1, model.f, np.zeros(0), model.b2, model.y, model.u, period=model.period
     )
 
 

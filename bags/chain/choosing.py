@@ -8,13 +8,18 @@ from pathlib import Path
 from bags.chain.config import Config
 from bags.chain.identification_config import IdentificationConfig
 from bags.chain.steps import Identified, Trials, read_trials, write_identified
-from bags.designs import documents
-from bags.pictures.choices import Scored, draw_comparison, draw_selection
-from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, NlsidError
-from nlsid_core.files import write_atomically
-from nlsid_core.identification import Fit, Model, Selection, describe, identify, select
+from nlsid_core.identification import (
+    Candidate,
+    Fit,
+    Model,
+    Selection,
+    Validation,
+    describe,
+    identify,
+    select,
+)
 from nlsid_core.identification.prediction import history
 from nlsid_core.progress import Progress, part
 
@@ -25,19 +30,6 @@ class Selected:
 
     selection: Selection
     identified: Identified
-
-
-def select_bags(
-    bags: Sequence[Path],
-    config: Config,
-    out: Path,
-    *,
-    progress: Progress,
-) -> Selected:
-    """`select_trials` of bags; BagError for one that cannot be used."""
-    sections_to_try(config)
-    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
-    return select_trials(trials, config, out, progress=progress)
 
 
 def sections_to_try(config: Config) -> list[IdentificationConfig]:
@@ -58,7 +50,7 @@ def select_trials(
     executor: Executor | None = None,
     progress: Progress,
 ) -> Selected:
-    """Every combination of the options; the files of the best by validation error, and select.png.
+    """Every combination of the options; the files of the best by validation error.
 
     executor: shares them; the files are the same to the last bit. Raises DataError before anything
     is written, Infeasible if no combination has a model.
@@ -86,11 +78,16 @@ def select_trials(
         both = Dataset((*trials.train.trajectories, *trials.validation.trajectories))
         trials = replace(trials, train=both, validation=None)
     identified = write_identified(selection.fit, trials, config, out, progress=progress)
-    if report_available():
-        picture = out / documents.SELECTION_PLOT
-        write_atomically(picture, draw_selection(selection, config.select or {}))
-        identified = Identified(identified.fit, trials, (*identified.files, picture))
     return Selected(selection, identified)
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A candidate of the class `label` with its scores."""
+
+    label: str
+    candidate: Candidate[Model]
+    scores: Validation
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +98,6 @@ class Compared:
     refusals: tuple[str, ...]
     trials: Trials
     skipped_at_start: int
-
-    def draw(self, path: Path) -> None:
-        """Test errors as a picture; needs the extra `report`."""
-        write_atomically(path, draw_comparison(self.rows))
 
 
 def compare_bags(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -362,9 +362,6 @@ def _time_refusals(config: Config) -> Iterator[str]:
             f"funnel.horizon: {horizon:g} s is not one sample of {period:g} s; give the length of "
             "a run"
         )
-    for use, other in combinations(("test", "validation", "calibration"), 2):
-        if twice := set(getattr(config.split, use)) & set(getattr(config.split, other)):
-            yield f"split: '{min(twice)}' is named for {use} and for {other}"
 
 
 def _model_refusals(config: Config) -> Iterator[str]:

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bags.chain.config import Config, signal_texts
-from bags.chain.steps import USES, absent_from, with_parts
+from bags.chain.steps import check_split
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.signals.sampling import Sampler
-from nlsid_core.errors import BagError
+from nlsid_core.errors import BagError, DataError
 
 
 def misfits(config: Config, bags: Sequence[Path]) -> list[str]:
@@ -28,15 +28,11 @@ def misfits(config: Config, bags: Sequence[Path]) -> list[str]:
             said = [str(error)]
         for what in said:
             found.setdefault(what, []).append(path.name)
-    names = set(map(trial_name, bags))
     lines = [f"{_some(where)}: {what}" for what, where in found.items()]
-    lines += absent_from(with_parts(sorted(names), config), config)
-    for use in USES:
-        wanted = getattr(config.split, use)
-        if wanted and set(wanted) >= names:
-            lines.append(f"split.{use}: names every bag; leave some to train on")
-    if not config.split.test and config.split.share is None:
-        lines.append("split: nothing to score on; name test bags, or give a share")
+    try:
+        check_split(sorted({trial_name(bag) for bag in bags}), config)
+    except DataError as error:
+        lines.append(str(error))
     return lines
 
 

@@ -82,13 +82,12 @@ ROBOTS = MappingProxyType({robot.name: robot for robot in (PENDULUM, ARM)})
 class Plant:
     """A robot being simulated; one `step` is one sample.
 
-    mass_scale: of every mass and inertia, to make a robot that is no longer the one identified.
     Raises DataError if MuJoCo is not installed.
     """
 
     period = PERIOD
 
-    def __init__(self, robot: Robot, rng: np.random.Generator, *, mass_scale: float = 1.0) -> None:
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         try:
             import mujoco
         except ImportError as error:
@@ -96,8 +95,6 @@ class Plant:
         self.robot, self._rng = robot, rng
         self._advance: Callable[[Any, Any, int], None] = mujoco.mj_step
         self._model: Any = mujoco.MjModel.from_xml_string(robot.mjcf())
-        self._model.body_mass[:] *= mass_scale
-        self._model.body_inertia[:] *= mass_scale
         self._data: Any = mujoco.MjData(self._model)
         self.reset(np.zeros(2 * robot.joints))
 

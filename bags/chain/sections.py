@@ -40,6 +40,14 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
+    @classmethod
+    def keys(cls) -> dict[str, Key]:
+        """What each key is for; StopIteration if one does not say."""
+        return {
+            name: next(entry for entry in field.metadata if isinstance(entry, Key))
+            for name, field in cls.model_fields.items()
+        }
+
 
 class SignalConfig(Section):
     """A signal, for people and where it is found."""

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from bags.chain.config import Config
+from bags.chain.config import Config, SplitConfig
 from bags.chain.sections import SignalConfig
 from bags.chain.tracking_config import TrackingConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
@@ -19,7 +19,7 @@ from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.names import did_you_mean, listed
-from bags.signals.grid import filled_samples, read_dataset, said_restarts, skipped_samples
+from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials, check_apart
@@ -216,20 +216,7 @@ def by_use(labelled: Dataset, config: Config, *, left_out: Sequence[str] = ()) -
     the split that is neither of a trial nor of these.
     """
     refuse_absent([*labelled.names, *with_parts(left_out, config)], config)
-    if config.split.share is not None:
-        trials = cut(
-            labelled,
-            config.split.share,
-            validation=config.split.validation,
-            calibration=config.split.calibration,
-        )
-    else:
-        trials = split(
-            labelled,
-            test=config.split.test,
-            validation=config.split.validation,
-            calibration=config.split.calibration,
-        )
+    trials = split(labelled, config.split)
     if trials.calibration is not None:
         fitted = (*trials.train, *(trials.validation or ()))
         check_apart(fitted, trials.calibration)
@@ -248,37 +235,27 @@ def _labelled(
     return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
-def split(
-    dataset: Dataset,
-    *,
-    test: Sequence[str],
-    validation: Sequence[str] = (),
-    calibration: Sequence[str] = (),
-) -> Trials:
-    """The trials by name of their bag; DataError if a name is for two uses, or a part is empty."""
-    chosen = _held_out(
-        dataset.names, {"test": test, "validation": validation, "calibration": calibration}
+def split(dataset: Dataset, named: SplitConfig) -> Trials:
+    """The trials by name of their bag; DataError if a name is for two uses, or a part is empty.
+
+    With a share the test trials are that end of every trial that is not named for another use.
+    """
+    chosen = _held_out(dataset.names, named)
+    train = dataset.without([name for names in chosen.values() for name in names])
+    if named.share is None:
+        test = dataset.select(chosen["test"])
+    else:
+        train, test = _cut(train, named.share)
+    validation, calibration = (
+        dataset.select(chosen[use]) if chosen[use] else None for use in USES[1:]
     )
-    return Trials(
-        dataset.without([name for names in chosen.values() for name in names]),
-        dataset.select(chosen["test"]),
-        _selected(dataset, chosen["validation"]),
-        _selected(dataset, chosen["calibration"]),
-    )
+    return Trials(train, test, validation, calibration)
 
 
-def cut(
-    dataset: Dataset,
-    share: float,
-    *,
-    validation: Sequence[str] = (),
-    calibration: Sequence[str] = (),
-) -> Trials:
-    """Test trials are the `share` at the end of every trial that is not named for another use."""
-    chosen = _held_out(dataset.names, {"validation": validation, "calibration": calibration})
-    held_out = [name for names in chosen.values() for name in names]
+def _cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:
+    """Every trial in two, the second of which is this share of it."""
     parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
-    for trial in dataset.without(held_out):
+    for trial in dataset:
         count = round(share * len(trial.t))
         if not 2 <= count <= len(trial.t) - 2:
             raise DataError(
@@ -287,12 +264,7 @@ def cut(
         for half, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
             y, u = trial.y[rows], trial.u[rows]
             half.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
-    return Trials(
-        Dataset(tuple(parts[0])),
-        Dataset(tuple(parts[1])),
-        _selected(dataset, chosen["validation"]),
-        _selected(dataset, chosen["calibration"]),
-    )
+    return Dataset(tuple(parts[0])), Dataset(tuple(parts[1]))
 
 
 def check_split(names: Sequence[str], config: Config) -> None:
@@ -300,13 +272,9 @@ def check_split(names: Sequence[str], config: Config) -> None:
 
     A bag may turn out to have gaps: its parts may be named.
     """
-    split = config.split
-    named = {"validation": split.validation, "calibration": split.calibration}
-    if split.share is None:
-        named = {"test": split.test, **named}
     possible = with_parts(names, config)
     refuse_absent(possible, config)
-    _held_out(possible, named)
+    _held_out(possible, config.split)
 
 
 def absent_from(names: Sequence[str], config: Config) -> list[str]:
@@ -322,12 +290,12 @@ def absent_from(names: Sequence[str], config: Config) -> list[str]:
 
 
 def refuse_absent(names: Sequence[str], config: Config) -> None:
-    """Raise DataError for the first name in the split that none of the trials has.
+    """Raise DataError for names in the split that none of the trials has.
 
-    Its trial would be trained on without a word.
+    Their trials would be trained on without a word.
     """
     if absent := absent_from(names, config):
-        raise DataError(absent[0])
+        raise DataError("; ".join(absent))
 
 
 def with_parts(names: Sequence[str], config: Config) -> list[str]:
@@ -336,35 +304,28 @@ def with_parts(names: Sequence[str], config: Config) -> list[str]:
     return [*names, *sorted(name for name in wanted if name.rpartition(".")[0] in names)]
 
 
-def _held_out(trials: Sequence[str], named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+def _held_out(trials: Sequence[str], named: SplitConfig) -> dict[str, list[str]]:
     """The trials of each use, of those called so.
 
-    DataError if a name or a trial is for two, if none is for test or for a validation that names
-    some, or if none is left to train on.
+    DataError if a trial is for two, if none is for a use that names some or for the test, or if
+    none is left to train on.
     """
-    chosen = {use: _of_bags(trials, names) for use, names in named.items()}
-    for use, other in combinations(named, 2):
-        twice = set(named[use]) & set(named[other]) or set(chosen[use]) & set(chosen[other])
-        if twice:
+    uses = USES if named.share is None else USES[1:]
+    chosen = {use: _of_bags(trials, getattr(named, use)) for use in uses}
+    for use, other in combinations(uses, 2):
+        if twice := set(chosen[use]) & set(chosen[other]):
             raise DataError(f"split: '{min(twice)}' is named for {use} and for {other}")
-    if "test" in named and not chosen["test"]:
-        raise DataError(
-            "none of the bags is a test trial, so no model can be scored; split.test names "
-            f"{', '.join(named['test']) or 'nothing'}, the bags are {listed(trials)}"
-        )
-    if named["validation"] and not chosen["validation"]:
-        raise DataError(
-            "none of the bags is a validation trial; split.validation names "
-            f"{', '.join(named['validation'])}, the bags are {listed(trials)}"
-        )
+    for use in uses:
+        wanted = getattr(named, use)
+        if not chosen[use] and (wanted or use == "test"):
+            raise DataError(
+                f"none of the bags is a {use} trial; split.{use} names "
+                f"{', '.join(wanted) or 'nothing'}, the bags are {listed(trials)}"
+            )
     if sum(map(len, chosen.values())) == len(trials):
-        uses = [use for use, found in chosen.items() if found]
-        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
+        said = " or ".join(use for use in uses if chosen[use])
+        raise DataError(f"all of the bags are {said} trials; give some to train on")
     return chosen
-
-
-def _selected(dataset: Dataset, names: Sequence[str]) -> Dataset | None:
-    return dataset.select(names) if names else None
 
 
 def _of_bags(trials: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -436,16 +397,7 @@ def what_a_funnel_catches(
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        remedy="another funnel.reaction_time, or a model that leaves less in its residual",
     )
-
-
-def what_a_monitor_would_not_judge(
-    model_path: Path, config: Config, design: OutputTubeDesign
-) -> list[str]:
-    """The test trials beside a model that a monitor of it would not judge as one run, and why."""
-    _, test = _trials_beside(model_path, config, design.model)
-    return [] if test is None else said_restarts(test)
 
 
 def _trials_beside(

@@ -3,6 +3,7 @@
 A name opens some options of its family under the keys of the configuration, and fixes others.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
@@ -54,6 +55,11 @@ class Template:
         made: ModelClass = self.family(**{place: self.part(**inner)}, **outer)
         return made
 
+    def texts(self) -> dict[str, str]:
+        """What the docstrings of the family and of the structure say of each key's option."""
+        known = option_texts(self.family) | option_texts(self.part)
+        return {key: known[option] for key, option in self.keys.items()}
+
     def default(self, key: str) -> object:
         """What the key is where it is not given."""
         made: Any = self.make({})
@@ -61,6 +67,15 @@ class Template:
             if hasattr(part, self.keys[key]):
                 return getattr(part, self.keys[key])
         raise KeyError(key)
+
+
+def option_texts(kind: type[Any]) -> dict[str, str]:
+    """What the docstring of a class or of a method says of each of its options."""
+    text = re.sub(r"\s+", " ", kind.__doc__ or "")
+    names = [option.name for option in fields(kind)]
+    ends = "|".join([*(rf"[,;.]? {name}: " for name in names), r" Raises ", r" Source: ", "$"])
+    found = {name: re.search(rf"\b{name}: (.*?)(?:{ends})", text) for name in names}
+    return {name: said[1].rstrip(".;, ") if said else "" for name, said in found.items()}
 
 
 def _same(*keys: str) -> dict[str, str]:

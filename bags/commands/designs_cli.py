@@ -5,9 +5,9 @@ A command imports what it runs when it is called.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -28,7 +28,6 @@ from nlsid_core.errors import CertificateRejected
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
-    from bags.chain.problems import FunnelProblem
     from bags.fleet.workers import Workers
 
 
@@ -80,8 +79,9 @@ def funnel(
     if given.problem is not None:
         if config is not None:
             raise typer.BadParameter("--problem takes no --config")
-        problem = _problem(given.problem, given, wired, expand_bags(bags) if bags else [])
-        _funnel_around_trajectory(problem, folder, sharing.workers())
+        _around_trajectory(
+            folder, given, wired, sharing.workers(), expand_bags(bags) if bags else []
+        )
         return
     if sharing != Sharing():
         raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
@@ -106,13 +106,10 @@ def _proof_in(path: Path) -> Path:
 
 def tube(folder: Path, settings: Config) -> None:
     """Design a tube around the model in a folder, and what it catches."""
-    from bags.chain.steps import (
-        design_funnel_files,
-        what_a_funnel_catches,
-        what_a_monitor_would_not_judge,
-    )
+    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
+    from bags.pictures import tables
     from bags.pictures.report import write_catching
 
     model = folder / documents.MODEL
@@ -127,46 +124,49 @@ def tube(folder: Path, settings: Config) -> None:
     if catching is None:
         out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
     else:
-        show.say_catching(out, catching)
+        tables.say_catching(out, catching)
         written += write_catching(folder, catching)
-    for line in what_a_monitor_would_not_judge(model, settings, design):
-        show.warn(out, line)
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
 
 
-def _problem(path: Path, given: Given, wired: Wired, bags: list[Path]) -> FunnelProblem:
-    """The problem of a file, with what its equations leave out of bags if there are any."""
-    from bags.chain.problems import FunnelProblem, measured
-    from bags.commands import show
-    from nlsid_core.designs import Wiring
-
-    if not bags:
-        return FunnelProblem.load(path)
-    wiring = Wiring(tuple(wired.response or ()), tuple(wired.excitation or ()), wired.period)
-    problem, broken = measured(
-        path, bags, wiring, seconds=given.seconds or None, safety_factor=given.safety_factor
-    )
-    out.print(show.breaking_table(broken))
-    return problem
-
-
-def _funnel_around_trajectory(given: FunnelProblem, folder: Path, workers: Workers) -> None:
-    """A funnel for given equations, and the push that was measured beside it."""
+def _around_trajectory(
+    folder: Path, given: Given, wired: Wired, workers: Workers, bags: list[Path]
+) -> None:
+    """Design a funnel for given equations, and for what they leave out of bags if there are any."""
+    from bags.chain.problems import load_problem, measured
     from bags.commands import show
     from bags.designs import documents
+    from bags.pictures import tables
     from nlsid_core import files
+    from nlsid_core.design import design
+    from nlsid_core.designs import Wiring
+
+    assert given.problem is not None
+    problem, push = load_problem(given.problem), None
+    if bags:
+        wiring = Wiring(tuple(wired.response or ()), tuple(wired.excitation or ()), wired.period)
+        field: Any = problem.dynamics
+        push, broken = measured(
+            field,
+            bags,
+            wiring,
+            seconds=given.seconds or None,
+            safety_factor=given.safety_factor,
+        )
+        out.print(tables.breaking_table(broken))
+        problem = replace(problem, dynamics=field.pushed(push.box))
 
     with progress_bar("designing") as progress, workers.sharing() as executor:
-        design = given.design(progress, executor=executor)
-    for path in (*design.save(folder), *show.draw_tube(folder, design)):
+        made = design(problem, executor=executor, progress=progress)
+    for path in (*made.save(folder), *show.draw_tube(folder, made)):
         out.print(f"wrote {path}", soft_wrap=True)
-    out.print(str(design), soft_wrap=True)
-    if given.push is not None:
+    out.print(str(made), soft_wrap=True)
+    if push is not None:
         path = folder / documents.PUSH
-        files.write_document(path, given.push.document())
+        files.write_document(path, push.document())
         out.print(f"wrote {path}", soft_wrap=True)
-        out.print(f"measured, not proved: {given.push}", soft_wrap=True, markup=False)
+        out.print(f"measured, not proved: {push}", soft_wrap=True, markup=False)
 
 
 def check(
@@ -239,14 +239,15 @@ def report(
     made with. The page needs nothing else, and prints.
     """
     from bags.commands import show
+    from bags.commands.page import folder_page, recorded
     from bags.designs import documents
     from bags.designs.wiring import sampler_of
-    from bags.pictures.folder_report import Held, write_folder_report
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
+    from nlsid_core import files
 
     target = page or folder / documents.DESIGN_REPORT
-    held = Held()
+    held: dict[str, str] = {}
     if bags:
         settings = settings_if_any(folder, config)
         design, folders = documents.load(folder), expand_bags(bags)
@@ -258,11 +259,11 @@ def report(
                 recordings.append(bag_info(bag, topics=topics))
         chosen = show.chosen_bags(design, folders, settings)
         replays = show.replayed(design, chosen.judged, settings)
-        held = Held(recordings, replays, chosen.said)
+        held = recorded(recordings, replays, chosen.said)
         out.print(show.replay_table(replays))
         for line in chosen.said:
             out.print(line, soft_wrap=True, markup=False, highlight=False)
-    write_folder_report(folder, target, held)
+    files.write_atomically(target, folder_page(folder, held).encode())
     out.print(f"wrote {target}", soft_wrap=True)
 
 

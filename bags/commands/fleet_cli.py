@@ -5,7 +5,6 @@ A command imports what it runs when it is called.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from bags.chain.config import Config
-    from bags.fleet.check import Checked
-    from bags.fleet.monitor import FleetVerdict, Judged
+    from bags.fleet.monitor import FleetVerdict
+    from bags.fleet.rows import Row, Rows
     from bags.fleet.trials import FleetTrials
 
 LISTED = 20  # bags of a kind, by name
@@ -77,19 +76,24 @@ def check(
     from bags.chain.config import load_config
     from bags.commands.progress import progress_bar
     from bags.fleet.bags import UNREAD, named_bags
-    from bags.fleet.check import BAD, SERIOUS, check_fleet, write_parquet
+    from bags.fleet.check import BAD, GOOD, LOOK, SERIOUS, CheckBag
+    from bags.fleet.rows import read_rows, write_parquet
 
     settings = load_config(config_of(folder, config))
     named = named_bags(bags, patience=fleet.patience)
     _say_misspelt(named, settings)
     with progress_bar("checking") as progress:
-        found = check_fleet(
-            named, settings, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
+        found = read_rows(
+            CheckBag(settings),
+            named,
+            workers=fleet.workers(),
+            manifest=fleet.manifest,
+            progress=progress,
         )
     if table is not None:
         write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
-    _say_counts(len(found.rows), found.known, fleet.manifest, [(counts[v], v) for v in SERIOUS])
+    _say_counts(found, fleet.manifest, [(counts[v], v) for v in SERIOUS])
     wrong = [row for verdict in SERIOUS[:-1] for row in found.rows if row.verdict == verdict]
     if wrong:
         out.print(_checked_table(wrong[:ROWS]))
@@ -97,7 +101,8 @@ def check(
         left = Counter(row.verdict for row in more)
         said = ", ".join(f"{count} {verdict}" for verdict, count in left.items())
         out.print(f"and {len(more)} more ({said}); --out writes all of them")
-    if found.still:
+    usable = [row for row in found.rows if row.verdict in (LOOK, GOOD)]
+    if usable and not any(row.numbers["moves"] for row in usable):
         out.print(
             "no command moves in any bag that can be used: there is little to identify from",
             soft_wrap=True,
@@ -117,18 +122,19 @@ def _say_misspelt(names: Iterable[str], settings: Config) -> None:
             out.print(f"mind: {line}", soft_wrap=True, markup=False, style="dark_orange3")
 
 
-def _checked_table(rows: Sequence[Checked]) -> Table:
+def _checked_table(rows: Sequence[Row]) -> Table:
     shown = _table(rows)
     shown.add_column("verdict", no_wrap=True)
     shown.add_column("start (UTC)", min_width=10)
-    if any(row.lost is not None for row in rows):
+    is_counted = any("lost" in row.numbers for row in rows)
+    if is_counted:
         shown.add_column("lost", justify="right")
     shown.add_column("what to look at", overflow="fold", ratio=1)
     for row in rows:
         cells = [_plain(row.bag), row.verdict, _when(row.start)]
-        if any(other.lost is not None for other in rows):
-            cells.append("-" if row.lost is None else str(row.lost))
-        shown.add_row(*cells, _plain(row.trouble))
+        if is_counted:
+            cells.append(_number(row, "lost", ".0f"))
+        shown.add_row(*cells, _plain(row.reason))
     return shown
 
 
@@ -143,7 +149,7 @@ def monitor(
         Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
     ] = None,
 ) -> None:
-    """Hold every bag against one proved design: which robots, which days, which assumption.
+    """Hold every bag against one proved design: which are inside, and what they spend.
 
     How much of what is assumed each bag spends, the worst ten, what that says of the next bag, and
     whether the newest month is like the calibration. Status 0 if all are inside with the assumption
@@ -153,8 +159,8 @@ def monitor(
     from bags.commands.progress import progress_bar
     from bags.designs import documents
     from bags.fleet.bags import COPY, named_bags
-    from bags.fleet.check import write_parquet
-    from bags.fleet.monitor import JudgeBag, calibration_spent, monitor_fleet
+    from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent
+    from bags.fleet.rows import read_rows, write_parquet
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
 
@@ -166,17 +172,16 @@ def monitor(
     if settings is not None:
         _say_misspelt(named, settings)
     with progress_bar("judging") as progress:
-        found = monitor_fleet(
-            named,
-            task,
-            calibration_spent(folder, design),
-            workers=fleet.workers(),
-            manifest=fleet.manifest,
-            progress=progress,
+        read = read_rows(
+            task, named, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
         )
+    calibration = calibration_spent(folder, design)
+    found = FleetVerdict(read.rows, calibration, frozenset(design.made_with))
     if table is not None:
         write_parquet(found.rows, table)
-    _say_verdicts(found, fleet.manifest, table)
+    counts = Counter(row.verdict for row in found.rows)
+    _say_counts(read, fleet.manifest, [(counts[v], v) for v in _VERDICTS if counts[v]])
+    _say_verdicts(found)
     if found.worst:
         worst = named[found.worst[0].bag]
         centre = f" --config {config}" if config else ""
@@ -189,55 +194,48 @@ def monitor(
     if table is not None:
         out.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows} - {COPY}
-    if verdicts & {Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value} or any(
-        row.alarm for row in found.rows
-    ):
+    if verdicts & {*BROKEN} or any("alarm" in row.said for row in found.rows):
         raise typer.Exit(1)
     if verdicts != {Status.INSIDE.value}:
         raise typer.Exit(2)
 
 
-def _say_verdicts(found: FleetVerdict, manifest: Path | None, table: Path | None) -> None:
+def _say_verdicts(found: FleetVerdict) -> None:
     from bags.fleet.bags import COPY, UNREAD
 
-    counts = Counter(row.verdict for row in found.rows)
-    words = [word for word in _VERDICTS if counts[word]]
-    _say_counts(len(found.rows), found.known, manifest, [(counts[word], word) for word in words])
-    if own := found.own:
+    if own := len(found.own):
         out.print(f"{own} of them made the design: a verdict on these says little", soft_wrap=True)
-    for key, title in (("robot", "robots"), ("day", "days")):
-        _say_groups(title, found.by(key), words, table)
-    for what, count in Counter(r.assumption for r in found.rows if r.assumption).most_common():
-        out.print(f"broken in {_bags(count)}: {what}", soft_wrap=True, markup=False)
-    if most := max(found.histogram):
-        out.print("bags by how much of what is assumed they spent:")
-        for k, count in enumerate(found.histogram):
-            label = f"{10 * k} to {10 * k + 10} %" if k < 10 else "over 100 %"
-            out.print(f"{label:>12} {count:6d} {'#' * math.ceil(40 * count / most)}".rstrip())
     if found.worst:
         _say_worst(found.worst)
     for line in found.ranks:
         out.print(line, soft_wrap=True, highlight=False)
-    if found.ranks and found.unrecognised:
+    if found.ranks and found.made_of and not found.own:
         out.print(
             "none of these is known to be a bag that the design was made with. Those count above "
             "if they are here, read from elsewhere than for the design",
             soft_wrap=True,
         )
-    drift = found.drift
-    said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
-    out.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
-    _say_bags(
-        "outside, or what is assumed broken",
-        {r.bag: _since(r) for r in found.rows if r.verdict in BROKEN},
+    out.print(
+        str(
+            found.drift
+            or "drift is not judged: no calibration trials beside the funnel, or too few bags of "
+            "the newest month"
+        ),
+        soft_wrap=True,
     )
-    _say_bags("not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
-    _say_bags("clock", {r.bag: r.clock for r in found.rows if r.clock})
-    alarms = {r.bag: r.alarm for r in found.rows if r.alarm and r.verdict not in BROKEN}
-    _say_bags("only the second alarm", alarms)
+    bad = {row.bag: _since(row) for row in found.rows if row.verdict in BROKEN}
+    _say_bags("outside, or what is assumed broken", bad)
+    for what, title in (
+        ("unjudged", "not judged whole"),
+        ("clock", "clock"),
+        ("alarm", "only the second alarm"),
+    ):
+        told = {row.bag: row.said[what] for row in found.rows if what in row.said}
+        if what == "alarm":
+            told = {bag: said for bag, said in told.items() if bag not in bad}
+        _say_bags(title, told)
     for verdict, title in ((UNREAD, UNREAD), (COPY, "copies")):
-        said_of = {row.bag: row.reason for row in found.rows if row.verdict == verdict}
-        _say_bags(title, said_of)
+        _say_bags(title, {row.bag: row.reason for row in found.rows if row.verdict == verdict})
 
 
 BROKEN = ("outside", "assumption violated")
@@ -251,35 +249,7 @@ _VERDICTS = {  # and the heads of their columns
 }
 
 
-def _say_groups(
-    title: str, groups: Mapping[str, Sequence[Judged]], words: Sequence[str], table: Path | None
-) -> None:
-    """Those with trouble, as a table; how many have none, and how many are not shown."""
-    from bags.fleet.monitor import trouble_in
-
-    if list(groups) == ["-"]:
-        return  # the bags' names have no folders
-    troubled = {name: rows for name, rows in groups.items() if trouble_in(rows)}
-    named = [name for name in troubled if name]  # the others are listed as not read
-    out.print(f"{title} with trouble: {len(named)} of {len(set(groups) - {''})}")
-    if not named:
-        return
-    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    shown.add_column(title.removesuffix("s"), overflow="fold")
-    for head in ("bags", *(_VERDICTS[word] for word in words)):
-        shown.add_column(head, justify="right")
-    for name in named[:ROWS]:
-        rows = troubled[name]
-        counts = Counter(row.verdict for row in rows)
-        cells = (str(counts[word] or "") for word in words)
-        shown.add_row(_plain(name), str(len(rows)), *cells)
-    out.print(shown)
-    if (more := len(named) - ROWS) > 0:
-        rest = "--out writes every bag" if table is None else f"every bag is in {table}"
-        out.print(f"and {more} more {title} with trouble, none with more; {rest}")
-
-
-def _say_worst(worst: Sequence[Judged]) -> None:
+def _say_worst(worst: Sequence[Row]) -> None:
     from bags.fleet.monitor import in_percent
 
     count = f"the {len(worst)} bags that" if len(worst) > 1 else "the bag that"
@@ -297,17 +267,22 @@ def _say_worst(worst: Sequence[Judged]) -> None:
     for row in worst:
         shown.add_row(
             _plain(row.bag),
-            in_percent(row.spent or 0.0),
-            f"{row.spent_at:.3f} s",
+            in_percent(row.numbers["spent"]),
+            _number(row, "spent_at", ".3f", " s"),
             _when(row.start),
             _VERDICTS[row.verdict],
-            f"{row.bad_at:.3f} s" if row.bad_from else "-",
-            "-" if row.margin is None else f"{row.margin:.3f}",
+            _number(row, "bad_at", ".3f", " s"),
+            _number(row, "margin", ".3f"),
         )
     out.print(shown)
 
 
-def _table(rows: Sequence[Checked | Judged]) -> Table:
+def _number(row: Row, name: str, form: str, unit: str = "") -> str:
+    """A number of a row, - where it is not known."""
+    return f"{row.numbers[name]:{form}}{unit}" if name in row.numbers else "-"
+
+
+def _table(rows: Sequence[Row]) -> Table:
     """A table that begins with the bags' names, whole ones if they are not long."""
     shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
     longest = max(len(row.bag) for row in rows)
@@ -320,19 +295,20 @@ def _when(moment: str) -> str:
     return moment[:16].replace("T", " ")
 
 
-def _since(row: Judged) -> str:
+def _since(row: Row) -> str:
     """Why a bag is bad, and from when on."""
-    return row.reason if " at t = " in row.reason else f"from {row.bad_at:.3f} s on: {row.reason}"
+    if " at t = " in row.reason:
+        return row.reason
+    return f"from {row.numbers['bad_at']:.3f} s on: {row.reason}"
 
 
 def _bags(count: int) -> str:
     return f"{count} bag" if count == 1 else f"{count} bags"
 
 
-def _say_counts(
-    count: int, known: int, manifest: Path | None, counts: Sequence[tuple[int, str]]
-) -> None:
+def _say_counts(read: Rows, manifest: Path | None, counts: Sequence[tuple[int, str]]) -> None:
     """How many there are of each verdict, and how many were known from a run before."""
+    count, known = len(read.rows), read.known
     said = ", ".join(f"{n} {'copies' if word == 'copy' and n != 1 else word}" for n, word in counts)
     out.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
     if manifest is not None:

@@ -30,8 +30,10 @@ from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from concurrent.futures import Executor
 
     from bags.chain.config import Config
+    from bags.chain.steps import Trials
 
 
 def init(
@@ -92,9 +94,6 @@ class Instead:
 class Reading(Sharing):
     """Who reads the bags, and how patiently."""
 
-    strict: Annotated[
-        bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
-    ] = False
     patience: PatienceOption = 60.0
 
 
@@ -111,6 +110,7 @@ def identify(
     Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
     cannot be used is listed and left out, and the next run reads only what is new.
     """
+    from bags.chain.choosing import sections_to_try
     from bags.chain.config import load_config
     from bags.chain.tracking_config import is_tracking, load_tracking_config
     from bags.recordings.folders import expand_bags
@@ -123,57 +123,63 @@ def identify(
         from bags.commands import states
 
         states.identify(expand_bags(bags), load_tracking_config(path), folder)
-    elif instead.compare:
-        _compare(expand_bags(bags), load_config(path), folder)
-    elif reading.count or reading.scheduler or reading.strict or any(map(is_url, bags)):
-        _by_workers(bags, load_config(path), folder, reading, select=instead.select)
     else:
-        identify_here(expand_bags(bags), load_config(path), folder, select=instead.select)
+        settings = load_config(path)
+        if instead.select:
+            sections_to_try(settings)  # before bags are read
+        if instead.compare:
+            _compare(expand_bags(bags), settings)
+        elif reading.count or reading.scheduler or any(map(is_url, bags)):
+            _by_workers(bags, settings, folder, reading, select=instead.select)
+        else:
+            identify_here(expand_bags(bags), settings, folder, select=instead.select)
 
 
 def identify_here(bags: Sequence[Path], settings: Config, folder: Path, *, select: bool) -> None:
     """Read and identify in this process, and say what was found."""
-    from bags.chain.choosing import select_bags
-    from bags.chain.steps import identify_bags
-    from bags.commands import show
+    from bags.chain.steps import read_trials
 
-    with progress_bar("selecting" if select else "identifying") as progress:
-        if select:
-            show.say_selected(out, select_bags(bags, settings, folder, progress=progress))
-        else:
-            show.say_identified(out, identify_bags(bags, settings, folder, progress=progress))
+    with progress_bar("reading") as progress:
+        trials = read_trials(bags, settings, progress=progress)
+    _identify(trials, settings, folder, select=select)
 
 
 def _by_workers(
     bags: list[Path], settings: Config, folder: Path, reading: Reading, *, select: bool
 ) -> None:
     """Read by workers, identify at home, say what was left out and why."""
-    from bags.chain.choosing import sections_to_try, select_trials
-    from bags.chain.steps import identify_trials
-    from bags.commands import show
     from bags.commands.fleet_cli import say_read
     from bags.fleet.bags import named_bags
     from bags.fleet.trials import MANIFEST, read_fleet
 
-    if select:
-        sections_to_try(settings)
     workers = reading.workers()
     with progress_bar("reading") as progress:
         named = named_bags(bags, patience=reading.patience)
-        found = read_fleet(
-            named, settings, folder, workers=workers, strict=reading.strict, progress=progress
-        )
+        found = read_fleet(named, settings, folder, workers=workers, progress=progress)
     say_read(found, folder / MANIFEST)  # before anything is made of it, which may fail
-    with progress_bar("identifying") as progress, workers.sharing() as executor:
+    with workers.sharing() as executor:
+        _identify(found.trials, settings, folder, select=select, executor=executor)
+
+
+def _identify(
+    trials: Trials,
+    settings: Config,
+    folder: Path,
+    *,
+    select: bool,
+    executor: Executor | None = None,
+) -> None:
+    """Identify as configured, or what is best of `select`, and say what was found."""
+    from bags.chain.choosing import select_trials
+    from bags.chain.steps import identify_trials
+    from bags.commands import show
+
+    with progress_bar("selecting" if select else "identifying") as progress:
         if select:
-            show.say_selected(
-                out,
-                select_trials(found.trials, settings, folder, executor=executor, progress=progress),
-            )
+            chosen = select_trials(trials, settings, folder, executor=executor, progress=progress)
+            show.say_selected(out, chosen)
         else:
-            show.say_identified(
-                out, identify_trials(found.trials, settings, folder, progress=progress)
-            )
+            show.say_identified(out, identify_trials(trials, settings, folder, progress=progress))
 
 
 def _check(path: Path, bags: list[Path]) -> None:
@@ -197,19 +203,13 @@ def _check(path: Path, bags: list[Path]) -> None:
     typer.echo(f"{path}: nothing is wrong with it for {len(bags)} bags; no message was read")
 
 
-def _compare(bags: list[Path], settings: Config, folder: Path) -> None:
+def _compare(bags: list[Path], settings: Config) -> None:
     """Score every method on the same test bags: simulation, prediction, residuals, proof."""
     from bags.chain.choosing import compare_bags
     from bags.commands import show
-    from bags.designs import documents
-    from bags.pictures.report import report_available
 
     with progress_bar("comparing") as progress:
         compared = compare_bags(bags, settings, progress=progress)
     out.print(show.comparison_table(compared))
     for refusal in compared.refusals:
         out.print(f"no model: {escape(refusal)}", soft_wrap=True)
-    if report_available():
-        folder.mkdir(parents=True, exist_ok=True)
-        compared.draw(folder / documents.COMPARISON_PLOT)
-        out.print(f"wrote {folder / documents.COMPARISON_PLOT}", soft_wrap=True)

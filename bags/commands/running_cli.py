@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -74,7 +74,7 @@ def monitor(
         write_margins(target, replays)
     if judging.as_json:
         pairs = zip(replays, folders, strict=True)
-        typer.echo(json.dumps([asdict(judged_of(entry, bag, entry.name)) for entry, bag in pairs]))
+        typer.echo(json.dumps([judged_of(entry, bag, entry.name).cells for entry, bag in pairs]))
     else:
         show.say_replays(out, replays)
         if drawable(replays):

@@ -11,25 +11,23 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from bags.chain.choosing import Compared, Selected
+from bags.chain.choosing import Compared, Scored, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.commands.progress import progress_bar
 from bags.designs import documents
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
-from bags.monitoring.catching import Breaking, Catching, Caught
 from bags.monitoring.replay import Replay, ToJudge, replay_bag, to_judge
-from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.pictures.tables import STABILITY, methods_table, stability
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
-from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import DataError, duration, percent
-from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
+from nlsid_core.identification import Selection, describe, stated_rate
 from nlsid_core.kernel import text
 from nlsid_core.models import Signal
 from nlsid_core.running.comparison import Centre
@@ -49,7 +47,6 @@ processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
 COLUMNS = 80  # of a terminal that is not asked
 UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
-STABILITY = "proved rate a sample (time constant)"
 
 
 def say_identified(console: Console, result: Identified) -> None:
@@ -69,26 +66,6 @@ def say_selected(console: Console, result: Selected) -> None:
     if result.selection.refitted:
         console.print("the chosen class, fitted to training and validation trials together:")
     say_identified(console, result.identified)
-
-
-def methods_table(fit: Fit[Model], test: Dataset) -> Table:
-    """Every method's error on the test trials, time, and whether its model is proved stable."""
-    table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
-    table.collapse_padding = True
-    longest = max(len(candidate.method.title) for candidate in fit.candidates)
-    table.add_column("method", no_wrap=longest <= 38)  # as long as the rate beside it stays whole
-    table.add_column("test error", justify="right", min_width=7)
-    table.add_column("time", justify="right", no_wrap=True)
-    table.add_column(STABILITY, min_width=15)
-    for candidate in fit.candidates:
-        table.add_row(
-            candidate.method.title,
-            percent(fit.errors["test"][candidate.method.name]),
-            duration(candidate.seconds),
-            stability(candidate),
-            style="bold" if candidate is fit.chosen else "",
-        )
-    return table
 
 
 def notes(result: Identified) -> list[str]:
@@ -172,13 +149,6 @@ def _compared(row: Scored, horizons: Sequence[int]) -> list[str]:
     ]
 
 
-def stability(candidate: Candidate[Model]) -> str:
-    """The proved rate, or that none is, in colour."""
-    if candidate.proof is None:
-        return f"[dark_orange3]{candidate.unproved}"
-    return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
-
-
 def funnel_table(design: OutputTubeDesign) -> Table:
     """What the tube promises and on what."""
     model, funnel = design.model, design.funnel
@@ -219,97 +189,6 @@ def funnel_table(design: OutputTubeDesign) -> Table:
         table.add_row("assuming", escape(line))
     for line in of_funnel(model.document(), funnel.document()).said:
         table.add_row("measured", escape(line))
-    return table
-
-
-def catching_table(catching: Catching) -> Table:
-    """What the funnel and other detectors catch of every sabotage, and how soon."""
-    detectors = list(catching.rows[0].others)
-    plural = "s" if catching.trials > 1 else ""
-    table = Table(
-        title=f"caught of {catching.trials} held-back trial{plural}, and after how many s (median)",
-        caption=CATCHING_CAPTION,
-        title_justify="left",
-        caption_justify="left",
-        box=SIMPLE_HEAD,
-        show_edge=False,
-        padding=0,  # 79 columns in all
-    )
-    table.add_column("fault", no_wrap=True)
-    for name in ("outside", "violated", "alarm", "unknown", "after", *detectors):
-        table.add_column(name, justify="right")
-    for row in catching.rows:
-        if row.refused:  # the reason is said below the table
-            table.add_row(row.fault, *["-"] * (5 + len(detectors)))
-            continue
-        funnel = row.funnel
-        parts = (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
-        counts = [str(count) for count in parts]
-        others = [_soon(row.others[name]) for name in detectors]
-        least = max((other.count for other in row.others.values()), default=0)
-        style = "dark_orange3" if least > funnel.count else ""
-        table.add_row(row.fault, *counts, _after(funnel), *others, style=style)
-    return table
-
-
-CATCHING_CAPTION = (
-    "outside, violated (what is assumed) and alarm (only the monitor's own CUSUM, of which nothing "
-    "is proved) are all caught; unknown: not judged to the end. "
-    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
-    "(untouched). Coloured: one of them catches more."
-)
-
-
-def _after(caught: Caught) -> str:
-    if math.isnan(caught.after):
-        return "-"
-    digits = next((d for d, least in ((0, 100.0), (1, 10.0)) if caught.after >= least), 2)
-    return f"{caught.after:.{digits}f}"
-
-
-def _soon(caught: Caught) -> str:
-    return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
-
-
-def warn(console: Console, line: str) -> None:
-    """Say what a person should know before they trust what was made."""
-    console.print(
-        f"warning: {line}", soft_wrap=True, markup=False, highlight=False, style="dark_orange3"
-    )
-
-
-def say_catching(console: Console, catching: Catching) -> None:
-    """The widths, the table, and what is to be known of a tube that is too wide."""
-    for width in catching.widths:
-        said = f"half-width of {width.name}: {width.said}, {width.part}"
-        console.print(said, soft_wrap=True, highlight=False)
-    console.print(catching_table(catching))
-    for row in catching.rows:
-        if row.refused:
-            console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
-    if alone := [f"{row.fault}: {row.output}" for row in catching.rows if row.output]:
-        said = "a sensor's fault is in one output at a time; above is the one caught least: "
-        console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
-    if false := catching.rows[0].funnel.count:
-        warn(
-            console,
-            f"{false} of {catching.trials} held-back trials, nothing put into them, "
-            f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
-            "robot; calibrate on more trials like those it will run, or raise safety_factor",
-        )
-    for line in (*catching.beyond, *catching.still):
-        warn(console, line)
-    for line in catching.warnings():
-        warn(console, line)
-
-
-def breaking_table(found: Breaking) -> Table:
-    """By fault, how many of the copies that have it break what a proof assumes."""
-    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
-    table.add_column("fault")
-    table.add_column("broken", justify="right")
-    for fault, count in found.counts.items():
-        table.add_row(fault, f"{count} of {found.trials}")
     return table
 
 

@@ -14,6 +14,7 @@ from bags.commands import show
 from bags.commands.options import out
 from bags.commands.progress import progress_bar
 from bags.designs import documents
+from bags.pictures import tables
 from bags.pictures.report import report_available
 from nlsid_core.design.sampled.design import TrackingDesign
 from nlsid_core.identification.states import StateFit
@@ -41,10 +42,10 @@ def funnel(bags: Sequence[Path], config: TrackingConfig, folder: Path) -> Tracki
         soft_wrap=True,
     )
     recorded = read_signals_of(bags, config)
-    out.print(show.breaking_table(tracking_steps.what_breaks(made, recorded)))
+    out.print(tables.breaking_table(tracking_steps.what_breaks(made, recorded)))
     widest = tracking_steps.widest_start(made, recorded)
     if widest < 1.0:
-        show.warn(
+        tables.warn(
             out,
             f"the runs started within {widest:.2g} of the inlet that is claimed: what disturbs "
             "farther out was not measured; record runs that start there",

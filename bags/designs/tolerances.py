@@ -17,7 +17,6 @@ from nlsid_core import files
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict, text
 from nlsid_core.models.signal import Signal
 
@@ -175,16 +174,13 @@ def tolerances(folder: Path | str) -> Tolerances:
             "are written of funnels of identified models"
         )
     if isinstance(funnel, SampledFunnel):
-        signals = design.model.x
         path, goal = funnel.half_widths.max(axis=0), funnel.half_widths[-1]
         about = (
             "the plan in policy.json, sample by sample; the claim is about the observer's estimate "
             "of the state, which a measurement can be off by its noise"
         )
     else:
-        given = design.model.y
-        signals = (given,) if isinstance(given, Signal) else given
-        if isinstance(funnel, TubeFunnel) and any(tube.follows for tube in funnel.tubes):
+        if any(tube.follows for tube in funnel.tubes):
             raise DataError(
                 f"{folder}: the tube's half-width follows the commands, and a tolerance is one "
                 "number; design it with `funnel: {level: constant}` for tolerances"
@@ -194,7 +190,7 @@ def tolerances(folder: Path | str) -> Tolerances:
         before_use = SIMULATED
         if design.policy is not None:
             about += "; or with the plan in policy.json where the policy drives"
-    rows = zip(signals, path.tolist(), goal.tolist(), strict=True)
+    rows = zip(design.signals[0], path.tolist(), goal.tolist(), strict=True)
     entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)
     return Tolerances(tuple(entries), about, design.verdict, before_use)
 

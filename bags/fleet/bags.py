@@ -1,8 +1,6 @@
-"""The bags of a fleet: their names, whose they are, and which of them are one recording."""
+"""The bags of a fleet: their names, and which of them are one recording."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +11,6 @@ from nlsid_core.errors import DataError
 WILD: Final = frozenset("*?[")
 UNREAD: Final = "not read"  # nothing of the bag can be used: damaged, cut off, other topics, gone
 COPY: Final = "copy"  # of a recording that another bag has: it counts there
-_DATE: Final = re.compile(r"(19|20)\d\d([-_.T]?\d\d)*|(year|month|day|date|hour)=.*")
-_PART_OF_DATE: Final = re.compile(r"\d\d?")  # below a year or a month
 
 
 def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[str, Path]:
@@ -35,32 +31,6 @@ def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[
                     "above, or one pattern for both"
                 )
     return dict(sorted(found.items()))
-
-
-def robots_of(names: Iterable[str]) -> dict[str, str]:
-    """Whose bag each is, by the folders in its name; `-` where there is no such folder.
-
-    It is the first folder that is no date and not the same for all bags, else the last no date.
-    """
-    parts = {name: name.split("/")[:-1] for name in names}
-    named = [depth for depth, is_date in enumerate(_dates(parts)) if not is_date]
-    told = (d for d in named if len({_at(own, d) for own in parts.values()}) > 1)
-    at = next(told, named[-1] if named else None)
-    return {name: "-" if at is None else _at(own, at) for name, own in parts.items()}
-
-
-def _dates(parts: Mapping[str, Sequence[str]]) -> list[bool]:
-    """Whether the folders of a depth are dates, or the parts of dates that begin above them."""
-    found: list[bool] = []
-    for column in zip_longest(*parts.values()):
-        there = [text for text in column if text is not None]
-        kinds = (_DATE, _PART_OF_DATE) if found and found[-1] else (_DATE,)
-        found.append(any(all(kind.fullmatch(text) for text in there) for kind in kinds))
-    return found
-
-
-def _at(folders: Sequence[str], depth: int) -> str:
-    return folders[depth] if depth < len(folders) else "-"
 
 
 class Recordings:

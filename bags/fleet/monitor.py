@@ -1,11 +1,10 @@
 """Every bag of a fleet held against one design: who left it, when, and is the fleet what it was."""
 
 import hashlib
-import json
 import math
 import pickle
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -14,11 +13,7 @@ from scipy.stats import mannwhitneyu
 
 from bags.chain.training import load_held_back, load_training
 from bags.designs import documents
-from bags.fleet.bags import COPY, UNREAD, Recordings, robots_of, same_as
-from bags.fleet.check import iso
-from bags.fleet.manifest import Manifest
-from bags.fleet.run import ask
-from bags.fleet.workers import Workers
+from bags.fleet.rows import Row, iso
 from bags.monitoring.replay import Definitions, Replay, replay_bag
 from bags.recordings.definitions import texts_of
 from bags.signals.reader import bag_origin
@@ -27,59 +22,12 @@ from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.tube import TubeFunnel
-from nlsid_core.progress import Progress, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status, cause
+from nlsid_core.running.reading import Reading, Status
 
 RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
-BINS = 10  # of the histogram, of what the assumption allows
 LEAST = 3  # bags of a month, and calibration trials, that are compared
-
-
-@dataclass(frozen=True)
-class Judged:
-    """One bag: its verdict, and the numbers behind it.
-
-    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: what of it
-    was broken first, without numbers. spent: the largest part of what is assumed that was used
-    (None: not measured), at spent_at, s of the run. margin: the least (None: nothing judged),
-    margin_at: s. start: the bag's first log time, spent_when, and bad_from: of the first bad
-    sample, all ISO 8601 in UTC; bad_at: s of the run. alarm: of the second alarm. unjudged: the
-    first samples that were not judged, and why, also of a bag that is bad. clock: where its stamps
-    go back. judged, span: s. filled: samples nobody measured. digest: of the recording.
-    """
-
-    bag: str
-    robot: str
-    verdict: str
-    reason: str = ""
-    assumption: str = ""
-    spent: float | None = None
-    spent_at: float = 0.0
-    spent_when: str = ""
-    margin: float | None = None
-    margin_at: float = 0.0
-    start: str = ""
-    bad_from: str = ""
-    bad_at: float = 0.0
-    alarm: str = ""
-    unjudged: str = ""
-    clock: str = ""
-    judged: float = 0.0
-    span: float = 0.0
-    filled: int = 0
-    digest: str = ""
-
-    @property
-    def month(self) -> str:
-        """The month of its start, `2026-11`; empty if unknown."""
-        return self.start[:7]
-
-    @property
-    def has_trouble(self) -> bool:
-        """Whether there is something to look at; a copy is looked at where it counts."""
-        return bool(self.alarm or self.clock) or self.verdict not in (Status.INSIDE.value, COPY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,43 +47,46 @@ class JudgeBag:
         return f"judge {version('nlsid')} {digest} {self.centre} {wiring} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
-        """A Judged, as JSON."""
+        """A Row, as JSON."""
         replay = replay_bag(self.design, bag, centre=self.centre, definitions=self.definitions)
-        return files.canonical(asdict(judged_of(replay, bag, name)))
+        return judged_of(replay, bag, name).content()
 
 
-def judged_of(replay: Replay, bag: Path, name: str) -> Judged:
-    """What `replay` says of `bag`, which is called `name`, in a few numbers."""
-    stamps = dict(zip(map(id, replay.readings), replay.stamps_ns, strict=True))
-    most, worst, bad = most_spent(replay.judged), replay.worst, replay.first_bad
-    alarm = replay.first_alarm
-    return Judged(
-        bag=name,
-        robot="-",  # told from the others at home
-        verdict=replay.verdict,
-        reason=replay.reason,
-        assumption="" if bad is None or bad.status is Status.OUTSIDE else _broken(bad.reason),
-        spent=None if most is None else most.assumption,
-        spent_at=0.0 if most is None else most.t,
-        spent_when="" if most is None else iso(stamps[id(most)]),
-        margin=None if worst is None else max(worst.margin, -1e300),
-        margin_at=0.0 if worst is None else worst.t,
+def judged_of(replay: Replay, bag: Path, name: str) -> Row:
+    """What `replay` says of `bag`, which is called `name`, in a few words and numbers.
+
+    said: `alarm`, the second one; `unjudged`, the first samples that were not judged, and why, also
+    of a bag that is bad; `clock`, where its stamps go back.
+    numbers: the least `margin`; the largest part of the assumption that was `spent`, at `spent_at`
+    s of the run; `bad_at`, the first bad sample; s that were `judged` of the `span`; samples that
+    were `filled` in.
+    """
+    said = {"clock": replay.clock, "unjudged": _unjudged(replay)}
+    numbers: dict[str, float] = {
+        "judged": replay.judged_span,
+        "span": replay.span,
+        "filled": replay.filled,
+    }
+    if replay.first_alarm is not None:
+        said["alarm"] = replay.first_alarm.alarm
+    if (most := most_spent(replay.judged)) is not None:
+        numbers |= {"spent": most.assumption, "spent_at": most.t}
+    if replay.worst is not None:
+        numbers |= {"margin": max(replay.worst.margin, -1e300)}
+    if replay.first_bad is not None:
+        numbers["bad_at"] = replay.first_bad.t
+    marks = [bag_origin(bag)["digest"]]
+    if replay.judged:
+        marks.append(files.digest({"start": replay.start_ns, **said, **numbers}))
+    return Row(
+        name,
+        replay.verdict,
+        replay.reason,
         start=iso(replay.start_ns),
-        bad_from="" if bad is None else iso(stamps[id(bad)]),
-        bad_at=0.0 if bad is None else bad.t,
-        alarm="" if alarm is None else alarm.alarm,
-        unjudged=_unjudged(replay),
-        clock=replay.clock,
-        judged=replay.judged_span,
-        span=replay.span,
-        filled=replay.filled,
-        digest=bag_origin(bag)["digest"],
+        marks=tuple(marks),
+        said={what: text for what, text in said.items() if text},
+        numbers=numbers,
     )
-
-
-def _broken(reason: str) -> str:
-    """What was broken, whenever and by however much."""
-    return cause(reason.partition(" at t = ")[0]).replace("#", "...").rstrip(",")
 
 
 def _unjudged(replay: Replay) -> str:
@@ -177,60 +128,41 @@ class Drift:
 
 @dataclass(frozen=True, eq=False)
 class FleetVerdict:
-    """Every bag's row, in order.
+    """What the rows of a fleet say together.
 
     calibration: what each trial that scaled the design spent. made_of: digests of the recordings
-    that designed or scaled it. known: how many rows were in the manifest before.
+    that designed or scaled it.
     """
 
-    rows: tuple[Judged, ...]
+    rows: tuple[Row, ...]
     calibration: tuple[float, ...]
     made_of: frozenset[str]
-    known: int = 0
 
     @property
-    def others(self) -> list[Judged]:
+    def own(self) -> list[Row]:
+        """The bags that the design was made of."""
+        return [row for row in self.rows if not self.made_of.isdisjoint(row.marks)]
+
+    @property
+    def others(self) -> list[Row]:
         """The bags of which the assumption was measured and that the design was not made of."""
-        return [r for r in self.rows if r.spent is not None and r.digest not in self.made_of]
+        return [row for row in self._measured if self.made_of.isdisjoint(row.marks)]
 
     @property
-    def unrecognised(self) -> bool:
-        """Whether no bag here is known to be one that the design was made of."""
-        return bool(self.made_of) and not any(row.digest in self.made_of for row in self.rows)
-
-    @property
-    def own(self) -> int:
-        """How many bags the design was made of."""
-        return sum(row.digest in self.made_of for row in self.rows)
-
-    @property
-    def worst(self) -> list[Judged]:
+    def worst(self) -> list[Row]:
         """Ten bags that spent the most."""
-        measured = [row for row in self.rows if row.spent is not None]
-        return sorted(measured, key=lambda row: -(row.spent or 0.0))[:10]
+        return sorted(self._measured, key=lambda row: -row.numbers["spent"])[:10]
 
     @property
-    def histogram(self) -> list[int]:
-        """How many bags spent 0 to 10 %, ..., 90 to 100 % of what is assumed, and more."""
-        counts = [0] * (BINS + 1)
-        for row in self.rows:
-            if row.spent is not None:
-                counts[min(BINS, math.ceil(max(BINS * row.spent - 1.0, 0.0)))] += 1
-        return counts
-
-    def by(self, key: str) -> dict[str, list[Judged]]:
-        """The rows by `robot` or by `day` (empty: unknown), those with the most trouble first."""
-        found: dict[str, list[Judged]] = {}
-        for row in self.rows:
-            found.setdefault(row.start[:10] if key == "day" else row.robot, []).append(row)
-        return dict(sorted(found.items(), key=lambda e: (-trouble_in(e[1]), e[0])))
+    def _measured(self) -> list[Row]:
+        return [row for row in self.rows if "spent" in row.numbers]
 
     @property
     def ranks(self) -> list[str]:
         """What m bags say of the next, if it is exchangeable with them: of two ranks that are fixed
         before anything is looked at. Source: see `nlsid_core.data.calibration`.
         """
-        spent = sorted((row.spent or 0.0 for row in self.others), reverse=True)
+        spent = sorted((row.numbers["spent"] for row in self.others), reverse=True)
         m = len(spent)
         ranks = [1] if m else []
         if (rare := math.floor(RARE * (m + 1))) > 1:
@@ -245,8 +177,8 @@ class FleetVerdict:
     @property
     def drift(self) -> Drift | None:
         """Of the newest month; None if it or the calibration has fewer than LEAST."""
-        month = max((row.month for row in self.others), default="")
-        newest = [row.spent for row in self.others if row.month == month and row.spent is not None]
+        month = max((row.start[:7] for row in self.others), default="")
+        newest = [row.numbers["spent"] for row in self.others if row.start.startswith(month)]
         if not month or min(len(newest), len(self.calibration)) < LEAST:
             return None
         test = mannwhitneyu(newest, self.calibration, alternative="two-sided")
@@ -258,50 +190,6 @@ class FleetVerdict:
             float(test.pvalue),
             float(test.statistic) / pairs,
         )
-
-
-def trouble_in(rows: Sequence[Judged]) -> int:
-    """How many of them have trouble."""
-    return sum(row.has_trouble for row in rows)
-
-
-def monitor_fleet(
-    bags: Mapping[str, Path],
-    task: JudgeBag,
-    calibration: Sequence[float],
-    *,
-    workers: Workers,
-    manifest: Path | None = None,
-    progress: Progress = silent,
-) -> FleetVerdict:
-    """Each bag as `nlsid monitor` judges it; one that cannot be read or judged is `not read`.
-
-    calibration: what each trial that scaled the design spent (`calibration_spent`).
-    """
-    robots, known, rows = robots_of(bags), 0, []
-    with Manifest(manifest) as kept:
-        for answer in ask(task, bags, workers, kept, progress=progress):
-            known += answer.kept
-            row = (
-                Judged(answer.name, "", UNREAD, answer.reason)
-                if answer.reason
-                else Judged(**json.loads(answer.content))
-            )
-            rows.append(replace(row, robot=robots[row.bag]))
-    made_of = frozenset(task.design.made_with)
-    return FleetVerdict(tuple(counted_once(rows)), tuple(calibration), made_of, known)
-
-
-def counted_once(rows: Sequence[Judged]) -> list[Judged]:
-    """The rows, but the second of a recording (by its digest, or all numbers) is a `copy`."""
-    recordings, counted = Recordings(), []
-    for row in rows:
-        numbers = replace(row, bag="", robot="", digest="") if row.judged else None
-        marks = [mark for mark in (row.digest, numbers) if mark]
-        if (first := recordings.first(row.bag, marks)) != row.bag:
-            row = Judged(row.bag, row.robot, COPY, same_as(first), start=row.start)
-        counted.append(row)
-    return counted
 
 
 def calibration_spent(folder: Path, design: AnyDesign) -> tuple[float, ...]:

@@ -60,7 +60,6 @@ def ask(
     workers: Workers,
     manifest: Manifest,
     *,
-    strict: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Answer]:
     """The answers in the order of `bags` (by name), whoever gave them and whenever they came.
@@ -68,9 +67,8 @@ def ask(
     All are there before the first is given. Until then the manifest holds what they say, so that
     memory does not.
 
-    A bag of which the worker dies is asked of again, alone, and given up when it dies again. With
-    `strict` the first bag without an answer raises BagError. Raises DataError if the workers are
-    gone for good; what was answered by then is in the manifest.
+    A bag of which the worker dies is asked of again, alone, and given up when it dies again. Raises
+    DataError if the workers are gone for good; what was answered by then is in the manifest.
     """
     answers: dict[str, Answer] = {}
     keys: dict[str, str] = {}
@@ -85,15 +83,11 @@ def ask(
             answers[name] = Answer(bag, name, kept=True)
         else:
             fresh.append(name)
-    if strict and (lost := [answer for answer in answers.values() if answer.reason]):
-        raise BagError(f"{lost[0].bag}: {lost[0].reason}")
     if known := sum(answer.kept for answer in answers.values()):
         progress(f"{known} of {len(bags)} bags are known", len(answers) / len(bags))
     asked = {name: (bags[name], keys[name]) for name in fresh}
     with closing(_asked(task, asked, workers)) as given:
         for answer in given:
-            if answer.reason and strict:
-                raise BagError(f"{answer.bag}: {answer.reason}")
             if not answer.reason:
                 manifest.keep(keys[answer.name], str(answer.bag), answer.content)
             answers[answer.name] = replace(answer, bag=bags[answer.name], content=b"")
@@ -124,28 +118,29 @@ def _asked(
                 if next(reversed(running)).done():
                     break  # in this process: said at once
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            broken = False
+            died = []
             for future in done:
                 name = running.pop(future)
                 error = _error(future)
                 if error is None:
                     yield future.result()
-                elif not isinstance(error, BrokenExecutor):
-                    yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
+                elif isinstance(error, BrokenExecutor):
+                    died.append(name)
                 else:
-                    broken = True
-                    deaths[name] += 1
-                    if deaths[name] < DEATHS:
-                        suspects.append(name)
-                    else:
-                        yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
-            if broken:
-                suspects.extend(running.values())
-                for name in running.values():
-                    deaths[name] += 1
-                running.clear()
-                workers.close(executor)
-                executor = workers.open()
+                    yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
+            if not died:
+                continue
+
+            died += running.values()
+            running.clear()
+            workers.close(executor)
+            executor = workers.open()
+            for name in died:
+                deaths[name] += 1
+                if deaths[name] < DEATHS:
+                    suspects.append(name)
+                else:
+                    yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
     finally:
         workers.close(executor)
 

@@ -24,7 +24,7 @@ from bags.fleet.run import Answer, ask, without_name
 from bags.fleet.workers import Workers
 from bags.recordings.definitions import read_definitions, texts_of
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.progress import Progress, silent
 
 MANIFEST = documents.FLEET
@@ -81,23 +81,18 @@ def read_fleet(
     out: Path,
     *,
     workers: Workers,
-    strict: bool = False,
     progress: Progress = silent,
 ) -> FleetTrials:
     """`read_trials` of bags by name, by workers; what they read is kept in DIR/fleet.sqlite.
 
-    A bag that cannot be read or used is left out, and so is a second copy of one recording; with
-    `strict` the first of them raises BagError. DataError, before any is read, if their names leave
+    A bag that cannot be read or used is left out, and so is a second copy of one recording.
+    DataError, before any is read, if their names leave
     nothing to train on, or nothing for a use that the configuration names bags for.
     """
     check_split(list(bags), config)
     with Manifest(out / MANIFEST) as manifest:
-        given = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
-        found = usable_trials(given, config)
-    if strict and found.left_out:
-        name, reason = next(iter(found.left_out.items()))
-        raise BagError(f"{bags[name]}: {reason}")
-    return found
+        given = ask(ReadTrials(config), bags, workers, manifest, progress=progress)
+        return usable_trials(given, config)
 
 
 def usable_trials(given: Iterable[Answer], config: Config) -> FleetTrials:

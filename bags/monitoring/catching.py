@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bags.signals.grid import said_restarts
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.designs import AnyDesign
@@ -217,8 +218,8 @@ class Catching:
 
     trials: how many were held back. shares: of each calibration trial, the part of what the funnel
     assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
-    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p). remedy: what
-    to try where the assumption is what is wide.
+    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p).
+    restarts: which of them a monitor would not judge as one run, and why.
     """
 
     widths: tuple[Width, ...]
@@ -228,7 +229,7 @@ class Catching:
     shares: tuple[tuple[str, float], ...]
     errors: tuple[tuple[FloatArray, FloatArray], ...]
     half_widths: tuple[FloatArray, ...]
-    remedy: str
+    restarts: tuple[str, ...] = ()
 
     @property
     def beyond(self) -> list[str]:
@@ -289,7 +290,7 @@ class Catching:
             said.append(
                 f"{off}, and the half-width is {width.half_width / max(needed, TINY):.3g} times "
                 "that: what is assumed of the innovations is wider than the model's error. Try "
-                f"{self.remedy}"
+                "another funnel.reaction_time, or a model that leaves less in its residual"
             )
         return said
 
@@ -317,15 +318,14 @@ def what_it_catches(
     held_back: Dataset,
     calibration: Dataset,
     ranges: FloatArray,
-    remedy: str,
 ) -> Catching:
     """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
 
     Of several outputs a sensor's fault is put into one at a time.
 
-    ranges: (p,) of each output, in its unit. remedy: see `Catching`. The thresholds of detectors
-    have the tube's safety factor too. A detector that alarms in more of the untouched trials than
-    the monitor gets its threshold raised until it does not.
+    ranges: (p,) of each output, in its unit. The thresholds of detectors have the tube's safety
+    factor too. A detector that alarms in more of the untouched trials than the monitor gets its
+    threshold raised until it does not.
     """
     monitor, p = design.monitor(Centre.COMMAND), len(ranges)
     factor = design.funnel.tubes[0].safety_factor
@@ -384,7 +384,7 @@ def what_it_catches(
         tuple(sorted(shares.items(), key=lambda entry: -entry[1])),
         tuple((run.t, run.residuals.error) for run in clean),
         tuple(run.widths for run in clean),
-        remedy,
+        tuple(said_restarts(held_back)),
     )
 
 

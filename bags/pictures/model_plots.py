@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, tidy
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, grid, legend, thinned, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Fit, Model, Validation, simulate_trial
@@ -23,13 +23,9 @@ def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
     simulated = {trial.name: simulate_trial(chosen.model, trial)[:, output] for trial in test}
     trials = sorted(test, key=lambda t: -_size(t.y[:, output] - simulated[t.name]))[:MOST_TRIALS]
     trials.sort(key=lambda t: test.names.index(t.name))
-    columns = min(len(trials), COLUMNS)
-    rows = -(-len(trials) // columns)
-    width = 3.1 * columns if columns > 1 else 9.5
-    figure = Figure(figsize=(width, 2.1 * rows + 0.5), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    panels = list(grid.flat)
-    for axes, trial in zip(panels, trials, strict=False):
+    width = 3.1 if len(trials) > 1 else 9.1
+    figure, panels = grid(len(trials), COLUMNS, (width, 2.1), sharey=True)
+    for axes, trial in zip(panels, trials, strict=True):
         y = trial.y[:, output]
         rows_drawn = _excerpt(y - simulated[trial.name])
         t = trial.t[rows_drawn] - trial.t[0]
@@ -45,20 +41,9 @@ def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
         )
         drawn = "" if len(t) == len(trial) else f", {len(t)} of {len(trial)} samples"
         axes.set_title(f"{trial.name}{drawn}", fontsize=9, loc="left")
-    for axes in panels[len(trials) :]:
-        axes.set_visible(False)
-    tidy(panels[: len(trials)])
     figure.supxlabel("time [s]", fontsize=9)
     figure.supylabel(axis_name(test.trajectories[0], output), fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=min(len(labels), 3),
-        fontsize=8,
-        frameon=False,
-    )
+    legend(figure, panels[:1])
     return figure
 
 
@@ -67,14 +52,14 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     first = test.trajectories[0]
     n_y, n_u = first.y.shape[1], first.u.shape[1]
     figure = Figure(figsize=(3.3 * (2 + n_u), 2.7 * n_y + 0.4), layout="constrained")
-    grid = figure.subplots(n_y, 2 + n_u, squeeze=False)
+    panels = figure.subplots(n_y, 2 + n_u, squeeze=False)
     start = max(history(chosen.model), chosen.transient)
     predicts = learns(chosen.model)
     for i in range(n_y):
-        over_time, auto, *crossed = grid[i]
+        over_time, auto, *crossed = panels[i]
         for trial in test:
             left = trial.y[start:, i] - simulate_trial(chosen.model, trial)[start:, i]
-            t, e = _thinned(trial.t[start:] - trial.t[0], left)
+            t, e = thinned(trial.t[start:] - trial.t[0], left, DRAWN)
             over_time.plot(t, e, lw=0.8)
         over_time.set_title(f"residual of {axis_name(first, i)}", fontsize=8, loc="left")
         over_time.set_xlabel("time [s]", fontsize=8)
@@ -99,11 +84,10 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
                 predicts=predicts,
             )
             axes.set_title(f"with {first.u_names[j]}", fontsize=8, loc="left")
-        for axes in grid[i, 1:]:
+        for axes in panels[i, 1:]:
             axes.set_xlabel("lag [samples]", fontsize=8)
-    handles, labels = grid[0, 1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
-    tidy(list(grid.flat))
+    legend(figure, panels[0, 1:2], loc="outside upper right")
+    tidy(list(panels.flat))
     return figure
 
 
@@ -143,16 +127,6 @@ def _excerpt(error: FloatArray) -> slice:
     worst = int(np.argmax(np.abs(error)))
     start = min(max(worst - LONGEST // 2, 0), len(error) - LONGEST)
     return slice(start, start + LONGEST)
-
-
-def _thinned(t: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """At most DRAWN points: of each block of samples the largest."""
-    block = -(-len(t) // DRAWN)
-    if block <= 1:
-        return t, e
-    rows = np.arange(len(t) // block * block).reshape(-1, block)
-    largest = rows[np.arange(len(rows)), np.argmax(np.abs(e[rows]), axis=1)]
-    return t[largest], e[largest]
 
 
 def _bounded(simulated: FloatArray, measured: FloatArray) -> FloatArray:

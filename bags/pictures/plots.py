@@ -1,8 +1,9 @@
 """Pictures for reports (extra `report`: matplotlib). Each function returns a Figure."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,10 +11,12 @@ from matplotlib.figure import Figure
 
 from bags.monitoring.replay import Replay
 from nlsid_core import files
+from nlsid_core.arrays import FloatArray
 from nlsid_core.running.reading import Reading, Status
 
 INK, BLUE, ORANGE, RED, GREY = "#222222", "#1f6fb4", "#d9822b", "#c23b3b", "#9aa0a6"
 LINE = 1.2
+Place = Literal["outside upper left", "outside upper right", "outside lower left"]
 
 
 def svg(figure: Figure) -> str:
@@ -44,6 +47,39 @@ def write_png(path: Path, figure: Figure) -> None:
     files.write_atomically(path, png(figure))
 
 
+def grid(
+    count: int, columns: int, size: tuple[float, float], *, sharey: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """So many panels of this size [in], row by row, in at most so many columns."""
+    columns = min(count, columns)
+    rows = -(-count // columns)
+    width, height = size[0] * columns + 0.4, size[1] * rows + 0.5
+    figure = Figure(figsize=(width, height), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    tidy(panels[:count])
+    return figure, panels[:count]
+
+
+def legend(
+    figure: Figure, panels: Iterable[Axes], *, loc: Place = "outside upper left", ncols: int = 3
+) -> None:
+    """One legend for these panels, each label once."""
+    named: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    figure.legend(
+        list(named.values()),
+        list(named),
+        loc=loc,
+        ncols=min(len(named), ncols),
+        fontsize=8,
+        frameon=False,
+    )
+
+
 def margins(replays: Sequence[Replay]) -> Figure:
     """Per replayed bag: measured output in the tube above, margin and assumption used below."""
     columns = min(len(replays), 4)
@@ -69,19 +105,7 @@ def margins(replays: Sequence[Replay]) -> Figure:
     for kind in (0, 1):
         _same_limits([axes for axes in panels[kind::2].flat if axes.get_visible()])
     tidy([axes for axes in panels.flat if axes.get_visible()])
-    handles, labels = [], []
-    for axes in (panels[0, 0], panels[1, 0]):
-        found = axes.get_legend_handles_labels()
-        handles += found[0]
-        labels += found[1]
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=min(len(labels), 2 * columns),
-        fontsize=8,
-        frameon=False,
-    )
+    legend(figure, panels[:2, 0], ncols=2 * columns)
     return figure
 
 
@@ -130,6 +154,17 @@ def _same_limits(panels: list[Axes]) -> None:
     limits = [axes.get_ylim() for axes in panels]
     for axes in panels:
         axes.set_ylim(min(lo for lo, _ in limits), max(hi for _, hi in limits))
+
+
+def thinned(t: FloatArray, values: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """At most so many points: of each stretch of more the least and the largest."""
+    if len(t) <= most:
+        return t, values
+    kept: list[int] = []
+    for part in np.array_split(np.arange(len(t)), most // 2):
+        ends = {int(part[np.argmin(values[part])]), int(part[np.argmax(values[part])])}
+        kept += sorted(ends)
+    return t[kept], values[kept]
 
 
 def tidy(panels: Sequence[Axes]) -> None:

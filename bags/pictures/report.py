@@ -1,25 +1,20 @@
 """`report.html`: one file that shows what was identified, how well, and what is proved."""
 
 import importlib.util
-import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
 from bags.designs import documents
-from bags.monitoring.catching import Catching, Row
+from bags.monitoring.catching import Catching
 from bags.monitoring.replay import Replay
+from bags.pictures import tables
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, duration, percent
+from nlsid_core.errors import DataError
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
-from nlsid_core.models import (
-    DifferenceEquation,
-    ImplicitModel,
-    MonotoneEquation,
-    StateAffineModel,
-)
+from nlsid_core.models import StateAffineModel
 
 MODEL_BEGINS, MODEL_ENDS = "<!-- model begins -->", "<!-- model ends -->"
 FUNNEL_BEGINS, FUNNEL_ENDS = "<!-- funnel begins -->", "<!-- funnel ends -->"
@@ -32,7 +27,7 @@ th, td { white-space: nowrap } .left td { white-space: normal }
 th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
 ul { padding-left: 1.2rem }
-tbody tr { border-bottom: 1px solid #ddd } tr.chosen { background: #e8f1fa; font-weight: 600 }
+tbody tr { border-bottom: 1px solid #ddd } pre { font-size: .8rem; overflow-x: auto }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
 """
@@ -86,50 +81,14 @@ def write_catching(folder: Path, catching: Catching) -> list[Path]:
 
 def _catching(catching: Catching, drawn: str) -> str:
     """The section of the report."""
-    detectors = list(catching.rows[0].others)
-    head = "".join(
-        f"<th>{escape(name)}</th>"
-        for name in ("outside", "assumption violated", "alarm", "unknown", "after", *detectors)
-    )
-    rows = "".join(_catching_row(row, detectors) for row in catching.rows)
-    widths = "; ".join(
-        f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
-    )
-    wide = "".join(
-        f'<p class="not">{escape(line)}</p>'
-        for line in (*catching.beyond, *catching.still, *catching.warnings())
-    )
+    said = tables.html(lambda console: tables.say_catching(console, catching))
     return f"""
 <h2>The funnel: what it can catch</h2>
-<p>Half-width: {widths}.</p>{wide}
-<table><thead><tr><th>fault</th>{head}</tr></thead><tbody>{rows}</tbody></table>
-<p class="note">Of {catching.trials} trials that neither the model nor the funnel was made on,
-sabotaged: how many are caught, and how soon after the fault (median). <i>Outside</i> the tube,
-<i>assumption violated</i> and <i>alarm</i>, the monitor's own CUSUM alone, of which nothing is
-proved, are all caught; <i>unknown</i>: not judged to the end. CUSUM and 3σ
-watch the innovation, the box the difference from the nominal. Their thresholds have the same
-calibration trials and safety factor as the funnel's level, and are raised until they have no more
-false alarms on the untouched trials.</p>
+{said}
+<p class="note">The trials had no part in the model nor in the funnel, and are sabotaged. CUSUM and
+3σ watch the innovation, the box the difference from the nominal.</p>
 {drawn}
 """
-
-
-def _catching_row(row: Row, detectors: Sequence[str]) -> str:
-    if row.refused:
-        return f'<tr><td>{escape(row.fault)}</td><td colspan="8">{escape(row.refused)}</td></tr>'
-    funnel = row.funnel
-    cells = [
-        *(
-            str(count)
-            for count in (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
-        ),
-        "-" if math.isnan(funnel.after) else f"{funnel.after:.2f} s",
-    ]
-    for name in detectors:
-        other = row.others[name]
-        cells.append(f"{other.count}, {other.after:.2f} s" if other.count else "0")
-    fault = escape(f"{row.fault}, {row.output}" if row.output else row.fault)
-    return f"<tr><td>{fault}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
 
 
 def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
@@ -140,23 +99,22 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     outputs = range(test.trajectories[0].y.shape[1])
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
-    head = "".join(f"<th>{name} error</th>" for name in columns)
     listed = "".join(_recordings(data, use) for use, data in parts.items())
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
-    rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
+    methods = tables.methods_table(fit, test, columns)
+    left_out = f" and the first {chosen.transient}" if chosen.transient else ""
     calibrated = ", calibration trials for neither: they scale the tube"
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
 <style>{STYLE}</style>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <h1>{escape(robot)}: identified model</h1>
-{MODEL_BEGINS}<p>{escape(_equation(chosen.model))}</p>
+{MODEL_BEGINS}<p>{escape(_about(chosen.model))}</p>
 {_stability(chosen)}
 <h2>How well it simulates</h2>
-<table><thead><tr><th>method</th>{head}<th>time</th>
-<th>stability</th></tr></thead><tbody>{rows}</tbody></table>
+{tables.html(lambda console: console.print(methods))}
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
-simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
+simulation starts from{left_out}, ŷ simulated with the recorded input.
 Trials: {counts}; test trials were only used
 for this table and the pictures below{calibrated if "calibration" in parts else ""}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
@@ -196,52 +154,13 @@ def _stability(chosen: Candidate[Model]) -> str:
     )
 
 
-def _row(candidate: Candidate[Model], fit: Fit[Model], columns: Sequence[str]) -> str:
-    proved = (
-        '<span class="proved">proved</span>'
-        if candidate.proof is not None
-        else '<span class="not">not proved</span>'
-    )
-    cells = [
-        escape(candidate.method.title),
-        *(percent(fit.errors[name][candidate.method.name]) for name in columns),
-        duration(candidate.seconds),
-        proved,
-    ]
-    tag = '<tr class="chosen">' if candidate is fit.chosen else "<tr>"
-    return tag + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-
-
-def _equation(m: Model) -> str:
+def _about(model: Model) -> str:
+    """What it is, and of which signals."""
     outputs, inputs = (
         ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
-        for part in (m.y, m.u)
+        for part in (model.y, model.u)
     )
-    signals = f"y = {outputs}, u = {inputs}, one sample = {m.period:g} s"
-    if isinstance(m, DifferenceEquation):
-        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
-        drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
-        return f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, {signals}"
-    if isinstance(m, StateAffineModel):
-        terms = sum(len(g.exponents) for g in m.G) + len(m.p.exponents)
-        return (
-            f"0 = sum G_k(w) y(t-k) + p(w), {len(m)} lags, {terms} terms in w = the last "
-            f"{len(m.window)} inputs; {signals}"
-        )
-    if isinstance(m, MonotoneEquation):
-        e = " ".join(f"{c:+.4g} y{power}" for c, power in zip(m.e, ("", "²", "³"), strict=True))
-        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
-        return (
-            f"{e.removeprefix('+')} = {m.c:+.4g} {past} + {len(m.window)} inputs (y, u minus their "
-            f"offsets); {signals}"
-        )
-    if isinstance(m, ImplicitModel):
-        return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
-    return f"y = G₂ f(G₁ u): {m}; {signals}"
-
-
-def _left_out(chosen: Candidate[Model]) -> str:
-    return f" and the first {chosen.transient}" if chosen.transient else ""
+    return f"{model}; y = {outputs}, u = {inputs}"
 
 
 def _residuals(chosen: Candidate[Model], test: Dataset) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, LINE, ORANGE, png, svg
+from bags.pictures.plots import BLUE, LINE, ORANGE, png, svg, thinned
 from bags.signals.grid import seconds
 from bags.signals.reader import Samples
 from nlsid_core.errors import DataError
@@ -22,7 +22,7 @@ def draw_signals(samples: Sequence[Samples], *, title: str) -> Figure:
     figure = Figure(figsize=(9.5, 0.8 + 1.7 * len(samples)), layout="constrained")
     panels = figure.subplots(len(samples), 1, sharex=True, squeeze=False)[:, 0]
     for axes, signal in zip(panels, samples, strict=True):
-        t, values = _thinned(seconds(signal.stamp_ns, origin), signal.values)
+        t, values = thinned(seconds(signal.stamp_ns, origin), signal.values, DRAWN)
         steps = np.diff(t)
         gaps = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else steps.astype(int)
         axes.plot(np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan), color=BLUE, lw=LINE)
@@ -53,13 +53,3 @@ def write_picture(path: Path | str, figure: Figure, *, title: str) -> None:
     else:
         raise DataError(f"{path}: a picture is a .png, .svg or .html file")
     write_atomically(path, content)
-
-
-def _thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if len(t) <= DRAWN:
-        return t, values
-    kept: list[int] = []
-    for part in np.array_split(np.arange(len(t)), DRAWN // 2):
-        ends = {int(part[np.argmin(values[part])]), int(part[np.argmax(values[part])])}
-        kept += sorted(ends)
-    return t[kept], values[kept]

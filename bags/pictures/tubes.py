@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy, write_png
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, grid, legend, tidy, write_png
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.designs import AnyDesign
@@ -39,7 +39,7 @@ def draw_tube(design: AnyDesign) -> Figure:
     signals = design.signals[0]
     is_continuous = isinstance(design.funnel, ContinuousFunnel)
     pairs = state_pairs(len(signals)) if is_continuous else []
-    figure, panels = _grid(len(pairs) + len(signals))
+    figure, panels = grid(len(pairs) + len(signals), COLUMNS, (3.6, 2.6))
 
     for axes, pair in zip(panels, pairs, strict=False):
         for stage in design.stages:
@@ -58,7 +58,7 @@ def draw_tube(design: AnyDesign) -> Figure:
     for axes, signal in zip(over_time, signals, strict=True):
         axes.set_title(_name(signal), fontsize=9, loc="left")
         axes.set_xlabel("time [s]", fontsize=8)
-    _legend(figure, over_time[0])
+    legend(figure, over_time[:1], loc="outside lower left")
     return figure
 
 
@@ -103,7 +103,7 @@ def draw_free_run(model: MeasuredState, validation: Dataset) -> Figure:
     where = "" if used == len(trial) else f" in the box ({used} of {len(trial)} samples)"
     worst = f"free run of {trial.name}, the worst that was not fitted: {error:.2g} %{where}"
     figure.suptitle(worst, fontsize=11, x=0.01, ha="left")
-    _legend(figure, panels[0, 0])
+    legend(figure, panels[0, :1], loc="outside lower left")
     return figure
 
 
@@ -128,30 +128,5 @@ def _projection(axes: Axes, funnel: ContinuousFunnel, pair: tuple[int, int]) -> 
     axes.plot(*path[-1], "o", color=INK, ms=5, zorder=5)
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    """So many panels, row by row."""
-    columns = min(count, COLUMNS)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(3.6 * columns + 0.4, 2.6 * rows + 0.5), layout="constrained")
-    every = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes in every[count:]:
-        axes.set_visible(False)
-    tidy(every[:count])
-    return figure, every[:count]
-
-
 def _name(signal: Signal) -> str:
     return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
-    figure.legend(
-        list(named.values()),
-        list(named),
-        loc="outside lower left",
-        ncols=len(named),
-        fontsize=8,
-        frameon=False,
-    )

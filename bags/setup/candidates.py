@@ -159,15 +159,6 @@ class Found:
         surely = [c for c in self.constant if c.command > COMMANDS_SURELY]
         return [c.text for c in surely if c.topic not in moving][:SHOWN]
 
-    def commands(self) -> list[Candidate]:
-        """What may drive the robot, the best first."""
-        return _in_order(pair.command for pair in self.pairs)
-
-    def responses(self, commands: Sequence[str] = ()) -> list[Candidate]:
-        """What may answer (to `commands`), the best first."""
-        named = [p for p in self.pairs if not commands or p.command.text in commands]
-        return _in_order(p.response for p in named)
-
     def best_for(self, response: str) -> list[Pair]:
         """The pairs of one response, the best first."""
         return [pair for pair in self.pairs if pair.response.text == response]
@@ -394,7 +385,3 @@ def _other_joint(command: str, response: str) -> bool:
     """Whether both name an element of an array, and another one."""
     named = [re.findall(r"\[\w+=([^\]]+)\]", text) for text in (command, response)]
     return all(named) and named[0] != named[1]
-
-
-def _in_order(candidates: Iterator[Candidate]) -> list[Candidate]:
-    return list({candidate.text: candidate for candidate in candidates}.values())

@@ -6,7 +6,6 @@ refused there is changed (gaps cut out, responses resampled) or said.
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -18,11 +17,10 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
+from bags.setup.attempts import followed, say_class, say_degree, say_lags
 from bags.setup.candidates import Found, slope_window
-from bags.setup.curved import say_class
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
-from bags.setup.orders import followed, say_degree, say_lags
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
@@ -36,10 +34,8 @@ from nlsid_core.progress import silent
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
-SIMULATED: Final = "/clock"
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
-ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 
 
 def choose(
@@ -151,7 +147,9 @@ def propose(
     in_training = _ranges(trials.train)
     if all(_is_constant(*ends) for ends in in_training):
         _refuse_constant(excitations, in_training, "drives", "the training trials")
+    asked = len(proposal.doubts)
     say_direction(proposal, found, trials.every)
+    is_swapped = len(proposal.doubts) > asked
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
@@ -175,7 +173,7 @@ def propose(
             without = f"; without it models are off by {proposal.error:.3g} %"
             wider.why |= {text: wider.why[text] + without for text in others}
             return wider
-    if len(responses) == 1:
+    if len(responses) == 1 and not is_swapped:  # who swapped them has to say so first
         say_class(proposal, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)
@@ -389,34 +387,12 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
             f"{said}: samples are paired by the times of logging, live of "
             "arrival, whose jitter becomes part of the model's error"
         )
-        pace = _pace(bag)
-        if abs(pace - 1.0) > ONE_PACE:
-            proposal.walls.append(
-                f"simulated time on {SIMULATED} runs at {pace:.3g} times the pace of the times of "
-                "logging: the model is one by the wall's clock, and a live monitor with "
-                "use_sim_time goes by the simulated one; record with `ros2 bag record "
-                "--use-sim-time`, or give commands a header"
-            )
 
 
 def _stamps_are_zero(bag: Bag, path: SignalPath) -> bool:
     """Whether the publisher of a signal does not fill its header stamps in."""
     stamps = read_columns(bag, {str(path): path})[path.topic].stamp_ns
     return stamps is not None and len(stamps) > 0 and not stamps.any()
-
-
-def _pace(bag: Bag) -> float:
-    """Simulated seconds in one of the times of logging; 1 without simulated time."""
-    if SIMULATED not in bag.topics:
-        return 1.0
-    paths = {part: SignalPath.parse(f"{SIMULATED}:clock.{part}") for part in ("sec", "nanosec")}
-    with suppress(BagError):  # of another type
-        columns = read_columns(bag, paths)[SIMULATED]
-        simulated = columns.values["sec"] + 1e-9 * columns.values["nanosec"]
-        logged = (columns.log_ns - columns.log_ns[:1]) / 1e9
-        if len(columns) > 1 and logged[-1] > 0.0:
-            return float((simulated[-1] - simulated[0]) / logged[-1])
-    return 1.0
 
 
 def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:

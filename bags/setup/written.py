@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from bags.chain.config import Config
-from bags.chain.reference import keys_of, template_rows
 from bags.chain.sections import Key, Section, sections_in
 from bags.chain.templates import TEMPLATES
 from bags.setup.proposal import Proposal
@@ -30,7 +29,7 @@ def _section(
     content: Mapping[str, Any], kind: type[Section] | None, why: Mapping[str, str], depth: int
 ) -> Iterator[str]:
     indent = "  " * depth
-    known = keys_of(kind) if kind is not None else _options(content)
+    known = kind.keys() if kind is not None else _options(content)
     for key, value in content.items():
         inner = sections_in(kind.model_fields[key].annotation) if kind is not None else []
         if depth == 0:
@@ -51,8 +50,8 @@ def _section(
 
 def _options(content: Mapping[str, Any]) -> dict[str, Key]:
     """The keys of the section `identification`."""
-    rows = template_rows(TEMPLATES[content["model"]])
-    return {"model": Key("the class of models")} | {key: Key(text) for key, text, _, _ in rows}
+    texts = TEMPLATES[content["model"]].texts()
+    return {"model": Key("the class of models")} | {key: Key(said) for key, said in texts.items()}
 
 
 def _said(key: Key | None, why: str) -> str:

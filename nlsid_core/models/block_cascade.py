@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail
+from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, recorded, tail
 from nlsid_core.models.spline import Spline
 
 KIND = "block_cascade"
@@ -25,11 +25,10 @@ MAX_PHASES = 8  # a proof visits 2^M vertices
 
 
 @dataclass(frozen=True, eq=False)
-class BlockCascade:
+class BlockCascade(Recorded):
     """a1: (n₁,), b1: (M, m₁+1), f: the nonlinearity, a2: (n₂,), b2: (M, m₂+1).
 
-    One input, one output; t counts samples of `period` s. bags, training as in
-    `DifferenceEquation`.
+    One input, one output; t counts samples of `period` s.
     Raises ShapeError or DataError on arrays that do not fit or are not finite.
     """
 
@@ -38,11 +37,8 @@ class BlockCascade:
     f: Spline
     a2: FloatArray
     b2: FloatArray
-    period: float
     y: Signal
     u: Signal
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
 
     def __post_init__(self) -> None:
         row, table = (None,), (None, None)
@@ -51,8 +47,7 @@ class BlockCascade:
             raise ShapeError(f"b1 {self.b1.shape} and b2 {self.b2.shape} should have equal phases")
         if len(self.b1) > MAX_PHASES:
             raise DataError(f"{len(self.b1)} phases; at most {MAX_PHASES}")
-        if not (np.isfinite(self.period) and self.period > 0):
-            raise DataError(f"period {self.period} s is not positive")
+        self.require_period()
 
     def __str__(self) -> str:
         phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"

@@ -16,7 +16,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze, keep
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal, head, objects, recorded, tail
+from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, objects, recorded, tail
 
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
@@ -59,11 +59,10 @@ class PiecewiseLinear:
 
 
 @dataclass(frozen=True, eq=False)
-class CellNetwork:
+class CellNetwork(Recorded):
     """maps: f_j. into (m, m+n+q+1), next (n, m+n+q+1), output (p, m+n+q+1), period in s.
 
     start (n,): the usual state at the start; it is estimated from the first `start_samples`.
-    bags, training as in `DifferenceEquation`.
     Raises ShapeError or DataError on arrays that do not fit or are not finite.
     """
 
@@ -73,11 +72,8 @@ class CellNetwork:
     output: FloatArray
     start: FloatArray
     start_samples: int
-    period: float
     y: tuple[Signal, ...]
     u: tuple[Signal, ...]
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
 
     def __post_init__(self) -> None:
         m, n = len(self.maps), np.size(self.start)
@@ -90,8 +86,7 @@ class CellNetwork:
             raise DataError("a map should depend on earlier maps only")
         if self.start_samples < 1:
             raise DataError(f"start_samples is {self.start_samples}; should be 1 or more")
-        if not (np.isfinite(self.period) and self.period > 0):
-            raise DataError(f"period {self.period} s is not positive")
+        self.require_period()
 
     def __str__(self) -> str:
         counts = {"state": len(self.start), "piecewise-linear map": len(self.maps)}

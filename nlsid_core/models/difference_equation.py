@@ -8,19 +8,18 @@ from numpy.typing import NDArray
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail
+from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, recorded, tail
 
 KIND = "difference_equation"
 
 
 @dataclass(frozen=True, eq=False)
-class DifferenceEquation:
+class DifferenceEquation(Recorded):
     """y(t) = Σ_{k=1..n} a_k y(t-k) + Σ_{j=0..n} b_j u(t-j) + c, one output, one input.
 
     Source: (4.1) with constant G and affine p. a: (n,), b: (n+1,), c in the output's unit;
     t counts samples of `period` s, u(t) acts from sample t on. `u_range` is the range of the
-    input the model was fitted on; `bags` names (name, digest) the recordings and
-    `training` is the digest of the data file made of them.
+    input the model was fitted on.
 
     Raises ShapeError or DataError on arrays that do not fit or are not finite.
     """
@@ -28,22 +27,20 @@ class DifferenceEquation:
     a: FloatArray
     b: FloatArray
     c: float
-    period: float
     y: Signal
     u: Signal
     u_range: tuple[float, float]
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
 
     def __post_init__(self) -> None:
         freeze(self, "model", {"a": (None,)})
         freeze(self, "model", {"b": (len(self.a) + 1,)})
         if not len(self.a):
             raise ShapeError("a model has at least one lag")
-        if not np.isfinite([self.c, self.period, *self.u_range]).all():
+        if not np.isfinite([self.c, *self.u_range]).all():
             raise DataError("a model's coefficients should be finite")
-        if self.period <= 0 or self.u_range[0] > self.u_range[1]:
-            raise DataError(f"period {self.period} s or input range {self.u_range} is not valid")
+        if self.u_range[0] > self.u_range[1]:
+            raise DataError(f"input range {self.u_range} is not valid")
+        self.require_period()
 
     def __len__(self) -> int:
         """The number of lags n."""

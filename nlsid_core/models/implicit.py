@@ -14,20 +14,20 @@ from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, Signal, recorded, tail, window_of
+from nlsid_core.models.signal import FORMAT, Recorded, Signal, recorded, tail, window_of
 from nlsid_core.polynomial.values import monomial_values
 
 KIND = "implicit"
 
 
 @dataclass(frozen=True, eq=False)
-class ImplicitModel:
+class ImplicitModel(Recorded):
     """0 = h(v, x, w), x⁺ = [v; ã(x, w)]: n states, m inputs, one sample is `period` s.
 
     h: n_v polynomials in [v; x; w]; shift: ã, n - n_v polynomials in [x; w]. monotonicity: δ > 0
     of (v - v̂)'(h(v, x, w) - h(v̂, x, w)) ≥ δ|v - v̂|², which makes v unique.
 
-    y, u, window, bags, training: of a model of recorded signals, whose v is y(t), whose x stacks
+    y, u, window: of a model of recorded signals, whose v is y(t), whose x stacks
     y(t-1) … y(t-k), and whose w_j is u_i(t-d) for (i, d) = window[j].
 
     Raises ShapeError or DataError on parts that do not fit.
@@ -36,14 +36,11 @@ class ImplicitModel:
     h: Polynomials
     shift: Polynomials
     monotonicity: float
-    period: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     y: tuple[Signal, ...] = ()
     u: tuple[Signal, ...] = ()
     window: tuple[tuple[int, int], ...] = ()
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
 
     def __post_init__(self) -> None:
         n, m, n_v = len(self.states), len(self.inputs), self.unknowns
@@ -56,8 +53,9 @@ class ImplicitModel:
                     f"{name} should have {rows} polynomials in {variables} variables; has "
                     f"exponents {part.exponents.shape}, coefficients {part.coefficients.shape}"
                 )
-        if not 0.0 < self.monotonicity < np.inf or not 0.0 < self.period < np.inf:
-            raise DataError("monotonicity and period should be positive")
+        if not 0.0 < self.monotonicity < np.inf:
+            raise DataError("monotonicity should be positive")
+        self.require_period()
         if self.y and (len(self.y) != n_v or n % n_v or len(self.window) != m):
             raise ShapeError(
                 f"{len(self.y)} outputs and a window of {len(self.window)} inputs for {n} states, "
@@ -90,7 +88,7 @@ class ImplicitModel:
         h = Polynomials(
             np.concatenate([left, right]), np.concatenate([e.coefficients, -f.coefficients])
         )
-        return cls(h, _nothing(n + m), monotonicity, period, states, inputs)
+        return cls(h, _nothing(n + m), monotonicity, states, inputs, period=period)
 
     def separated(self) -> tuple[Polynomials, Polynomials] | None:
         """(e, f) if h = e(v) - f(x, w) and there is no ã, else None."""

@@ -16,7 +16,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail, window_of
+from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, recorded, tail, window_of
 
 KIND = "monotone_equation"
 NEWTON_STEPS = 100  # far from the solution a cubic takes a third off the distance a step
@@ -25,10 +25,10 @@ ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it
 
 
 @dataclass(frozen=True, eq=False)
-class MonotoneEquation:
+class MonotoneEquation(Recorded):
     """e: (3,), a: (n,), b: (n_w,), c; window: (input, delay ≥ 0) of each entry of w.
 
-    One output, n_u inputs, u_offset: (n_u,). bags, training: as in `DifferenceEquation`.
+    One output, n_u inputs, u_offset: (n_u,).
     Raises ShapeError or DataError on parts that do not fit, or if e is not increasing.
     """
 
@@ -39,17 +39,15 @@ class MonotoneEquation:
     window: tuple[tuple[int, int], ...]
     y_offset: float
     u_offset: FloatArray
-    period: float
     y: Signal
     u: tuple[Signal, ...]
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
 
     def __post_init__(self) -> None:
         sizes = {"e": (3,), "a": (None,), "b": (len(self.window),), "u_offset": (len(self.u),)}
         freeze(self, "model", sizes)
-        if not np.isfinite([self.c, self.y_offset, self.period]).all() or self.period <= 0:
-            raise DataError("a model's numbers should be finite and its period positive")
+        if not np.isfinite([self.c, self.y_offset]).all():
+            raise DataError("a model's numbers should be finite")
+        self.require_period()
         if not len(self.a):
             raise ShapeError("a monotone equation has at least one lag")
         if any(not (0 <= i < len(self.u) and d >= 0) for i, d in self.window):

@@ -1,12 +1,13 @@
 """What every model document shares: its header and the signals it is about."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.errors import DocumentError
+from nlsid_core.errors import DataError, DocumentError
 
 FORMAT = "nlsid/model"
 
@@ -29,6 +30,24 @@ class Signal:
         return cls(
             *(files.member(document, key, str, source=source) for key in ("name", "unit", "path"))
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recorded:
+    """A model of recorded signals: one sample is `period` s.
+
+    bags names (name, digest) the recordings, and training is the digest of the data file made of
+    them.
+    """
+
+    period: float
+    bags: tuple[tuple[str, str], ...] = ()
+    training: str = ""
+
+    def require_period(self) -> None:
+        """Raise DataError unless the period is positive."""
+        if not 0.0 < self.period < inf:
+            raise DataError(f"period {self.period} s is not positive")
 
 
 def signals_of(trial: Trajectory, letter: Literal["y", "u"]) -> tuple[Signal, ...]:

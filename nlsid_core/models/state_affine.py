@@ -19,6 +19,7 @@ from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import (
     FORMAT,
+    Recorded,
     Signal,
     head,
     objects,
@@ -32,13 +33,12 @@ OutOfRange = Literal["clip", "refuse"]
 
 
 @dataclass(frozen=True, eq=False)
-class StateAffineModel:
+class StateAffineModel(Recorded):
     """0 = Σ_k G_k(w) ȳ(t-k) + p(w), ȳ = (y - y_offset)/y_scale, the same for u.
 
     G: n+1 polynomials with (n_y, n_y) coefficients; p: polynomials with (n_y,) coefficients.
     window: (input, delay) of each entry of w, delays in 0 … n. u_range: (n_u, 2), to which inputs
-    are clipped, or beyond which they are refused (`on_out_of_range`). bags, training: as in
-    `DifferenceEquation`.
+    are clipped, or beyond which they are refused (`on_out_of_range`).
 
     Raises ShapeError or DataError on parts that do not fit.
     """
@@ -51,11 +51,8 @@ class StateAffineModel:
     u_offset: FloatArray
     u_scale: FloatArray
     u_range: FloatArray
-    period: float
     y: tuple[Signal, ...]
     u: tuple[Signal, ...]
-    bags: tuple[tuple[str, str], ...] = ()
-    training: str = ""
     on_out_of_range: OutOfRange = "clip"
 
     def __post_init__(self) -> None:
@@ -73,8 +70,9 @@ class StateAffineModel:
                 "u_range": (n_u, 2),
             },
         )
-        if (self.y_scale <= 0).any() or (self.u_scale <= 0).any() or not self.period > 0:
-            raise DataError("scales and the period should be positive")
+        if (self.y_scale <= 0).any() or (self.u_scale <= 0).any():
+            raise DataError("scales should be positive")
+        self.require_period()
         if (self.u_range[:, 0] >= self.u_range[:, 1]).any():
             raise DataError(f"input range {self.u_range.tolist()} is empty")
         if len(self.G) < 2:

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from bags.chain.background import BackgroundIdentification, Progress, finished_bags
-from bags.chain.config import load_config
+from bags.chain.config import SplitConfig, load_config
 from bags.chain.shipped import config_file
-from bags.chain.steps import cut
+from bags.chain.steps import split
 from bags.designs.documents import MODEL, MODEL_PROOF
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
@@ -87,9 +87,8 @@ def test_recordings_that_are_finished_and_have_the_topics_are_used(tmp_path: Pat
 
 def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
     data = synthetic_dataset(0.01, trials=2, samples=80)
-    trials = cut(data, 0.25)
+    trials = split(data, SplitConfig(share=0.25))
     train, test = trials.train, trials.test
-    assert trials.validation is None
     assert train.names == test.names == data.names
     for whole, fitted, scored in zip(data, train, test, strict=True):
         assert (len(fitted), len(scored)) == (60, 20)
@@ -97,23 +96,17 @@ def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
         np.testing.assert_array_equal(np.concatenate([fitted.u, scored.u]), whole.u)
         assert scored.t[0] == 0.0
     with pytest.raises(DataError, match=r"0\.01 of 80 samples"):
-        cut(data, 0.01)
+        split(data, SplitConfig(share=0.01))
 
 
-def test_trials_to_choose_by_are_left_whole() -> None:
+@pytest.mark.parametrize("use", ["validation", "calibration"])
+def test_trials_of_another_use_are_left_whole(use: str) -> None:
     data = synthetic_dataset(0.01, trials=2, samples=80)
-    name = data.names[0]
-    trials = cut(data, 0.25, validation=[name])
-    assert trials.validation is not None
-    assert trials.validation.names == (name,)
-    assert [len(trial) for trial in trials.validation] == [80]
+    trials = split(data, SplitConfig(share=0.25, **{use: data.names[:1]}))
+    assert [len(trial) for trial in trials.by_use[use]] == [80]
     assert trials.train.names == trials.test.names == data.names[1:]
-    with pytest.raises(DataError, match="all of the bags are validation trials"):
-        cut(data, 0.25, validation=data.names)
-    scaling = cut(data, 0.25, calibration=[name])
-    assert scaling.calibration is not None
-    assert [len(trial) for trial in scaling.calibration] == [80]
-    assert scaling.train.names == data.names[1:]
+    with pytest.raises(DataError, match=f"all of the bags are {use} trials"):
+        split(data, SplitConfig(share=0.25, **{use: data.names}))
 
 
 def test_a_configuration_names_test_bags_or_a_share_but_not_both(tmp_path: Path) -> None:

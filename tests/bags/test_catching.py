@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bags.commands import show
 from bags.monitoring.catching import (
     DELAY,
     LOST,
@@ -19,6 +18,7 @@ from bags.monitoring.catching import (
     what_it_catches,
 )
 from bags.monitoring.replay import Replay
+from bags.pictures import tables
 from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
@@ -51,7 +51,6 @@ def catches(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Cat
         held_back=held_back,
         calibration=calibration_trials(train, least=72).calibration,
         ranges=np.array([np.ptp(np.concatenate([trial.y for trial in train]))]),
-        remedy="a shorter run",
     )
 
 
@@ -186,7 +185,7 @@ def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert "try more lags, another class" in poor
     (loose,) = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
     assert "the half-width is 20 times that" in loose
-    assert loose.endswith("Try a shorter run")
+    assert loose.endswith("leaves less in its residual")
     constant = replace(found, widths=(Width("speed", "m/s", 0.1, 0.0, 0.05),))
     assert "is inf of its range" in constant.warnings()[0]
 
@@ -215,7 +214,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(), "box": Caught()},
     )
     refused = Row("refused", Caught(), {}, "no such input")
-    table = show.catching_table(replace(found, rows=(*found.rows, worse, refused)))
+    table = tables.catching_table(replace(found, rows=(*found.rows, worse, refused)))
     console = Console(width=80, record=True, file=None, force_terminal=False)
     with console.capture() as said:
         console.print(table)
@@ -241,7 +240,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
         next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
-        show.say_catching(console, replace(found, rows=(*found.rows, refused)))
+        tables.say_catching(console, replace(found, rows=(*found.rows, refused)))
     assert "refused was not tried: no such input" in said.get()
 
 
@@ -266,7 +265,6 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        remedy="",
     )
     level, settling = made.funnel.tubes[0].follows, made.funnel.settling
     assert level is not None
@@ -296,7 +294,6 @@ def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() ->
         held_back=held_back,
         calibration=calibration,
         ranges=ranges,
-        remedy="",
     )
     counts = []
     for output in range(2):
@@ -335,7 +332,7 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     for caught in (c for r in zero for c in (r.funnel, *r.others.values())):
         assert not caught.after < 0.0
     console = Console(record=True, width=100)
-    show.say_catching(console, found)
+    tables.say_catching(console, found)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
 

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.designs.bundle import Bundle
 from bags.designs.documents import load
 from bags.designs.wiring import wiring_of
@@ -25,6 +23,7 @@ from nlsid_core.running.controller import Limits
 from nlsid_core.running.reading import Reading, Status
 from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
+from tests.verbs import nlsid
 
 RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"
 WIRING = wiring_of([RESPONSE], [COMMAND], 0.05)
@@ -84,8 +83,7 @@ def test_it_is_driven_from_stage_to_stage_and_held_against_each(
     ]
     assert [r.margin for r in replayed] == [r.margin for r in readings]
     where = ["-y", RESPONSE, "-u", COMMAND, "--period", "0.05"]
-    said = CliRunner().invoke(app, ["monitor", str(folder), str(tmp_path / "bag"), *where])
-    assert (said.exit_code, "inside" in said.output) == (0, True), said.output
+    assert "inside" in nlsid("monitor", folder, tmp_path / "bag", *where)
     scene = Scene("a recording", "replay")
     recording = Recording(
         load(folder / designs.COMPOSITION, wiring=WIRING),

@@ -6,18 +6,17 @@ from typing import Any, get_type_hints
 import pytest
 import yaml
 from pydantic import TypeAdapter
-from typer.testing import CliRunner
 
 from bags.chain.config import Config
-from bags.chain.reference import keys_of, option_rows, page, template_rows
 from bags.chain.sections import Section, sections_in
 from bags.chain.shipped import config_file
-from bags.chain.templates import TEMPLATES
+from bags.chain.templates import TEMPLATES, option_texts
 from bags.chain.tracking_config import TrackingConfig
-from bags.commands.cli import app
 from bags.samples import f1tenth
+from docs.site import configuration
 from nlsid_core.identification import METHODS
 from tests.house.sources import ROOT
+from tests.verbs import nlsid
 
 CONFIG = config_file("f1tenth.yaml")
 PAGE = ROOT / "docs" / "configuration.md"
@@ -25,10 +24,8 @@ PAGE = ROOT / "docs" / "configuration.md"
 
 def check(*arguments: object, status: int = 0) -> str:
     path, *bags = arguments
-    given = ["identify", "DIR", *map(str, bags or f1tenth()), "--config", str(path), "--check"]
-    done = CliRunner().invoke(app, given)
-    assert done.exit_code == status, done.output
-    return done.output
+    given = ("identify", "DIR", *(bags or f1tenth()), "--config", path, "--check")
+    return nlsid(*given, status=status)
 
 
 def edited(path: Path, **changes: Any) -> Path:
@@ -77,10 +74,10 @@ def test_a_plan_that_no_controller_could_drive_is_refused(
 
 def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(tmp_path: Path) -> None:
     path = edited(tmp_path / "a.yaml", split=None)
-    assert "split: nothing to score on" in check(path, *f1tenth(), status=1)
+    assert "none of the bags is a test trial" in check(path, *f1tenth(), status=1)
     path = edited(tmp_path / "b.yaml", split={"test": ["trial_05"]})
     only = [bag for bag in f1tenth() if bag.name == "trial_05"]
-    assert "split.test: names every bag" in check(path, *only, status=1)
+    assert "all of the bags are test trials" in check(path, *only, status=1)
 
 
 def test_wrong_keys_end_with_status_1(tmp_path: Path) -> None:
@@ -93,8 +90,8 @@ def test_wrong_keys_end_with_status_1(tmp_path: Path) -> None:
 
 
 def test_the_page_of_every_key_is_up_to_date() -> None:
-    said = "python -m bags.chain.reference > docs/configuration.md"
-    assert PAGE.read_text(encoding="utf-8") == page(), said
+    said = "python -m docs.site.configuration > docs/configuration.md"
+    assert PAGE.read_text(encoding="utf-8") == configuration.page(), said
 
 
 def every_section(kind: type[Section]) -> list[type[Section]]:
@@ -106,7 +103,7 @@ def every_section(kind: type[Section]) -> list[type[Section]]:
 def test_every_key_says_what_it_is_and_its_example_is_accepted(kind: type[Section]) -> None:
     for section in every_section(kind):
         types = get_type_hints(section, include_extras=True)
-        for name, key in keys_of(section).items():
+        for name, key in section.keys().items():
             assert key.text, name
             inside = sections_in(section.model_fields[name].annotation)
             assert inside or key.example is not None, f"{section.__name__}.{name}"
@@ -115,11 +112,9 @@ def test_every_key_says_what_it_is_and_its_example_is_accepted(kind: type[Sectio
 
 
 def test_every_option_of_a_class_and_a_method_is_on_the_page() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    rows = [row for template in TEMPLATES.values() for row in template_rows(template)]
-    for key, what, _, _ in [
-        *rows,
-        *(row for kind in METHODS.values() for row in option_rows(kind)),
-    ]:
-        assert what, key
-        assert f"`{key}` | {what}" in text
+    text = PAGE.read_text(encoding="utf-8").replace("\\|", "|")
+    said = [template.texts() for template in TEMPLATES.values()]
+    for texts in (*said, *map(option_texts, METHODS.values())):
+        for key, what in texts.items():
+            assert what, key
+            assert f"`{key}` | {what}" in text

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.samples import f1tenth
 from nlsid_core.models import Signal
+from tests.verbs import nlsid
 
 CONFIG = """\
 robot: car
@@ -59,18 +58,14 @@ def test_a_displacement_is_told_of_samples_that_are_washed_out_messages() -> Non
 def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path) -> None:
     config = tmp_path / "position.yaml"
     config.write_text(CONFIG)
-    out, run = str(tmp_path / "out"), CliRunner()
-    bags = [str(bag) for bag in f1tenth() if bag.name >= "trial_34"]
-    result = run.invoke(app, ["identify", out, *bags, "--config", str(config)])
-    assert result.exit_code == 0, result.output
-    result = run.invoke(app, ["funnel", out, "--config", str(config)])
-    assert result.exit_code == 0, result.output
-    said = " ".join(re.sub(r"[│\n]", " ", result.output).split())
+    out = tmp_path / "out"
+    bags = [bag for bag in f1tenth() if bag.name >= "trial_34"]
+    nlsid("identify", out, *bags, "--config", config)
+    designed = nlsid("funnel", out, "--config", config)
+    said = " ".join(re.sub(r"[│\n]", " ", designed).split())
     found = re.search(r"half-width (\S+) m of position, for ever", said)
     moves = re.search(r"moves in at most 1 s is within (\S+) m of what the simulation moves", said)
     assert found
     assert moves
     assert 3 * float(found[1]) <= float(moves[1]) * 1.0001 < 0.5
-    unseen = [bag for bag in bags if bag.endswith(("trial_37", "trial_41"))]
-    held = run.invoke(app, ["monitor", out, *unseen])
-    assert held.exit_code == 0, held.output
+    nlsid("monitor", out, *(bag for bag in bags if bag.name in ("trial_37", "trial_41")))

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.config import load_config
-from bags.commands.cli import app
 from tests.duffing import trials
 from tests.identified_bags import FUNNEL, write_bag, write_config
+from tests.verbs import nlsid
 
 RUNS, SAMPLES = 8, 240
 
@@ -20,9 +19,7 @@ def test_init_proposes_feedback_where_linear_models_say_little(tmp_path: Path) -
         write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
     config = tmp_path / "out" / "robot.yaml"
     drive, answer = ("/joint_commands:effort[name=joint_0]", "/joint_states:position[name=joint_0]")
-    given = ["init", str(config.parent), str(tmp_path / "bags"), "-u", drive, "-y", answer]
-    result = CliRunner().invoke(app, given)
-    assert result.exit_code == 0, result.output
+    nlsid("init", config.parent, tmp_path / "bags", "-u", drive, "-y", answer)
     assert load_config(config).identification.given["model"] == "feedback"
     said = " ".join(config.read_text().replace("#", "").split())
     linear, feedback = (
@@ -40,21 +37,10 @@ def test_feedback_goes_from_bags_to_a_monitor(tmp_path: Path) -> None:
     write_bag(tmp_path / "bags", "broken", y, broken.u)
     section = {"model": "feedback", "stages": 2, "imitated": 20}
     config = write_config(tmp_path / "config.yaml", section, **FUNNEL)
-    bags = [str(tmp_path / "bags" / f"run_{k}") for k in range(RUNS)]
+    bags = [tmp_path / "bags" / f"run_{k}" for k in range(RUNS)]
     out = tmp_path / "out"
-
-    def done(*given: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, list(given))
-        return result.exit_code, result.output
-
-    code, said = done("identify", str(out), *bags, "--config", str(config))
-    assert code == 0, said
-    code, said = done("funnel", str(out), "--config", str(config))
-    assert code == 0, said
-    code, said = done("check", str(out))
-    assert (code, said.count("PROVED")) == (0, 2), said
-    held = ("monitor", str(out))
-    code, said = done(*held, bags[5])
-    assert code == 0, said
-    code, said = done(*held, str(tmp_path / "bags" / "broken"))
-    assert code == 1, said
+    nlsid("identify", out, *bags, "--config", config)
+    nlsid("funnel", out, "--config", config)
+    assert nlsid("check", out).count("PROVED") == 2
+    nlsid("monitor", out, bags[5])
+    nlsid("monitor", out, tmp_path / "bags" / "broken", status=1)

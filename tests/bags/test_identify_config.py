@@ -211,7 +211,6 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
             r"monitor\.stale_after: 0\.1 s is not longer",
         ),
         ({"funnel": {"horizon": 0.001, "policy": "none"}}, r"funnel\.horizon: .* not one sample"),
-        ({"split": {"test": ["a"], "validation": ["a"]}}, "'a' is named for test and for"),
         ({"inputs": 2}, "identification.model: linear has one response and one excitation"),
         (
             {

@@ -6,11 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.joint_bags import write_joint_bag
-from bags.chain.problems import FunnelProblem
-from bags.commands.cli import app
 from bags.monitoring.catching import breaking
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -18,6 +15,8 @@ from nlsid_core.design import Goal, plan_motion
 from nlsid_core.dynamics import MeasuredPush, VectorField, measured_push
 from nlsid_core.errors import DocumentError
 from nlsid_core.proofs import check
+from tests import funnel_problem
+from tests.verbs import nlsid
 
 PERIOD, PUSH, FACTOR = 0.02, 0.06, 1.2  # s, m/s², of the box over the largest
 SIGNALS = [
@@ -51,34 +50,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("push")
     motion = plan_motion(FIELD, start=[0, 0], end=[0.2, 0], seconds=1, u=[0])
     end = motion.x.ends()[-1]
-    problem = FunnelProblem(FIELD, motion, goal=Goal(end, np.diag([25.0, 11.0])))
-    files.write_document(folder / "problem.json", problem.document())
+    goal = Goal(end, np.diag([25.0, 11.0]))
+    files.write_document(folder / "problem.json", funnel_problem.document(FIELD, motion, goal))
     (folder / "bags").mkdir()
     for seed in range(3):
         write_joint_bag(folder / "bags", recorded(seed))
     return folder
 
 
-def told(folder: Path, *options: str) -> tuple[int, str]:
-    given = [
-        "funnel",
-        str(folder / "design"),
-        str(folder / "bags"),
-        "--problem",
-        str(folder / "problem.json"),
-        *SIGNALS,
-        *options,
-    ]
-    ended = CliRunner().invoke(app, given)
-    return ended.exit_code, ended.output + str(ended.exception or "")
+def told(folder: Path, *options: str, status: int | None = 0) -> str:
+    bags, problem = folder / "bags", folder / "problem.json"
+    given = ("funnel", folder / "design", bags, "--problem", problem, *SIGNALS)
+    return nlsid(*given, *options, status=status)
 
 
 @pytest.mark.slow
 def test_what_bags_show_is_stored_with_their_digests_and_the_funnel_is_proved_for_it(
     folder: Path,
 ) -> None:
-    status, said = told(folder, "--safety-factor", str(FACTOR))
-    assert status == 0, said
+    said = told(folder, "--safety-factor", str(FACTOR))
     assert "largest of 3 distinct trials, safety factor 1.2" in said
     assert "measured, not proved: |dx/dt - f|" in said
     assert re.search(r"late by 5 samples .* 3 of 3", said), "the velocity contradicts the command"
@@ -96,8 +86,7 @@ def test_what_bags_show_is_stored_with_their_digests_and_the_funnel_is_proved_fo
 
 
 def test_bags_with_other_states_than_the_equations_are_refused(folder: Path) -> None:
-    status, said = told(folder, "-y", "/joint_states:position[0]")
-    assert status != 0
+    said = told(folder, "-y", "/joint_states:position[0]", status=None)
     assert "3 states (as y) and 1 inputs, the dynamics 2 and 1" in said
 
 

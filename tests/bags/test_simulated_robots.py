@@ -4,15 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.plants import ARM, PENDULUM, PERIOD, Plant
 from bags.chain.simulation import record_repeats
 from bags.chain.steps import read_signals_of
 from bags.chain.tracking_config import load_tracking_config
-from bags.commands.cli import app
-from nlsid_core.errors import DataError
+from tests.verbs import nlsid
 
 pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")
 
@@ -67,34 +65,36 @@ def test_an_unknown_simulated_robot_is_an_error(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     text = (ROOT / "config" / "pendulum.yaml").read_text()
     config.write_text(text.replace("  robot: pendulum\n", "  robot: pendulums\n"))
-    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(tmp_path)])
-    assert isinstance(result.exception, DataError)
-    assert "there are: pendulum, arm" in str(result.exception)
+    said = nlsid("demo", "--robot", config, "--out", tmp_path, status=None)
+    assert "there are: pendulum, arm" in said
 
 
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_the_whole_chain_runs_from_one_configuration(tmp_path: Path) -> None:
-    config = tmp_path / "pendulum.yaml"
     text = (ROOT / "config" / "pendulum.yaml").read_text()
     for given, shorter in (
-        ("1.5\n", "0.5\n"),
-        ("[0.6,", "[0.2,"),
-        ("60.0", "30.0"),
-        ("30\n", "6\n"),
+        ("[pendulum_4_0, pendulum_4_1, pendulum_4_2, pendulum_4_3]", "[pendulum_2_0]"),
+        ("duration: 1.5\n", "duration: 0.3\n"),
+        ("[0.6,", "[0.1,"),
+        ("groups: 5", "groups: 3"),
+        ("repeats: 4", "repeats: 2"),
+        ("seconds: 60.0", "seconds: 12.0"),
+        ("runs: 30", "runs: 3"),
+        ("identification:\n", "identification:\n  degrees: [[3, 1, 1]]\n"),
     ):
         assert given in text
         text = text.replace(given, shorter)
+    config = tmp_path / "pendulum.yaml"
     config.write_text(text)
     out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(out)])
-    assert result.exit_code == 0, result.output
-    assert "PROVED funnel" in result.output
-    checked = CliRunner().invoke(app, ["check", str(out / "funnel.proof.json")])
-    assert checked.output.startswith("PROVED")
-    bags = ["monitor", str(out), str(out / "runs")]
-    monitored = CliRunner().invoke(app, bags)
-    assert monitored.exit_code == 0, monitored.output
-    fitted = ["funnel", str(out), str(out / "excitations"), "--config", str(config)]
-    refused = CliRunner().invoke(app, fitted)
-    assert "fitted on" in str(refused.exception)
+    said = nlsid("demo", "--robot", config, "--out", out)
+    assert "PROVED funnel" in said
+    assert "3 of 3 bags are inside" in said
+    for name in ("free_run.png", "funnel.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+        assert f"wrote {out / name}" in said
+    assert nlsid("check", out).startswith("PROVED")
+    nlsid("monitor", out, out / "runs")
+    refused = nlsid("funnel", out, out / "excitations", "--config", config, status=None)
+    assert "fitted on" in refused

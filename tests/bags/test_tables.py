@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from bags.commands import show
 from bags.commands.cli import app
 from bags.monitoring.replay import Replay
+from bags.pictures import tables
 from bags.tools.fitness import LEAST_OVERLAP
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Degrees, Polynomial, Rse, Sem, identify
@@ -82,13 +83,13 @@ def test_the_rate_of_a_method_with_a_long_name_is_not_cut(kind: Any, method: Any
         trials.append(Trajectory(t=0.1 * np.arange(200), y=y, u=u, name=name))
     data = Dataset(tuple(trials))
     fit = identify(data, kind, method=method, test=data)
-    text = printed(show.methods_table(fit, data))
+    text = printed(tables.methods_table(fit, data))
     assert "…" not in text
     assert all(len(line) == 80 for line in text.splitlines() if line.startswith("│"))
     proved = [c.proof for c in fit.candidates if c.proof is not None]
     assert len(proved) == len(fit.candidates) > 1
     for candidate in fit.candidates:
-        assert show.stability(candidate).removeprefix("[green]") in text
+        assert tables.stability(candidate).removeprefix("[green]") in text
 
 
 def test_a_recording_too_short_for_a_delay_is_said_to_be_short(tmp_path: Path) -> None:

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.designs.tolerances import CONTROLLER, TABLE, VALIDATOR, Tolerance, tolerances
 from nlsid_core import files
 from nlsid_core.design import OutputTubeDesign
@@ -21,6 +19,7 @@ from nlsid_core.kernel import text
 from nlsid_core.models import Signal
 from tests.core.kernel.mutations import CORPUS
 from tests.tracked import designed
+from tests.verbs import nlsid
 
 CONTINUOUS = sorted(path.name for path in (CORPUS / "continuous_funnel").iterdir())[0]
 
@@ -73,9 +72,8 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
     design: OutputTubeDesign, tmp_path: Path
 ) -> None:
     design.save(tmp_path)
-    done = CliRunner().invoke(app, ["export", str(tmp_path), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
-    assert f"no {CONTROLLER}: no signal is in rad or m" in done.output
+    said = nlsid("export", tmp_path, "--out", tmp_path / "out")
+    assert f"no {CONTROLLER}: no signal is in rad or m" in said
     content = yaml.safe_load((tmp_path / "out" / VALIDATOR).read_text())
     width = up(design.funnel.half_width)
     assert content["/**"]["ros__parameters"]["thresholds"] == {

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.pictures.tubes import draw_free_run, draw_tube, state_pairs, write_tube
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.designs import AnyDesign, Design
@@ -18,8 +16,6 @@ from tests.continuous_stage import stage
 from tests.tracked import PERIOD, designed, pendulum
 
 pytestmark = pytest.mark.pictures
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("make", [designed, lambda: Design(*stage())])
@@ -63,29 +59,3 @@ def test_the_free_run_is_simulated_in_the_box_only_and_of_the_worst_trial() -> N
         measured, simulated = (np.asarray(drawn.get_ydata()) for drawn in axes.get_lines())
         np.testing.assert_array_equal(measured, worse[:, i])
         assert np.isnan(simulated[outside]).all()
-
-
-@pytest.mark.slow
-def test_every_step_draws_beside_its_files_and_says_so(tmp_path: Path) -> None:
-    pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")
-    text = (ROOT / "config" / "pendulum.yaml").read_text()
-    for given, shorter in (
-        ("[pendulum_4_0, pendulum_4_1, pendulum_4_2, pendulum_4_3]", "[pendulum_2_0]"),
-        ("duration: 1.5\n", "duration: 0.3\n"),
-        ("[0.6,", "[0.1,"),
-        ("groups: 5", "groups: 3"),
-        ("repeats: 4", "repeats: 2"),
-        ("seconds: 60.0", "seconds: 12.0"),
-        ("runs: 30", "runs: 3"),
-        ("identification:\n", "identification:\n  degrees: [[3, 1, 1]]\n"),
-    ):
-        assert given in text
-        text = text.replace(given, shorter)
-    config = tmp_path / "pendulum.yaml"
-    config.write_text(text)
-    result = CliRunner().invoke(app, ["demo", "--robot", str(config), "--out", str(tmp_path)])
-    assert result.exit_code == 0, (result.output, result.exception)
-    for name in ("free_run.png", "funnel.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-        assert f"wrote {tmp_path / name}" in result.output
-    assert "3 of 3 bags are inside" in result.output

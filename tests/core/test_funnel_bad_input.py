@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.chain.problems import FunnelProblem
+from bags.chain.problems import load_problem
 from bags.commands import cli
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.errors import DataError, NlsidError, NotPolynomial, OptionError
+from tests import funnel_problem
 from tests.marks import slow_among
 
 KNOTS = 9
@@ -38,7 +39,7 @@ def hanging() -> tuple[VectorField, Nominal]:
 def fair() -> Json:
     """A problem with nothing wrong."""
     goal = Goal(np.zeros(2), 20 * np.eye(2))
-    return FunnelProblem(*hanging(), goal, np.eye(2), np.eye(1)).document()
+    return funnel_problem.document(*hanging(), goal, Q=np.eye(2), R=np.eye(1))
 
 
 def other(field: VectorField) -> Json:
@@ -46,7 +47,7 @@ def other(field: VectorField) -> Json:
     t = np.linspace(0, 1, 5)
     rest = integrate_nominal(field, lambda _: np.zeros(field.m), t=t, start=np.zeros(field.n))
     goal = Goal(np.zeros(field.n), np.eye(field.n))
-    return FunnelProblem(field, rest, goal, np.eye(field.n), np.eye(field.m)).document()
+    return funnel_problem.document(field, rest, goal, Q=np.eye(field.n), R=np.eye(field.m))
 
 
 def nominal_bent(problem: Json) -> Json:
@@ -161,7 +162,7 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
     problem, out = tmp_path / "problem.json", tmp_path / "out"
     files.write_document(problem, spoil(fair()))
     with pytest.raises(NlsidError, match=message):
-        FunnelProblem.load(problem).design()
+        design_funnel(load_problem(problem))
     given = ["nlsid", "funnel", str(out), "--problem", str(problem)]
     monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit) as stopped:
@@ -175,20 +176,19 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
 
 def test_the_same_problem_unspoiled_is_designed(tmp_path: Path) -> None:
     files.write_document(tmp_path / "problem.json", fair())
-    read = FunnelProblem.load(tmp_path / "problem.json")
-    assert read.document() == fair()
-    assert np.min(read.design().found.proved.margins) > 0
+    made = design_funnel(load_problem(tmp_path / "problem.json"))
+    assert np.min(made.found.proved.margins) > 0
 
 
 @pytest.mark.slow
 def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -> None:
     problem = {key: fair()[key] for key in ("format", "version", "vector_field", "nominal", "goal")}
     files.write_document(tmp_path / "problem.json", problem | {"hold": 0.01, "error": [0.001, 0.0]})
-    found = FunnelProblem.load(tmp_path / "problem.json").design()
+    found = design_funnel(load_problem(tmp_path / "problem.json"))
     assert (found.claim["hold"], found.claim["error"]) == (0.01, [0.001, 0.0])
     files.write_document(tmp_path / "problem.json", problem | {"hold": "longest"})
     with pytest.raises(OptionError, match="hold is 'longest'"):
-        FunnelProblem.load(tmp_path / "problem.json").design()
+        load_problem(tmp_path / "problem.json")
 
 
 # -- where Python takes what a file cannot hold ------------------------------------------------

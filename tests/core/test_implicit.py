@@ -42,7 +42,7 @@ def test_without_newton_the_ellipsoid_method_makes_the_step(
 
 def test_the_ellipsoid_method_says_when_the_stated_monotonicity_is_false() -> None:
     model = quintic()
-    lying = ImplicitModel(model.h, model.shift, 1e6, 0.1, model.states, model.inputs)
+    lying = ImplicitModel(model.h, model.shift, 1e6, model.states, model.inputs, period=0.1)
     with pytest.raises(SolverError, match="is not 1e\\+06-monotone"):
         lying.ellipsoid(np.array([0.0, 5.0]), start=np.array([0.0]))
 
@@ -53,9 +53,9 @@ def test_an_equation_without_a_root_is_said_to_have_none() -> None:
         Polynomials(np.array([[2, 0], [0, 0]]), np.array([[1.0], [1.0]])),
         Polynomials(np.zeros((0, 1), dtype=np.int64), np.zeros((0, 0))),
         0.5,
-        0.1,
         ("v",),
         (),
+        period=0.1,
     )
     with pytest.raises(SolverError, match="monotone"):
         model.step(np.zeros((1, 1)), np.zeros((1, 0)))
@@ -121,9 +121,9 @@ def test_wrong_sizes_and_documents_are_refused() -> None:
             inputs=("u",),
         )
     with pytest.raises(ShapeError, match="h should have 1 to 1 polynomials, has 2"):
-        ImplicitModel(model.h, model.shift, 0.5, 0.1, ("a",), ("u",))
+        ImplicitModel(model.h, model.shift, 0.5, ("a",), ("u",), period=0.1)
     with pytest.raises(DataError, match="should be positive"):
-        ImplicitModel(model.h, model.shift, 0.0, 0.1, model.states, model.inputs)
+        ImplicitModel(model.h, model.shift, 0.0, model.states, model.inputs, period=0.1)
     with pytest.raises(ShapeError, match=r"x should be \(B, 2\)"):
         model.step(np.zeros(2), np.zeros((1, 1)))
     document = lagged().document()

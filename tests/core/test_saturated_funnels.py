@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
 from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import torque_limited_pendulum as pendulum
@@ -30,6 +29,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.proofs import check
+from tests import funnel_problem
 from tests.core.kernel import refusals
 from tests.funnel_files import Files, saved, write
 
@@ -310,16 +310,16 @@ def test_a_nominal_beyond_the_limits_is_refused() -> None:
 @pytest.mark.slow
 def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:
     field, _ = pendulum.problem()
-    asked = FunnelProblem(
+    asked = funnel_problem.document(
         field,
         still(field, 13, 0.3),
         Goal(np.zeros(2), GOAL),
-        pendulum.Q,
-        pendulum.R,
-        limits=np.array([[0, -LIMIT, LIMIT]]),
+        Q=pendulum.Q,
+        R=pendulum.R,
+        limits=[[0, -LIMIT, LIMIT]],
     )
     file = tmp_path / "problem.json"
-    documents.write_document(file, asked.document())
+    documents.write_document(file, asked)
     made = CliRunner().invoke(app, ["funnel", str(tmp_path), "--problem", str(file)])
     assert made.exit_code == 0, made.output
     assert ContinuousPolicy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary, smallest_escape
@@ -40,6 +39,7 @@ from nlsid_core.kernel.continuous_funnel import inside
 from nlsid_core.kernel.files import Rejected
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.proofs import check
+from tests import funnel_problem
 from tests.funnel_files import saved, write
 
 
@@ -296,8 +296,8 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     field, nominal = hanging(9)
     goal = Goal(np.zeros(2), 20 * np.eye(2))
     problem_file = tmp_path / "problem.json"
-    asked = FunnelProblem(field, nominal, goal, np.eye(2), np.eye(1))
-    files.write_document(problem_file, asked.document())
+    asked = funnel_problem.document(field, nominal, goal, Q=np.eye(2), R=np.eye(1))
+    files.write_document(problem_file, asked)
     runner = CliRunner()
     made = runner.invoke(app, ["funnel", str(tmp_path), "--problem", str(problem_file)])
     assert made.exit_code == 0, made.output

@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from bags.chain.config import Config, load_config
 from bags.chain.steps import identify_bags, identify_trials
 from bags.designs import documents
-from bags.fleet.bags import Recordings, named_bags, robots_of
+from bags.fleet.bags import Recordings, named_bags
 from bags.fleet.check import CheckBag
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
@@ -62,9 +62,8 @@ def run(
     config: Path,
     out: Path,
     workers: Workers = Workers(),  # noqa: B008
-    strict: bool = False,
 ) -> FleetTrials:
-    return identified(named_bags([bags]), load_config(config), out, workers, strict)
+    return identified(named_bags([bags]), load_config(config), out, workers)
 
 
 def identified(
@@ -72,10 +71,9 @@ def identified(
     config: Config,
     out: Path,
     workers: Workers = Workers(),  # noqa: B008
-    strict: bool = False,
 ) -> FleetTrials:
     """What was read; the model of it is in `out`."""
-    found = read_fleet(bags, config, out, workers=workers, strict=strict)
+    found = read_fleet(bags, config, out, workers=workers)
     identify_trials(found.trials, config, out, progress=silent)
     return found
 
@@ -93,26 +91,6 @@ def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> N
     assert list(named_bags([folder / "robot_0" / "drive_2.mcap"])) == ["drive_2"]
     with pytest.raises(DataError, match="two bags are called 'drive_0'"):
         named_bags([folder / "robot_0", drive(tmp_path / "drive_0.mcap")])
-
-
-@pytest.mark.parametrize(
-    ("names", "robots"),
-    [
-        (["a/d_1", "b/d_1"], ["a", "b"]),
-        (["d_1", "d_2"], ["-", "-"]),
-        (["a/2026-08/d", "b/2026-08/d", "a/2026-09/d"], ["a", "b", "a"]),
-        (["2026-08/a/d", "2026-08/b/d", "2026-09/a/d"], ["a", "b", "a"]),
-        (["2026/8/01/a/d", "2026/9/02/b/d"], ["a", "b"]),
-        (["x/20260801/1/d", "x/20260801/2/d"], ["x", "x"]),
-        (["fleet/1/2026-08-01/d", "fleet/2/2026-08-01/d"], ["1", "2"]),
-        (["date=2026-08-01/a/d", "date=2026-08-02/b/d"], ["a", "b"]),
-        (["site/a/run_1/d", "site/a/run_2/d"], ["run_1", "run_2"]),
-    ],
-)
-def test_the_robot_is_the_folder_that_tells_bags_apart_and_is_no_date(
-    names: list[str], robots: list[str]
-) -> None:
-    assert robots_of(names) == dict(zip(names, robots, strict=True))
 
 
 def test_a_folder_whose_folders_hold_bags_says_the_pattern(tmp_path: Path) -> None:
@@ -201,8 +179,6 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
         {"robot_1/copy"},
     )
     assert len(found.trials.train) + len(found.trials.test) == 6
-    with pytest.raises(BagError, match=r"cut\.mcap"):
-        run(folder / "*" / "*.mcap", config, tmp_path / "strict", strict=True)
 
 
 def test_a_second_run_reads_only_what_is_new(tmp_path: Path, config: Path) -> None:

@@ -1,15 +1,12 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
-import math
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -21,15 +18,9 @@ from bags.commands import fleet_cli
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
-from bags.fleet.check import Checked, check_fleet, write_parquet
-from bags.fleet.monitor import (
-    FleetVerdict,
-    JudgeBag,
-    Judged,
-    calibration_spent,
-    monitor_fleet,
-    trouble_in,
-)
+from bags.fleet.check import CheckBag
+from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent
+from bags.fleet.rows import Row, read_rows, write_parquet
 from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import replay_bag
@@ -37,10 +28,10 @@ from bags.recordings.remote import MARK_BYTES
 from bags.samples import f1tenth
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Reading
 from tests.bag_messages import START_NS
 from tests.bags.fleet.storage import Odd, drive, web_server
 from tests.marks import slow_among
+from tests.verbs import nlsid
 
 CONFIG = Path("config/f1tenth.yaml")
 
@@ -54,15 +45,19 @@ def design(f1tenth_chain: Path) -> Path:
 def held_against(funnel: Path, bags: Mapping[str, Path]) -> FleetVerdict:
     """The bags of a fleet, judged in this process."""
     design = documents.load(funnel)
-    task = JudgeBag(design, Centre.COMMAND, {})
-    return monitor_fleet(bags, task, calibration_spent(funnel.parent, design), workers=Workers())
+    read = read_rows(JudgeBag(design, Centre.COMMAND, {}), bags, workers=Workers())
+    spent = calibration_spent(funnel.parent, design)
+    return FleetVerdict(read.rows, spent, frozenset(design.made_with))
 
 
-def judged(spent: float, month: str = "2026-01", **other: str) -> Judged:
-    row = Judged(
-        f"bag_{spent}_{month}", "robot", "inside", spent=spent, start=f"{month}-03T00:00:00+00:00"
-    )
-    return replace(row, **other)  # type: ignore[arg-type]
+def checked(bags: Mapping[str, Path]) -> tuple[Row, ...]:
+    """Whether the bags are fit for F1TENTH's configuration."""
+    return read_rows(CheckBag(load_config(CONFIG)), bags, workers=Workers()).rows
+
+
+def judged(spent: float, month: str = "2026-01") -> Row:
+    start = f"{month}-03T00:00:00+00:00"
+    return Row(f"bag_{spent}_{month}", "inside", start=start, numbers={"spent": spent})
 
 
 def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
@@ -72,22 +67,14 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
     for row, path in zip(found.rows, bags.values(), strict=True):
         alone = replay_bag(proved, path, centre=Centre.COMMAND)
         assert alone.worst is not None
-        assert (row.verdict, row.margin, row.span) == (
-            alone.verdict,
-            alone.worst.margin,
-            alone.span,
-        )
-        assert row.spent == max(r.assumption for r in alone.judged)
-        most = max(range(len(alone.readings)), key=lambda k: _spent(alone.readings[k]))
-        when = datetime.fromtimestamp(alone.stamps_ns[most] // 10**9, UTC)
-        assert row.spent_when == when.isoformat()
+        assert row.verdict == alone.verdict
+        assert row.numbers["margin"] == alone.worst.margin
+        assert row.numbers["span"] == alone.span
+        most = max(alone.judged, key=lambda reading: reading.assumption)
+        assert row.numbers["spent"] == most.assumption
+        assert row.numbers["spent_at"] == most.t
         start = datetime.fromtimestamp(alone.stamps_ns[0] // 10**9, UTC)
         assert row.start == start.isoformat()
-
-
-def _spent(reading: Reading) -> float:
-    """What is judged by the assumption; nothing else comes first."""
-    return reading.assumption if math.isfinite(reading.assumption) else -1.0
 
 
 def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
@@ -133,24 +120,6 @@ def test_drift_is_the_rank_test_of_all_orders() -> None:
     assert FleetVerdict(rows[:2], older, frozenset()).drift is None
 
 
-def test_the_histogram_counts_every_bag_once() -> None:
-    rows = tuple(judged(s) for s in (0.0, 0.05, 0.1, 0.11, 0.95, 1.0, 1.01, 30.0))
-    counts = FleetVerdict(rows, (), frozenset()).histogram
-    assert counts == [3, 1, 0, 0, 0, 0, 0, 0, 0, 2, 2]
-
-
-def test_groups_with_trouble_come_first() -> None:
-    rows = (
-        judged(0.1, robot="a"),
-        judged(0.2, robot="b", verdict="outside"),
-        judged(0.3, robot="b"),
-    )
-    found = FleetVerdict((*rows, judged(0.4, robot="c", verdict="copy")), (), frozenset())
-    assert list(found.by("robot")) == ["b", "a", "c"]
-    assert [trouble_in(own) for own in found.by("robot").values()] == [1, 0, 0]
-    assert list(found.by("day")) == ["2026-01-03"]
-
-
 def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     design: Path, tmp_path: Path
 ) -> None:
@@ -160,12 +129,11 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
     table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
     given = ["--out", str(table), "--manifest", str(kept)]
-    done = CliRunner().invoke(app, ["fleet", "monitor", str(design.parent), pattern, *given])
-    assert done.exit_code == 1, done.output
-    assert "robot_2/cut: " in done.output
+    said = nlsid("fleet", "monitor", design.parent, pattern, *given, status=1)
+    assert "robot_2/cut: " in said
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
-    assert f"nlsid view {design.parent} {worst}" in done.output
-    assert "is no MCAP, SQLite or ROS 1 file" in done.output
+    assert f"nlsid view {design.parent} {worst}" in said
+    assert "is no MCAP, SQLite or ROS 1 file" in said
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
     assert set(rows) == {"robot_1/other", "robot_2/cut"}
@@ -185,14 +153,15 @@ def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: 
     assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
-    assert sum(found.histogram) == 1
 
 
-def test_bags_of_the_design_that_are_not_recognised_are_said() -> None:
-    rows = tuple(Judged(name, "-", "inside", "", spent=0.5, digest=name) for name in "ab")
-    assert FleetVerdict(rows, (), frozenset("xy")).unrecognised
-    assert not FleetVerdict(rows, (), frozenset("bx")).unrecognised
-    assert not FleetVerdict(rows, (), frozenset()).unrecognised
+def test_bags_of_the_design_that_are_not_recognised_are_said(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rows = tuple(Row(name, "inside", marks=(name,), numbers={"spent": 0.5}) for name in "ab")
+    for made_of, is_said in (("xy", True), ("bx", False), ("", False)):
+        fleet_cli._say_verdicts(FleetVerdict(rows, (), frozenset(made_of)))
+        assert ("none of these is known" in capsys.readouterr().out) is is_said
 
 
 def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
@@ -211,7 +180,7 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
     with web_server(web) as url:
         found = held_against(design, named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]))
     rows = {row.bag: row for row in found.rows}
-    assert rows["b"].judged > 0
+    assert rows["b"].numbers["judged"] > 0
     assert "copy" not in (rows["a"].verdict, rows["b"].verdict)
     assert (rows["c"].verdict, rows["c"].reason) == ("copy", "the same recording as a")
 
@@ -223,24 +192,24 @@ def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: P
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
     where = [str(design.parent), str(fleet)]
     check, monitor = ["check", *where, "--config", str(CONFIG)], ["monitor", *where]
-    for given, status in ((check, 2), (monitor, 2)):  # one was not read
-        done = CliRunner().invoke(app, ["fleet", *given], env={"COLUMNS": "200"})
-        assert done.exit_code == status, done.output
-        assert "a[bold][" in done.output
-        assert "red]\N{REPLACEMENT CHARACTER}[2J" in done.output
-        assert "b[/bold].mcap" in done.output
-        assert "\x1b[2J" not in done.output
+    for given in (check, monitor):
+        said = nlsid("fleet", *given, status=2)  # one was not read
+        assert "a[bold][" in said
+        assert "red]\N{REPLACEMENT CHARACTER}[2J" in said
+        assert "b[/bold].mcap" in said
+        assert "\x1b[2J" not in said
 
 
 def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
     bags = {path.name: path for path in f1tenth()[:3]}
     (tmp_path / "cut.mcap").write_bytes(b"no bag")
     bags |= named_bags([tmp_path / "cut.mcap"])
-    rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
+    rows = checked(bags)
     assert [row.bag for row in rows] == list(bags)
     assert rows[-1].verdict == "not read"
-    assert "is no MCAP, SQLite or ROS 1 file" in rows[-1].trouble
-    assert all(row.findings and row.start.startswith("2022-01-01T00:") for row in rows[:3])
+    assert "is no MCAP, SQLite or ROS 1 file" in rows[-1].reason
+    assert all(row.said["findings"] for row in rows[:3])
+    assert all(row.start.startswith("2022-01-01T00:") for row in rows[:3])
     parquet = pytest.importorskip("pyarrow.parquet")
     write_parquet(rows, tmp_path / "t.parquet")
     assert parquet.read_table(tmp_path / "t.parquet").num_rows == 4
@@ -249,9 +218,9 @@ def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
 def test_a_command_that_one_bag_holds_does_not_make_it_bad() -> None:
     """Each of the shipped trials 6 to 11 does so, and they are identified from."""
     bags = {path.name: path for path in f1tenth()[5:7]}
-    rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
+    rows = checked(bags)
     assert [row.verdict for row in rows] == ["good", "good"]
-    assert all("no excitation" in " ".join(row.findings) for row in rows)
+    assert all("no excitation" in row.said["findings"] for row in rows)
 
 
 @pytest.fixture(scope="module")
@@ -274,17 +243,14 @@ def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def fleet_command(verb: str, *given: str, columns: int = 80) -> tuple[int, list[str]]:
-    done = CliRunner().invoke(app, ["fleet", verb, *given], env={"COLUMNS": str(columns)})
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    return done.exit_code, done.output.splitlines()
+def fleet_command(verb: str, *given: object, status: int = 0, columns: int = 80) -> list[str]:
+    return nlsid("fleet", verb, *given, status=status, columns=columns).splitlines()
 
 
 @pytest.mark.parametrize("columns", [80, 140])
 def test_check_puts_first_what_the_next_step_refuses(spoiled: Path, columns: int) -> None:
     given = ("DIR", str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
-    status, lines = fleet_command("check", *given, columns=columns)
-    assert status == 1
+    lines = fleet_command("check", *given, status=1, columns=columns)
     assert lines[0] == "15 bags: 3 not read, 2 bad, 1 copy, 0 look, 9 good"
     shown = [line.split()[:3] for line in lines if line.startswith("r")]
     assert [" ".join(words).replace("not read", "unread").split()[:2] for words in shown] == [
@@ -310,16 +276,13 @@ def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
     bags, config = named_bags([spoiled / "*" / "*" / "*.mcap"]), load_config(CONFIG)
     split = config.split.model_copy(update={"test": ["r0/*"], "calibration": []})
     config = config.model_copy(update={"split": split})
-    checked = {
-        verdict: {
-            row.bag
-            for row in check_fleet(bags, config, workers=Workers()).rows
-            if row.verdict == verdict
-        }
+    rows = read_rows(CheckBag(config), bags, workers=Workers()).rows
+    listed = {
+        verdict: {row.bag for row in rows if row.verdict == verdict}
         for verdict in ("not read", "bad", "copy")
     }
     read = read_fleet(bags, config, tmp_path, workers=Workers())
-    assert checked == {
+    assert listed == {
         "not read": set(read.unread),
         "bad": set(read.unusable),
         "copy": set(read.copies),
@@ -331,7 +294,7 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
 ) -> None:
     pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
     given = (str(design.parent), pattern, "--manifest", kept)
-    _, lines = fleet_command("monitor", *given, columns=80)
+    lines = fleet_command("monitor", *given, status=1)
     said = "\n".join(lines)
     assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
     assert f"0 of them known from {kept}, 15 asked of now" in lines[1]
@@ -342,42 +305,17 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     )
     assert "r9/2022-01/back: stamps of /cmd_vel go back in 1 place, by up to 0.225 s; " in said
     worst = lines.index("the 10 bags that spent the most, and when:")
-    assert "robots with trouble: " in said
-    assert re.search(r"^r9 +7", said, re.MULTILINE)
     assert [len(line) <= 80 for line in lines[worst : worst + 13]] == 13 * [True]
     assert "\N{HORIZONTAL ELLIPSIS}" not in said, "nothing is cut"
-    _, again = fleet_command("monitor", *given, columns=80)
+    again = fleet_command("monitor", *given, status=1)
     assert f"12 of them known from {kept}, 3 asked of now" in again[1]
     assert [lines[0], *lines[2:]] == [again[0], *again[2:]]
-
-
-def test_a_table_of_groups_says_how_many_it_does_not_show(capsys: Any) -> None:
-    rows = tuple(
-        Judged(f"d{k}", "-", "unknown" if k < 35 else "inside", start=f"20{10 + k}-01-01T00:00")
-        for k in range(40)
-    )
-    fleet_cli._say_groups(
-        "days", FleetVerdict(rows, (), frozenset()).by("day"), ["unknown", "inside"], None
-    )
-    said = capsys.readouterr().out
-    assert "days with trouble: 35 of 40" in said
-    assert "and 5 more days with trouble, none with more; --out writes every bag" in said
-    assert said.count("-01-01") == 30
-
-
-def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_path: Path) -> None:
-    bags = named_bags([drive(tmp_path / "drive.mcap", samples=117)])
-    (row,) = held_against(design, bags).rows
-    assert row.verdict == "assumption violated"
-    assert row.reason.startswith(row.assumption.partition(" ...")[0])
-    assert not re.search(r"\d", row.assumption)
 
 
 def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     for k in range(2):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(held=0.25))
-    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
-    assert status == 0
+    lines = fleet_command("check", "DIR", tmp_path, "--config", CONFIG)
     assert lines == [
         "2 bags: 0 not read, 0 bad, 0 copies, 0 look, 2 good",
         "no command moves in any bag that can be used: there is little to identify from",
@@ -389,8 +327,7 @@ def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
 ) -> None:
     for k, lost in enumerate((3, 0, None)):
         drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, odd=Odd(lost=lost))
-    status, lines = fleet_command("check", "DIR", str(tmp_path), "--config", str(CONFIG))
-    assert status == 0
+    lines = fleet_command("check", "DIR", tmp_path, "--config", CONFIG)
     assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
     assert lines[1].split() == [
         "bag",
@@ -481,17 +418,10 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
 
     with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
         named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=1.0)
-        found: Sequence[Checked | Judged] = (
-            check_fleet(named, load_config(CONFIG), workers=Workers()).rows
-            if verb == "check"
-            else held_against(design, named).rows
-        )
+        found = checked(named) if verb == "check" else held_against(design, named).rows
     rows = {row.bag: row for row in found}
     assert [row.bag for row in found] == sorted(rows) == sorted(named)
-    said = {
-        name: f"{row.trouble} {row.findings}" if isinstance(row, Checked) else row.reason
-        for name, row in rows.items()
-    }
+    said = {name: f"{row.reason} {row.said}" for name, row in rows.items()}
     assert re.search("truncated or unfinished|unfinished: ", said["cut"])
     assert [rows[name].verdict for name in ("busy", "slow", "gone")] == 3 * ["not read"]
     assert "1 s were lost with failing requests" in said["busy"]

@@ -28,7 +28,13 @@ Y, U = Signal("speed", "m/s", "/speed:data"), Signal("command", "V", "/command:d
 
 def linear() -> DifferenceEquation:
     return DifferenceEquation(
-        np.array([1.2, -0.5, 0.1]), np.array([0.2, 0.1, 0.0, -0.3]), 0.25, 0.025, Y, U, (-1.0, 2.0)
+        np.array([1.2, -0.5, 0.1]),
+        np.array([0.2, 0.1, 0.0, -0.3]),
+        0.25,
+        Y,
+        U,
+        (-1.0, 2.0),
+        period=0.025,
     )
 
 
@@ -100,9 +106,9 @@ def monotone() -> MonotoneEquation:
         ((0, 0),),
         0.0,
         np.zeros(1),
-        0.025,
         Y,
         (U,),
+        period=0.025,
     )
 
 

@@ -54,6 +54,18 @@ CHANGES: dict[str, tuple[str, Callable[[Json, Json], None], str]] = {
         lambda _, p: p.update(multipliers={"N": [[1.0], [0.0]], "ends": {}}),
         "malformed",
     ),
+    "split slopes": (
+        "network",
+        lambda _, p: p.update(multipliers={"split": 0, "parts": [p["multipliers"]] * 2}),
+        "malformed",
+    ),
+    "ends of slopes": (
+        "cascade",
+        lambda _, p: p["multipliers"].update(
+            ends={"low": 0.0, "high": 1.0, "low_weights": [0.0], "high_weights": [0.0]}
+        ),
+        "malformed",
+    ),
     "ends of nothing": ("monotone", lambda _, p: p["multipliers"].update(ends={}), "malformed"),
     "leaf and node": ("split", lambda _, p: p["multipliers"].update(N=[[1.0]]), "malformed"),
     "singular": (

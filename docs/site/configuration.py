@@ -1,10 +1,9 @@
 """docs/configuration.md, made from the sections' own types: every key, unit, default and range.
 
-python -m bags.chain.reference > docs/configuration.md
+python -m docs.site.configuration > docs/configuration.md
 """
 
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import MISSING, fields
 from typing import Any, get_args, get_origin
@@ -14,14 +13,14 @@ from pydantic.fields import FieldInfo
 
 from bags.chain.config import Config
 from bags.chain.identification_config import IdentificationConfig
-from bags.chain.sections import Key, Section, sections_in
-from bags.chain.templates import TEMPLATES, Template
+from bags.chain.sections import Section, sections_in
+from bags.chain.templates import TEMPLATES, Template, option_texts
 from bags.chain.tracking_config import TrackingConfig
 from nlsid_core.identification import METHODS, methods_of
 
 HEAD = """# The configuration of a robot, key by key
 
-Made by `python -m bags.chain.reference`; a test keeps it true. Words are in the
+Made by `python -m docs.site.configuration`; a test keeps it true. Words are in the
 [glossary](glossary.md). `nlsid identify DIR BAG... --check` says all that is wrong with a file at
 once. A key without a default has to be given; a key that is not here is refused.
 """
@@ -61,11 +60,6 @@ def page() -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def keys_of(section: type[Section]) -> dict[str, Key]:
-    """What each key of a section is; StopIteration if one does not say."""
-    return {name: _key(field) for name, field in section.model_fields.items()}
-
-
 def _sections(name: str, kind: type[Section]) -> Iterator[tuple[str, type[Section]]]:
     """The section and those in it, by their dotted names; of lists of one kind the first only."""
     yield name, kind
@@ -83,15 +77,11 @@ def _section(name: str, section: type[Section]) -> Iterator[str]:
         yield f"{section.__doc__}\n"
     yield f"| {' | '.join(COLUMNS)} |"
     yield "|" + "---|" * len(COLUMNS)
-    for key, field in section.model_fields.items():
-        known = _key(field)
+    for key, known in section.keys().items():
+        field = section.model_fields[key]
         example = "" if known.example is None else f"`{json.dumps(known.example)}`"
         cells = (f"`{key}`", known.text, known.unit, _default(field), _range(field), example)
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _key(field: FieldInfo) -> Key:
-    return next(entry for entry in field.metadata if isinstance(entry, Key))
 
 
 def _default(field: FieldInfo) -> str:
@@ -189,18 +179,13 @@ def template_rows(template: Template) -> list[tuple[str, str, str, str]]:
 
 def option_rows(kind: Any) -> list[tuple[str, str, str, str]]:
     """(key, what its docstring says, type, default) of each option of a class or a method."""
-    text = re.sub(r"\s+", " ", kind.__doc__ or "")
-    names = [f.name for f in fields(kind)]
+    texts = option_texts(kind)
     found = []
     for option in fields(kind):
-        ends = "|".join([*(rf"[,;.]? {name}: " for name in names), r" Raises ", r" Source: ", "$"])
-        said = re.search(rf"\b{option.name}: (.*?)(?:{ends})", text)
-        what = said[1].rstrip(".;, ") if said else ""
         default = "required" if option.default is MISSING else _written(option.default)
         shown = option.type if isinstance(option.type, str) else _type(option.type)
-        found.append(
-            (option.name, what.replace("|", "\\|"), f"`{shown}`".replace("|", "\\|"), default)
-        )
+        what, type_ = (text.replace("|", "\\|") for text in (texts[option.name], f"`{shown}`"))
+        found.append((option.name, what, type_, default))
     return found
 
 
