@@ -263,9 +263,9 @@ class FunnelMonitor(ManagedNode):
         kind = self._kind(topic, [each.topic_type for each in found])
         if not kind:
             return
-        before = self._topics[topic].several
+        before = self._doubt(topic)
         heard.look(kind, found)
-        if (doubt := self._topics[topic].several) and not before:
+        if (doubt := self._doubt(topic)) and not before:
             self.get_logger().warning(doubt)
             if topic in self._watch.pairing.response_topics:
                 self._publish(self._watch.missing(doubt))
@@ -290,6 +290,11 @@ class FunnelMonitor(ManagedNode):
             self._tell(unfit)
         return ""
 
+    def _doubt(self, topic: str) -> str:
+        """Why nobody knows whose messages are on a topic; transforms have one for all."""
+        assert self._watch is not None
+        return "" if topic in self._watch.pairing.shared_topics else self._topics[topic].several
+
     def _on_signal(self, topic: str, message: Any, info: dict[str, int]) -> None:
         """Decode stamp and values, and judge whatever samples are complete."""
         watch, heard = self._watch, self._topics[topic]
@@ -297,7 +302,8 @@ class FunnelMonitor(ManagedNode):
         logged = watch.pairing.clock == "log"
         stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
         heard.silence.end(1)
-        heard.numbers.update(info["publication_sequence_number"])
+        if watch.pairing.measures(topic, message):
+            heard.numbers.update(info["publication_sequence_number"])
         responds = topic in watch.pairing.response_topics
         if not responds:
             unfit = self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
@@ -336,7 +342,7 @@ class FunnelMonitor(ManagedNode):
 
     def _distrust(self, topic: str, message: Any, *, logged: bool) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
-        said = self._topics[topic].several
+        said = self._doubt(topic)
         for each in self._topics.values():
             said = said or each.alternating
         if said or logged:
@@ -481,7 +487,7 @@ class FunnelMonitor(ManagedNode):
     def _odd(self) -> list[str]:
         """What is odd about the graph: whose messages come, and whose do not; commands may rest."""
         responses = self._watch.pairing.response_topics if self._watch else ()
-        said = [self._topics[topic].several for topic in self._topics]
+        said = [self._doubt(topic) for topic in self._topics]
         said += [self._topics[topic].unheard for topic in responses]
         return [each for each in (*said, graph.namesakes(self)) if each]
 

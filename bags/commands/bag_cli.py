@@ -200,7 +200,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
     if found.lost:
         verdict = "what was lost is said above"
     elif found.statements:
-        verdict = f"nothing was lost of what {' and '.join(found.statements)} state"
+        verdict = f"nothing was lost of what is stated in {' and '.join(found.statements)}"
     else:
         verdict = (
             "whether messages are missing is not known: the bag does not state how many it had"

@@ -105,13 +105,17 @@ def main() -> None:
     """
     _prepare_streams()
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except NlsidError as error:
         err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
         sys.exit(2)
     except OSError as error:
         said = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         err.print(f"error: {said}", soft_wrap=True, markup=False, highlight=False)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what could not be written is not tried again
         sys.exit(2)
 
 

@@ -55,6 +55,7 @@ class Watch:
         self.pairing = sampler_of(design)
         self._single = design.is_single
         self._count = len(self.pairing.responses)
+        self._framed = any(signal.path.framed for signal in self.pairing.responses)
         self._alarm = Alarm(options)
         self._announced = announced
         self.restart()
@@ -124,6 +125,8 @@ class Watch:
         measured = tuple(value for k, value in numbers.items() if k < self._count)
         if not measured:
             return self._judge(self.pairing.take(stamp_ns, numbers))
+        if self._framed and not any(map(math.isfinite, measured)):
+            return []  # the message has other transforms
         self._newest_ns = max(self._newest_ns, stamp_ns)
         before = self.pairing.late_responses
         newest, self._newest[topic] = self._newest.get(topic), (stamp_ns, measured)

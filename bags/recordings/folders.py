@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -18,6 +18,7 @@ METADATA: Final = "metadata.yaml"
 ROS1: Final = ".bag"
 DATA_FILES: Final = (".mcap", ".db3", ROS1)
 ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
+JOURNAL: Final = "-wal"  # what SQLite has not moved into a file yet
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MOST_LOOKED_AT: Final = 1000  # names, for bags that lie deeper than what was given
@@ -113,10 +114,22 @@ def bag_files(path: Path) -> BagFiles:
     if not path.is_dir():
         raise BagError(f"there is no bag {path}; name a rosbag2 folder or an .mcap file")
     if (path / METADATA).is_file():
-        return _described(path, _metadata(path / METADATA))
-    if not (there := data_files(path)):
+        found = _described(path, _metadata(path / METADATA))
+    elif there := data_files(path):
+        found = BagFiles(there, finished=False, notes=_missing_parts(there))
+    else:
         raise BagError(f"{path} is not a bag: it holds no {' or '.join(DATA_FILES)} file")
-    return BagFiles(there, finished=False, notes=_missing_parts(there))
+    return replace(found, notes=(*found.notes, *_left_beside(path, found.files)))
+
+
+def _left_beside(folder: Path, files: Sequence[Path]) -> tuple[str, ...]:
+    """Which newest messages SQLite kept of a file that is not read under that name."""
+    read = {f"{file.name.removesuffix(COMPRESSED)}{JOURNAL}" for file in files}
+    left = {there.name for there in folder.iterdir() if there.name.endswith(f".db3{JOURNAL}")}
+    return tuple(
+        f"{name} is not read: messages of {name.removesuffix(JOURNAL)}, which is not there"
+        for name in sorted(left - read)
+    )
 
 
 def _missing_parts(files: Sequence[Path]) -> tuple[str, ...]:

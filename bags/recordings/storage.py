@@ -161,7 +161,7 @@ class Storage:
             return Ros1File(path, salvage=salvage)
         if start.startswith(MAGIC):
             return McapFile(path, salvage=salvage)
-        what = f"starts with {start[:8].hex(' ')}" if start else "is empty"
+        what = f"starts with {start[:8].hex(' ')}" if start else "is empty, or cut off"
         raise BagError(f"it is no MCAP, SQLite or ROS 1 file: it {what}")
 
     def _unzipped(self, path: Path, stream: BinaryIO, *, salvage: bool) -> Path:

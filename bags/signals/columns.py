@@ -16,7 +16,7 @@ from bags.recordings.cdr import Gatherer, Numbers, Step, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath
-from nlsid_core.arrays import IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
@@ -138,7 +138,8 @@ class TopicReader:
         self._signals = signals
         self._stamped = is_stamped(msgtype, types)
         self._done = 0
-        self._targets = {n: s.targets(msgtype, types) for n, s in signals.items()}
+        self._kind = msgtype, types
+        self._targets = {n: s.targets(msgtype, types) for n, s in signals.items() if not s.framed}
         targets: list[tuple[Step, ...]] = list(STAMP) if self._stamped else []
         targets += [target for group in self._targets.values() for target in group]
         self._gatherer = Gatherer(msgtype, types, targets)
@@ -157,12 +158,21 @@ class TopicReader:
         if self._stamped:
             stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
         values: dict[str, Numbers] = {}
+        values |= {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
         for name, group in self._targets.items():
             values[name] = self._signals[name].combine(numbers[at : at + len(group)])
             at += len(group)
         return Columns(
             self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values, batch.sequence
         )
+
+    def _framed(self, batch: Batch, signal: SignalPath) -> FloatArray:
+        """Read by decoding: which message of an array is meant differs from message to message."""
+        try:
+            found = [signal.value(decode(batch.data(k), *self._kind)) for k in range(len(batch))]
+        except BagError as error:
+            raise BagError(f"{self._where}: {error}") from error
+        return np.array(found)
 
 
 def _check(bag: Bag, path: SignalPath) -> None:

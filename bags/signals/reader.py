@@ -104,7 +104,7 @@ def read_signals(
             key = topic, expression.clock
             if key not in stamped:
                 stamped[key] = _stamped(source, columns[topic], expression.clock, sort=sort)
-            gaps = name in gaps_in
+            gaps = name in gaps_in or expression.path.framed
             recorded = _recorded(source, name, stamped[key], gaps=gaps)
             recorded = replace(recorded, counted=columns[topic].doubt(name, responds=False))
             samples[name] = _applied(source, expression, recorded, kinds[topic], gaps=gaps)

@@ -154,6 +154,7 @@ class Sampler:
         self.on_grid = all(gridded)
         self._single = all(len(part) == 1 for part in self.excitations)
         self.response_topics = tuple(dict.fromkeys(s.path.topic for s in self.responses))
+        self.shared_topics = {s.path.topic for s in signals if s.path.framed}
         self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
         self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
         for k, signal in enumerate(signals):
@@ -210,6 +211,12 @@ class Sampler:
         """
         return {k: self._signals[k].path.value(message) for k in self._on[topic]}
 
+    def measures(self, topic: str, message: Any) -> bool:
+        """Whether a message has any of its topic's signals; one of other transforms has none."""
+        if not all(self._signals[k].path.framed for k in self._on[topic]):
+            return True
+        return any(map(math.isfinite, self.numbers(topic, message).values()))
+
     def unknown(self, topic: str) -> dict[int, float]:
         """What `numbers` gives for a message that cannot be read: NaN of each of its signals."""
         return dict.fromkeys(self._on[topic], math.nan)
@@ -243,6 +250,8 @@ class Sampler:
         return self._release(min(kept.newest_ns for kept in self._kept[: len(self.responses)]))
 
     def _operate(self, k: int, stamp_ns: int, value: float) -> None:
+        if self._signals[k].path.framed and math.isnan(value):
+            return  # the message has other transforms
         running = self._running.get(k)
         if running is None:
             running = self._running[k] = self._signals[k].numbers.running("")

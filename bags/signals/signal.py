@@ -1,8 +1,9 @@
 """A signal: one number in the messages of one topic, named `topic:field.path[index]`.
 
 An element of an array is named by its index, `position[0]`; by the string beside it,
-`position[name=elbow]`; or as every one of them, `position[*]`. A geometry_msgs/Quaternion also has
-the angles `roll`, `pitch` and `yaw`.
+`position[name=elbow]`; a message in an array by a string in it, `transforms[child_frame_id=base]`,
+where other messages of the topic may be without it; or as every one of them, `position[*]`. A
+geometry_msgs/Quaternion also has the angles `roll`, `pitch` and `yaw`.
 """
 
 import keyword
@@ -73,6 +74,11 @@ class SignalPath:
         """Whether it stands for several signals: see `expand`."""
         return any(step.every for step in self.steps)
 
+    @property
+    def framed(self) -> bool:
+        """Whether it leads through a named message of an array, so that it may be absent."""
+        return any(step.key is not None for step in self.steps[:-1])
+
     def check(self, msgtype: str, types: Typestore) -> None:
         """BagError unless messages of `msgtype` have a number here; it names the nearest that are.
 
@@ -96,7 +102,7 @@ class SignalPath:
                     f"{self}: Field '{step.field}' does not exist on '{owner}'; "
                     f"it has: {', '.join(fields)}{near}"
                 )
-            current = self._element(step, fields, owner)
+            current = self._element(step, fields, owner, types)
         if current[0] == Nodetype.NAME:
             fields = fields_of(str(current[1]), types)
             raise BagError(
@@ -132,7 +138,8 @@ class SignalPath:
     def value(self, message: Any) -> float:
         """The number in a decoded message of the checked type (of rosbags' or of rclpy).
 
-        Raises BagError if a dynamic array is too short or lacks the named element.
+        NaN if no message in an array has the name. Raises BagError if a dynamic array is too short
+        or lacks the element that is named beside it.
         """
         for step in self.steps:
             if step.field in ANGLES and not hasattr(message, step.field):
@@ -140,7 +147,10 @@ class SignalPath:
                 return float(quaternion_angle(step.field, np.array(parts, dtype=np.float64))[0])
             owner, message = message, getattr(message, _attribute(step.field))
             if step.picks:
-                message = message[self._place(step, owner, message)]
+                place = self._place(step, owner, message)
+                if place < 0:
+                    return math.nan
+                message = message[place]
         return float(message)
 
     def assign(self, message: Any, value: float) -> None:
@@ -174,7 +184,7 @@ class SignalPath:
         return owner == (Nodetype.NAME, QUATERNION)
 
     def _place(self, step: Step, owner: Any, array: Any) -> int:
-        """The index that `step` names in `array`, a field of `owner`."""
+        """The index that `step` names in `array`, a field of `owner`; -1 if no element has it."""
         if step.every:
             raise BagError(f"{self} is several signals; name one element")
         if step.length is not None and len(array) != step.length:
@@ -183,7 +193,11 @@ class SignalPath:
                 f"{step.length}"
             )
         if step.key is not None:
-            names = list(getattr(owner, _attribute(step.key[0])))
+            key = _attribute(step.key[0])
+            if not hasattr(owner, key):  # it is in the elements
+                inside = [getattr(element, key) for element in array]
+                return inside.index(step.key[1]) if step.key[1] in inside else -1
+            names = list(getattr(owner, key))
             if step.key[1] not in names:
                 raise BagError(
                     f"{self}: '{step.key[0]}' has no '{step.key[1]}'; it has: {', '.join(names)}"
@@ -196,7 +210,7 @@ class SignalPath:
             raise BagError(f"{self}: '{step.field}' has {len(array)} elements")
         return place
 
-    def _element(self, step: Step, fields: Any, owner: str) -> FieldDesc:
+    def _element(self, step: Step, fields: Any, owner: str, types: Typestore) -> FieldDesc:
         """The type of `step`, with its index applied."""
         found: FieldDesc = fields[step.field]
         if found[0] not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -218,7 +232,9 @@ class SignalPath:
                 f"[0] to [{int(str(length)) - 1}]"
             )
         if step.key is not None:
-            self._check_key(step.key[0], step.field, fields, owner)
+            inside = {} if element[0] != Nodetype.NAME else fields_of(str(element[1]), types)
+            if inside.get(step.key[0]) != (Nodetype.BASE, ("string", 0)):
+                self._check_key(step.key[0], step.field, fields, owner)
         return element
 
     def _check_key(self, key: str, field: str, fields: Any, owner: str) -> None:

@@ -122,18 +122,20 @@ def _every_number(bag: Bag, left_out: list[str]) -> dict[str, dict[str, Expressi
         paths: list[SignalPath] = []
         try:
             msgtype, types = bag.types_on(topic)
-            texts = [f"{topic}:{path}" for path, *_ in numeric_paths(msgtype, types)]
+            numbers = [
+                SignalPath.parse(f"{topic}:{path}") for path, *_ in numeric_paths(msgtype, types)
+            ]
         except BagError as error:
             left_out.append(str(error))
             continue
-        for path in map(SignalPath.parse, texts):
+        for path in numbers:
             try:
                 paths += _steady(bag, path) if path.every else [path]
             except BagError as error:
                 left_out.append(f"{path}: {error}")
         if paths or fields_of(msgtype, types).keys() <= {NO_FIELD}:
             found[topic] = {str(path): Expression(path) for path in paths}
-        elif not texts:
+        elif not numbers:
             left_out.append(f"{topic}: a '{msgtype}' holds no number, and text is not exported")
     return found
 

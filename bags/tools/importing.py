@@ -113,7 +113,7 @@ def _number(text: str) -> float | None:
 def _column(tables: Mapping[str, FloatArray], title: str) -> FloatArray:
     if title not in tables:
         near = did_you_mean(title, tables)
-        raise DataError(f"no column '{title}'; there are: {listed(tables)}{near}")
+        raise DataError(f"no column of numbers '{title}'; there are: {listed(tables)}{near}")
     return tables[title]
 
 

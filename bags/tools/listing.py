@@ -21,6 +21,8 @@ from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
 MAX_NAMED: Final = 64  # elements of one array that are listed by name
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_READ: Final = 1000  # messages in which frames are looked for
 MAX_ELEMENTS: Final = 4096  # of one array whose range is found; more is an image
 
 
@@ -65,6 +67,9 @@ class _Topic:
             msgtype, types = self.bag.types_on(self.topic)
             first = next((batch for _, batch in self.bag.batches([self.topic])), None)
             message: Any = None if first is None else decode(first.data(0), msgtype, types)
+            if msgtype == TRANSFORMS and first is not None:  # each publisher sends its own frames
+                rows = range(min(len(first), TRANSFORMS_READ))
+                message = [decode(first.data(k), msgtype, types) for k in rows]
             columns: dict[str, SignalPath] = {}
             for listed, elements in _paths(self.topic, msgtype, types, message):
                 count = len(elements) if "[*]" in listed.signal else 1
@@ -108,6 +113,9 @@ def _paths(
     topic: str, msgtype: str, types: Typestore, message: Any
 ) -> Iterator[tuple[Listed, Sequence[SignalPath]]]:
     """Each signal, and the single signals in the first message that it stands for."""
+    if msgtype == TRANSFORMS:
+        yield from _transforms(topic, message)
+        return
     last_angle = ""
     for text, number, owners in numeric_paths(msgtype, types):
         path = SignalPath.parse(f"{topic}:{text}")
@@ -125,6 +133,25 @@ def _paths(
                 if str(turned) != last_angle and not turned.every:
                     last_angle = str(turned)
                     yield Listed(str(turned), number, "rad"), [turned] if message else []
+
+
+def _transforms(topic: str, message: Any) -> Iterator[tuple[Listed, Sequence[SignalPath]]]:
+    """Position and angles of each frame."""
+    for frame in _frames(message):
+        for text, unit in (
+            *((f"translation.{axis}", "m") for axis in "xyz"),
+            *((f"rotation.{angle}", "rad") for angle in ANGLES),
+        ):
+            path = SignalPath.parse(f"{topic}:transforms[child_frame_id={frame}].transform.{text}")
+            yield Listed(str(path), "float64", unit), [path]
+
+
+def _frames(messages: Any) -> list[str]:
+    """The frames in decoded messages, each once, if a path can name them."""
+    found = dict.fromkeys(
+        t.child_frame_id for message in messages or () for t in message.transforms
+    )
+    return [frame for frame in found if frame and not set("[]=|") & set(frame)]
 
 
 def _named(

@@ -538,7 +538,7 @@ def test_a_table_is_read_or_what_is_wrong_is_said(
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("/arm:position[0]=nothing", "no column 'nothing'; there are: a, b"),
+        ("/arm:position[0]=nothing", "no column of numbers 'nothing'; there are: a, b"),
         ("/arm:posit[0]=a", "Field 'posit' does not exist"),
         ("/arm:position[0]", "is not signal=column"),
         ("/other:position[0]=a", "nothing is assigned to /arm"),

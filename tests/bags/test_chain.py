@@ -485,6 +485,14 @@ def test_the_status_is_the_same_where_nobody_reads_what_is_said(
     assert done.returncode == 0, done.stderr
 
 
+def test_what_cannot_be_written_is_said_in_a_line() -> None:
+    command = [sys.executable, "-m", "bags.commands.cli", "bag", "info", str(trial("05"))]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert done.returncode == 2
+    assert done.stderr.decode().splitlines() == ["error: [Errno 28] No space left on device"]
+
+
 @pytest.mark.pictures
 def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_path: Path) -> None:
     with Bag(trial("05")) as source, BagWriter(tmp_path / "short") as target:

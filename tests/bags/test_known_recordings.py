@@ -32,6 +32,7 @@ from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import CMD_TYPE, START_NS, command, speed_bag
 from tests.conftest import SHARED
+from tests.mcap_files import write_mcap
 
 CASES = SHARED.parent / "cases" / "bags"
 STEP_NS = 20_000_000
@@ -375,6 +376,16 @@ def test_a_message_that_cannot_be_unpacked_is_named_and_left_out_of_copies(tmp_p
     assert "4 messages on /x" in said
 
 
+def test_a_topic_without_a_name_is_left_out_of_an_export_and_the_others_are_not(
+    tmp_path: Path,
+) -> None:
+    bag = tmp_path / "run.mcap"
+    write_mcap(bag, dict.fromkeys(("", "/x"), (FLOAT[1], FLOAT[3])))
+    status, said = run("export", bag, "--out", tmp_path / "out")
+    assert (status, len(table(tmp_path / "out", "x")["data"])) == (0, 1)
+    assert "left out" in said
+
+
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
 def test_a_file_compressed_whole_is_read_by_its_content(tmp_path: Path, suffix: str) -> None:
     plain = tmp_path / "run" / f"a{suffix}"
@@ -408,6 +419,8 @@ def test_what_is_in_a_wal_file_is_read_and_the_bag_stays_as_it_is(tmp_path: Path
     assert recover(file.parent, tmp_path / "whole").messages == 100
     assert read_signals(file, ["/x:data"])["/x:data"].values.tolist() == ramp(100)
     assert before == {path: path.read_bytes() for path in file.parent.iterdir()}
+    file.rename(file.with_name("renamed_0.db3"))
+    assert "run_0.db3-wal is not read: messages of run_0.db3" in run("info", file.parent)[1]
 
 
 @pytest.mark.parametrize("release", ["foxy", "galactic", "humble", ""])

@@ -17,7 +17,9 @@ from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.grid import filled_samples, read_dataset
+from bags.signals.reader import read_signals
 from bags.signals.sampling import LOST, MOST_LOST, Grid, Sample, Sampler
+from bags.tools.listing import bag_signals
 from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.designs import AnyDesign, Design
 from nlsid_core.errors import BagError
@@ -32,6 +34,7 @@ from tests.bag_messages import (
     SPEED,
     START_NS,
     command,
+    header,
     odometry,
     serialised,
     speed_bag,
@@ -463,6 +466,59 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     replay = Replay("lossy", readings, (), "speed", "m/s", 1.0, period=0.025)
     assert (replay.filled, replay.verdict) == (len(lost), verdict.value)
     assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
+
+
+def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
+    types = standard_types().types
+    kind = "tf2_msgs/msg/TFMessage"
+    with BagWriter(tmp_path / "tf") as bag:
+        for k in range(60):
+            stamp = START_NS + k * 10 * MS
+            names = ("camera",) if k % 3 == 2 else ("odom", "base")
+            transforms = [
+                types["geometry_msgs/msg/TransformStamped"](
+                    header(stamp),
+                    name,
+                    types["geometry_msgs/msg/Transform"](
+                        types["geometry_msgs/msg/Vector3"](0.1 * k, 0.0, float(len(name))),
+                        types["geometry_msgs/msg/Quaternion"](
+                            0.0, 0.0, math.sin(0.01 * k), math.cos(0.01 * k)
+                        ),
+                    ),
+                )
+                for name in names
+            ]
+            data = serialised(kind, types[kind](transforms))
+            bag.write("/tf", kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    base = "/tf:transforms[child_frame_id=base].transform"
+    signals = [f"{base}.translation.x", f"{base}.rotation.yaw", f"{base}.translation.z"]
+    read = read_signals(tmp_path / "tf", signals)
+    rows = [k for k in range(60) if k % 3 != 2]
+    assert read[signals[0]].values.tolist() == [0.1 * k for k in rows]
+    np.testing.assert_allclose(read[signals[1]].values, [0.02 * k for k in rows], atol=1e-15)
+    assert read[signals[1]].stamp_ns.tolist() == [START_NS + k * 10 * MS for k in rows]
+    with Bag(tmp_path / "tf") as source:
+        listed = {entry.signal: entry for entry in bag_signals(source)}
+        assert (listed[signals[2]].low, listed[signals[2]].high) == (4.0, 4.0)
+        camera = "/tf:transforms[child_frame_id=camera].transform.rotation.yaw"
+        assert listed[camera].unit == "rad"
+        assert listed[camera].low == pytest.approx(0.04)
+        sampler = Sampler([f"{signals[1]}|clock(log)"], [f"{signals[0]}|clock(log)"], period=0.01)
+        sampler.check("/tf", *source.types_on("/tf"))
+        given = [
+            sample
+            for message in source.messages(["/tf"])
+            for sample in sampler.message(
+                "/tf",
+                sampler.stamp(message.data, message.log_time_ns),
+                decode(message.data, *source.types_on("/tf")),
+            )
+        ]
+    assert [sample.y[0] for sample in came(given)] == read[signals[1]].values.tolist()
+    with pytest.raises(BagError, match="'frame' on 'tf2_msgs/msg/TFMessage' is not an array of"):
+        read_signals(tmp_path / "tf", ["/tf:transforms[frame=base].transform.translation.x"])
+    with pytest.raises(BagError, match=r"is nan in message 0 .*not finite"):
+        read_signals(tmp_path / "tf", [signals[0].replace("base", "wheel")])
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def prove(level: float, spurious: float, identity: Identity) -> None:
     sigma[np.ix_(at, at)] = found.Q
     stated, _ = closed_loop.stated_multiplier(inner, sigma, scale, ring)
     stated["basis"] = inner.tolist()
-    multiplier = expanded(read_squares(Node(stated, "multiplier").members(WITNESS), ring), ring)
+    multiplier = expanded(Node(stated, "multiplier").members(WITNESS), ring)
     nu = {tuple(e): Fraction(float(c)) for e, c in identity.equality_multipliers[0].terms()}
     basis, w = identity.gram.basis, ring.variables[1]
     c = Fraction(level) - w * w - closed_loop.polynomial(nu, ring) * step.h[0]

@@ -28,7 +28,7 @@ NOTHING: dict[str, tuple[dict[str, object], str]] = {  # by which a node refuses
     "model_identifier": ({}, "set the parameters bags and out"),
     "funnel_publisher": ({}, "no funnel to publish; set the parameter funnel"),
     "tracking_controller": ({}, "no room between lowest and highest"),
-    "funnel_monitor": ({"nominal": "profil"}, "it should be command, motion or profile"),
+    "funnel_monitor": ({"nominal": "profil"}, "it should be command or profile"),
     "plant": ({}, "no model to simulate; set the parameter model"),
     "viewer": ({"port": -1}, "parameter port (port; 0: one that is free)"),
     "bag_player": ({}, "no bag to play; set the parameter bag"),

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from nlsid_core.kernel import stable_set
+from nlsid_core.kernel import positivity, stable_set
 from tests.core.kernel import mutations
 from tests.core.kernel import oracle_polynomial as oracle
 from tests.core.kernel.mutations import Case
@@ -18,7 +18,7 @@ def test_the_kernels_polynomials_are_the_oracles_exactly(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: dict[str, oracle.P] = {}
-    decided = stable_set.remainder
+    decided = positivity.remainder
 
     def watched(c: Any, squares: Any, ring: Any, what: str) -> Any:
         terms = {bytes(ring.exponents(k)): Fraction(v, c.denominator) for k, v in c.terms.items()}
