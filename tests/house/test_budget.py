@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_963,
+    ("nlsid_core",): 18_964,
     ("bags",): 11_998,
     ("nlsid_ros",): 2_665,
     ("tests",): 23_441,

@@ -33,7 +33,8 @@ LEAST_FRICTION = 1e-6
 FRICTIONS = (0.1, 0.5)  # in spreads of y, what it takes from y at rest, at the start
 TOPS = (1.0, 0.9, 0.75)  # quantiles of a hidden state at which it flows over, at the start
 STARTS, KEPT = 3, 2  # combinations of poles; minima that are refined
-START_SAMPLES, START_STEPS, START_INTERVALS = 5000, 20, 2
+START_SAMPLES, START_INTERVALS = 5000, 2
+START_STEPS = 40  # 20 stop far from minima: test error 12.4 % in place of 11.5 % on F1TENTH
 TOLERANCE = 1e-6
 NONE: IntArray = np.zeros(0, dtype=np.int64)
 LIMITS: dict[int, Limit] = {1: Top(), 2: DeadZone()}  # by how many numbers they have
