@@ -36,14 +36,20 @@ def limited(seconds: int, memory: int) -> None:
         print("no limits of time and memory on this system", file=sys.stderr)
         return
     until = int(time.process_time()) + max(1, seconds)
-    resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, memory * 2**20))
-    resource.setrlimit(resource.RLIMIT_CPU, (until, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+    def allow(what: int, most: int) -> None:
+        hard = resource.getrlimit(what)[1]  # stays: it cannot be raised for the next proof
+        soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(what, (soft, hard))
 
     def too_long(_: int, __: FrameType | None) -> None:
-        resource.setrlimit(resource.RLIMIT_CPU, (until + AFTER, until + AFTER))
+        signal.signal(signal.SIGXCPU, signal.SIG_DFL)
+        allow(resource.RLIMIT_CPU, until + AFTER)
         raise _kernel.Rejected(f"it takes more than {seconds} s of processor time", "too_long")
 
     signal.signal(signal.SIGXCPU, too_long)
+    allow(resource.RLIMIT_AS, memory * 2**20)
+    allow(resource.RLIMIT_CPU, until)
 
 
 def answer(path: str) -> dict[str, Any]:

@@ -36,9 +36,9 @@ SENTENCE = (
 DISTURBANCE = "disturbance {form} {kept} at every sample, d = xhat+ - f(xhat, u)"
 KEPT = {
     "response": "|S r| <= {bound:down}, r+ = A r + d from r = 0,",
-    "peak": "|S d| <= {bound:down}",
-    "energy": "sqrt(E) <= {bound:down}, E+ = E + {gain:up} |S d|^2 from E = 0,",
-    "fading": "sqrt(E) <= {bound:down}, E+ = {rate:up} E + {gain:up} |S d|^2 from E = 0,",
+    "peak": "|S+ d| <= {bound:down}",
+    "energy": "sqrt(E) <= {bound:down}, E+ = E + {gain:up} |S+ d|^2 from E = 0,",
+    "fading": "sqrt(E) <= {bound:down}, E+ = {rate:up} E + {gain:up} |S+ d|^2 from E = 0,",
 }
 APPLIED = "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
 ROOTS = (

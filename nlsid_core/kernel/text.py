@@ -15,6 +15,8 @@ from typing import Any
 
 DIGITS = 4  # significant, of a number that is rounded
 SHORT = 6  # significant digits of a number that is not
+# Not the context of whoever calls, which may round.
+EXACT = Context(prec=60, Emax=MAX_EMAX, Emin=MIN_EMIN)
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,12 @@ class Verdict:
 
 
 def above(value: Fraction, digits: int = DIGITS) -> str:
-    """A decimal number at least `value`."""
+    """A decimal number at least `value`, or the short form of a float64 that is `value`."""
     return _decimal(value, digits, ROUND_CEILING)
 
 
 def below(value: Fraction, digits: int = DIGITS) -> str:
-    """A decimal number at most `value`."""
+    """A decimal number at most `value`, or the short form of a float64 that is `value`."""
     return _decimal(value, digits, ROUND_FLOOR)
 
 
@@ -97,16 +99,17 @@ def _nearest(value: Fraction) -> float | None:
 
 def _decimal(value: Fraction, digits: int, rounding: str) -> str:
     nearest = _nearest(value)
-    own = None if nearest is None else Decimal(repr(nearest)).normalize()
+    own = None if nearest is None else Decimal(repr(nearest)).normalize(EXACT)
     if own is not None and len(own.as_tuple().digits) <= SHORT:
         shown = own
     else:
         context = Context(prec=digits, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN)
-        shown = context.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize()
+        shown = context.divide(Decimal(value.numerator), Decimal(value.denominator))
+        shown = shown.normalize(EXACT)
     exponent = shown.adjusted()
     if not shown or -4 <= exponent < digits + 3:
         return f"{shown:f}"
-    return f"{shown.scaleb(-exponent):f}e{exponent:+03d}"
+    return f"{shown.scaleb(-exponent, EXACT):f}e{exponent:+03d}"
 
 
 def _inner(low: Fraction, high: Fraction) -> str:

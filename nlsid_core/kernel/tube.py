@@ -284,7 +284,7 @@ def _summand(term: Members, u: Sequence[Signal]) -> str:
     unit = Signal("", " ".join(_plain(signal.unit, "()+*^") for signal in used if signal.unit))
     centre, scale = (unit.quantity(text.exact(term[name])) for name in ("centre", "scale"))
     if term["of"] == "change":
-        product = f"change of {product}"
+        product = f"change of ({product})" if len(used) > 1 else f"change of {product}"
     elif term["centre"]:
         product = f"({product} - {centre})"
     square = "" if product == scale == "1" else f"({product} / {scale})^2"

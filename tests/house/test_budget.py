@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_964,
+    ("nlsid_core",): 18_971,
     ("bags",): 11_998,
     ("nlsid_ros",): 2_665,
-    ("tests",): 23_441,
+    ("tests",): 23_461,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from decimal import localcontext
 from fractions import Fraction
 from itertools import combinations
 from pathlib import Path
@@ -290,6 +291,13 @@ def test_a_printed_bound_is_on_its_side_and_near(value: Any, digits: int) -> Non
 def test_numbers_of_thousands_of_digits_are_printed() -> None:
     assert text.below(Fraction(10**5000, 7)) == "1.428e+4999"
     assert text.above(Fraction(-7, 10**5000)) == "-7e-5000"
+
+
+def test_the_rounding_of_whoever_calls_changes_no_bound() -> None:
+    """Two digits were kept of 1235, to nearest: 1200 was said to be above 1234.5678."""
+    with localcontext(prec=2):
+        assert text.above(Fraction(12345678, 10000)) == "1235"
+        assert text.below(Fraction(0.125)) == "0.125"
 
 
 @settings(max_examples=100, deadline=None)

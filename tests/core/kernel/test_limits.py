@@ -1,14 +1,17 @@
 """Time and memory end by the operating system, with a reason; no file chooses equal hashes."""
 
+import subprocess
+import sys
 import time
 
 import pytest
 
 from nlsid_core import files, kernel
-from nlsid_core.deciding import Deciding, Limits
+from nlsid_core.deciding import KERNEL, Deciding, Limits
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel.polynomials import Ring
 from tests.core.kernel.hostile_claims import Claim, equal_hashes, network
+from tests.core.kernel.mutations import CORPUS
 
 
 def deciding(claim: Claim, limits: Limits) -> Deciding:
@@ -24,6 +27,14 @@ def deciding(claim: Claim, limits: Limits) -> Deciding:
 def test_a_claim_that_takes_too_much_is_ended_with_the_reason(limits: Limits, reason: str) -> None:
     with pytest.raises(CertificateRejected, match=reason):
         deciding(network(100), limits).wait()
+
+
+def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:
+    """It was no verdict but a traceback: a limit cannot be raised."""
+    proof = CORPUS / "stability" / "linear" / "claim.proof.json"
+    program = f"ulimit -t 15; ulimit -v 3000000; exec {sys.executable} -I {KERNEL} {proof}"
+    found = subprocess.run(["sh", "-c", program], capture_output=True, text=True, check=False)
+    assert ": PROVED " in found.stdout, found.stderr
 
 
 def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:

@@ -101,7 +101,7 @@ def test_the_whole_verdict_of_a_small_claim() -> None:
         "0.6001 m of the nominal; one that starts with |S[0] (xhat - x[0])| <= 1 ends within level "
         "0.6001 m of it; at the samples both stay in the box of the model's data, level in [-4, 4] "
         "m, input in [-4, 4], margin 0.08333\n"
-        "  assuming disturbance peak |S d| <= 0.05 at every sample, d = xhat+ - f(xhat, u)\n"
+        "  assuming disturbance peak |S+ d| <= 0.05 at every sample, d = xhat+ - f(xhat, u)\n"
         "  assuming the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
     )
 
@@ -110,8 +110,8 @@ def test_the_whole_verdict_of_a_small_claim() -> None:
     ("form", "said"),
     [
         ("response", "|S r| <= 0.05, r+ = A r + d from r = 0, at every sample"),
-        ("energy", "sqrt(E) <= 0.05, E+ = E + 2 |S d|^2 from E = 0, at every sample"),
-        ("fading", "sqrt(E) <= 0.05, E+ = 0.875 E + 2 |S d|^2 from E = 0, at every sample"),
+        ("energy", "sqrt(E) <= 0.05, E+ = E + 2 |S+ d|^2 from E = 0, at every sample"),
+        ("fading", "sqrt(E) <= 0.05, E+ = 0.875 E + 2 |S+ d|^2 from E = 0, at every sample"),
     ],
 )
 def test_every_form_says_what_it_bounds(form: str, said: str) -> None:

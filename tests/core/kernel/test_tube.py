@@ -80,6 +80,15 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
     )
 
 
+def test_the_change_of_a_product_is_not_the_product_of_a_change() -> None:
+    model, funnel, proof = claim("following")
+    term = {"inputs": [0, 0], "of": "change", "centre": 0.0, "scale": 1.0, "fading": 0.0}
+    tubes(funnel)["follows"] = {"terms": [term], "weights": [[3.0]]}
+    name = model["u"]["name"]
+    said = decide(model, funnel, proof).assumptions[1]
+    assert f"g = 3 (change of ({name} x {name}) / 1" in said
+
+
 def test_one_observer_of_all_tubes_is_called_so() -> None:
     model, funnel, proof = claim("linear")
     funnel["tubes"] = funnel["tubes"][:1]
