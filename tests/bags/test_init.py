@@ -329,7 +329,7 @@ def thrusters(folder: Path, *, trials: int = 4) -> Path:
     """Two unstamped thrusters of which the sum is the speed's command, and the noise is small."""
     for trial in range(trials):
         rng = np.random.default_rng(trial)
-        left, right = (stairs(rng, 0.0, 1.0, 14, 15) for _ in range(2))
+        left, right = (stairs(rng, 0.0, 1.0, 20, 15) for _ in range(2))
         speed = followed(left + right, 0.15) + 0.005 * rng.standard_normal(len(left))
         values = {"/left_cmd": left, "/right_cmd": right, "/speed": speed}
         number_bag(folder / f"run_{trial}", values, period=0.1)
@@ -526,7 +526,7 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
     u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
     assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
     said = nlsid("init", tmp_path, tmp_path / "a", tmp_path / "b", "-u", u, "-y", y)
-    assert re.search(r"expect 1\.\d+ % error .* of the part of the trial held back.*: good", said)
+    assert re.search(r"expect 1\.\d+ % error .*of the part of the trial held back.*: good", said)
     assert "if a trial begins near half a turn" in said
 
 
