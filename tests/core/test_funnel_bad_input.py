@@ -188,7 +188,7 @@ def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -
     assert (found.claim["hold"], found.claim["error"]) == (0.01, [0.001, 0.0])
     files.write_document(tmp_path / "problem.json", problem | {"hold": "longest"})
     with pytest.raises(OptionError, match="hold is 'longest'"):
-        load_problem(tmp_path / "problem.json")
+        design_funnel(load_problem(tmp_path / "problem.json"))
 
 
 # -- where Python takes what a file cannot hold ------------------------------------------------

@@ -49,7 +49,6 @@ class ContinuousTracking:
     assumed to act continuously). K is then linear between knots. error: (n,)
     bounds of how much each state is measured wrong (None: not at all).
 
-
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there. Source: thesis Chapters 5, 6.
     """
