@@ -30,7 +30,7 @@ from nlsid_core.errors import BagError, NlsidError
 from tests.bag_messages import CMD_TYPE, ODOM_TYPE, SPEED, command, speed_bag
 from tests.mcap_files import write_mcap
 
-FILES: Final = 20_000
+FILES: Final = 4_000
 SECONDS: Final = 10
 MEGABYTES: Final = 500
 WORKERS: Final = 2
@@ -280,7 +280,7 @@ def _too_long(_signal: int, _frame: object) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_20_000_mutated_files_give_data_or_our_error_in_bounded_time_and_memory(
+def test_thousands_of_mutated_files_give_data_or_our_error_in_bounded_time_and_memory(
     tmp_path: Path,
 ) -> None:
     contents = seeds(tmp_path)

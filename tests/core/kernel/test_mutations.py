@@ -86,9 +86,10 @@ def test_no_mutant_is_wrongly_proved() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_no_mutant_of_a_hundred_thousand_is_wrongly_proved() -> None:
+def test_no_mutant_of_twenty_thousand_is_wrongly_proved() -> None:
+    """More of them: `python -m benchmarks.kernel --mutations N`."""
     with ProcessPoolExecutor(2) as pool:
         seeds = map(np.random.default_rng, (2, 3))
-        for outcomes in pool.map(mutations.run, (50_000, 50_000), seeds):
+        for outcomes in pool.map(mutations.run, (10_000, 10_000), seeds):
             print(outcomes)
             assert outcomes["false_proved"] == outcomes["not decided"] == 0
