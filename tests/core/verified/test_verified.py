@@ -565,7 +565,7 @@ def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path
     assert found["differ"] == {}
     kinds = ("tube", "stability", "continuous_funnel", "sampled_funnel", "funnel_composition")
     for kind in kinds:
-        assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 2
+        assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 0
 
 
 def fades_faster(files: Files) -> None:
