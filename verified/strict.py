@@ -173,6 +173,7 @@ RECORDED = "format version kind period y u training bags"
 
 def _recorded(model: dict[str, Any], more: str, optional: str = "") -> None:
     members(model, "model", f"{RECORDED} {more}", optional)
+    text(model.get("equation", ""), "equation")
 
 
 def _difference(model: dict[str, Any]) -> Sizes:

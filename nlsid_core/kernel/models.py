@@ -42,7 +42,7 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
 
 def _recorded(node: Node, kind: str, table: Table) -> dict[str, Any]:
     """The members of a model of recorded signals; what made it is not read."""
-    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": itself}
+    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": Node.text}
     given = node.document("model", {**heads, **table}, kind)
     node.require({"the period should be positive": given["period"] > 0})
     return given

@@ -275,6 +275,7 @@ def test_an_endless_tree_is_refused() -> None:
 
 ODD: list[tuple[str, Callable[[Json, Json], Any], str]] = [
     ("quadratic", lambda m, _: m["G"][0]["exponents"].__setitem__(1, [0, 0]), "malformed"),
+    ("linear", lambda m, _: m.update(equation=["y", "u"]), "malformed"),
     ("linear", lambda _, d: d["proof"]["P"][0].__setitem__(0, 2**53 + 1), "malformed"),
     ("monotone", lambda m, _: m.update(e=[3.0, 3.0, 1.0]), "not_definite"),  # e' = 0 at v = -1
     ("monotone", lambda m, _: m.update(e=[1.0, 0.1, 0.0]), "not_valid"),
