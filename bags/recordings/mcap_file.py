@@ -46,7 +46,6 @@ from nlsid_core.errors import BagError
 OF_SUMMARY: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 ATTACHMENT_FIXED: Final = 8 + 8 + 4 + 4 + 8  # bytes of two times and three lengths
 CHECKSUM_AT: Final = RECORD.size + 24  # of a chunk's record, its checksum
-SUMMARY_AT: Final = 28  # before the end of the file, where its summary begins
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
@@ -62,7 +61,7 @@ Batches = Iterator[tuple[int, Batch]]  # channel id, messages
 
 
 class McapFile:
-    """An MCAP file open for reading. Close it, or use as a context manager.
+    """An MCAP file open for reading; close it.
 
     Raises BagError if it is not an MCAP file or if a record is damaged; a file that merely stops
     early opens, and says so in `contents.ending`. With `salvage=True` what is damaged is left out
@@ -80,7 +79,7 @@ class McapFile:
             if not isinstance(self.path, RemotePath):
                 self._stream = self.path.open("rb", buffering=0)
             found = None if salvage else summarised(self._read, self._size)
-            if found is None:
+            if found is None or not self._is_as_listed(found):
                 self._fetch_whole()
                 self.contents = self._walk()
                 self._find_channels()
@@ -88,9 +87,6 @@ class McapFile:
             self.contents = found
             if isinstance(self.path, RemotePath):
                 self._fetching = Fetching(self.path, found.blocks)
-            else:
-                summary = int.from_bytes(self._read(self._size - SUMMARY_AT, 8), "little")
-                self._check_data(found, summary - 4)
         except BaseException:
             self.close()
             raise
@@ -100,11 +96,25 @@ class McapFile:
         if self._stream is not None:
             self._stream.close()
 
-    def __enter__(self) -> "McapFile":
-        return self
+    def _is_as_listed(self, found: Contents) -> bool:
+        """Whether all messages lie in the chunks that the summary lists; the data are checked.
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        A remote file is taken at its word: to look costs a request for each gap between chunks.
+        """
+        if self._stream is None:
+            return True
+        gaps = [len(MAGIC), *(block.last for block in found.blocks)]
+        for at, until in zip(gaps, [*(b.record for b in found.blocks), self._size], strict=True):
+            while at + RECORD.size <= until:
+                opcode, length = RECORD.unpack(self._read(at, RECORD.size))
+                if opcode in (0, Opcode.MESSAGE, Opcode.CHUNK):
+                    return False
+                at += RECORD.size
+                if opcode == Opcode.DATA_END:
+                    self._check_data(found, at)
+                    return True
+                at += length
+        return False
 
     def _fetch_whole(self) -> None:
         """Fetch a remote file that has to be walked; BagError if it is too large for that."""
@@ -290,11 +300,8 @@ class McapFile:
 
     def _check_data(self, found: Contents, content: int) -> None:
         """Hold all before the end of the data against its checksum, where chunks have none."""
-        record = self._read(content - RECORD.size, RECORD.size + 4)
-        stated = int.from_bytes(record[RECORD.size :], "little")
-        if not stated or record[0] != Opcode.DATA_END:
-            return
-        if all(self._checksum(block) for block in found.blocks):
+        stated = int.from_bytes(self._read(content, 4), "little")
+        if not stated or all(self._checksum(block) for block in found.blocks):
             return
         crc, end = 0, content - RECORD.size
         for at in range(0, end, SEARCH_BYTES):

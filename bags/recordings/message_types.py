@@ -139,9 +139,9 @@ def defining(what: str) -> Iterator[None]:
     try:
         yield
     except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
-        said = " ".join(str(error).split())[:200]  # a parser's may have several lines
         raise BagError(
-            f"the definition of {what} cannot be used: {type(error).__name__}: {said}"
+            f"the definition of {what} cannot be used: {type(error).__name__}: "
+            f"{' '.join(str(error).split())[:200]}"
         ) from error
 
 

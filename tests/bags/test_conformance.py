@@ -1,6 +1,7 @@
 """Files that other projects test their readers with: MCAP's conformance suite, rosbag2, a robot."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
     assert files
     for path in files:
         wanted = stated(path.with_suffix(".json"))
-        with McapFile(path) as file:
+        with closing(McapFile(path)) as file:
             found = file.contents
             assert found.ending is None
             assert {

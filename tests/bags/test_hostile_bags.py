@@ -10,6 +10,7 @@ import signal
 import struct
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Final
@@ -119,7 +120,7 @@ def test_a_decompression_bomb_is_refused_before_it_unpacks(
     file = tmp_path / "bomb.mcap"
     file.write_bytes(bomb_file(zeros, stated))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with McapFile(file, salvage=True) as opened:
+    with closing(McapFile(file, salvage=True)) as opened:
         assert opened.contents.lost
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown < 200 * 1024

@@ -304,7 +304,7 @@ def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_u
     data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
     assert identify(data, Polynomial(1), method=Rse(certified=True)).proof.rate < 1.0
     quadratic = Polynomial(1, (0,), Degrees(leading=2))
-    with pytest.raises(ShapeError, match="degree 1 at most.*minimise the robust simulation error"):
+    with pytest.raises(ShapeError, match=r"degree 1 at most.*minimise the robust simulation error"):
         identify(data, quadratic, method=Rse(certified=True), comparators=())
     beside = identify(
         data, quadratic, method=Rse(2), comparators=[Rse(2, certified=True)], allow_unproved=True

@@ -19,6 +19,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from typer.testing import CliRunner
 
@@ -822,6 +823,21 @@ def late_chunk(file: Path) -> Path:
     return altered(file, struct.pack("<Q", START_NS), struct.pack("<Q", START_NS + 2**50))
 
 
+def unlisted_message(file: Path) -> Path:
+    """One behind the last chunk, of which neither summary nor statistics know."""
+    mcap_bag(file, [FLOAT], MESSAGES)
+    content = file.read_bytes()
+    at = 8
+    while content[at] != Opcode.DATA_END:
+        at += 9 + int.from_bytes(content[at + 1 : at + 9], "little")
+    message = struct.pack("<HIQQ", 1, 20, START_NS, START_NS) + float_message(20)
+    added = struct.pack("<BQ", Opcode.MESSAGE, len(message)) + message
+    places = (each + len(added) for each in struct.unpack_from("<QQ", content, len(content) - 28))
+    footer = struct.pack("<QQI", *places, 0)
+    file.write_bytes(content[:at] + added + content[at:-28] + footer + content[-8:])
+    return file
+
+
 def unknown_connection(file: Path) -> Path:
     ros1_bag(file, [(0, data[4:]) for *_, data in MESSAGES])
     return altered(file, b"conn=\0\0\0\0\r\0\0\0time", b"conn=\1\0\0\0\r\0\0\0time")
@@ -833,6 +849,7 @@ TOLD = [
     (torn_wal, 1, 19, "the last 1 pages in a-wal are damaged", ""),
     (flipped_loose, 1, 20, "the checksum of all differs", "the checksum of all differs"),
     (late_chunk, 0, 20, "nothing was lost", ""),
+    (unlisted_message, 1, 21, "the file states 20 messages, 21 are there", "statistics say 20"),
     (unknown_connection, 1, 19, "1 messages of unknown connection 1", "not hold what its index"),
     (
         lambda file: mcap_bag(file, [FLOAT], MESSAGES, change=without_counts(20)),

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def chunked(tmp_path: Path) -> Path:
 
 
 def chunk_ends(file: Path) -> list[int]:
-    with McapFile(file) as opened:
+    with closing(McapFile(file)) as opened:
         return [block.offset + block.size for block in opened.contents.blocks]
 
 
@@ -66,7 +67,7 @@ def test_every_truncation_gives_back_every_message_of_every_complete_chunk(
 def test_a_damaged_chunk_is_named_and_the_others_come_back(chunked: Path, tmp_path: Path) -> None:
     file = chunked / "run.mcap"
     content = bytearray(file.read_bytes())
-    with McapFile(file) as opened:
+    with closing(McapFile(file)) as opened:
         block = opened.contents.blocks[4]
     content[block.offset + block.size // 2] ^= 0xFF
     file.write_bytes(content)
@@ -84,7 +85,7 @@ def test_a_damaged_chunk_is_named_and_the_others_come_back(chunked: Path, tmp_pa
 def test_records_after_a_damaged_length_are_found_again(chunked: Path, tmp_path: Path) -> None:
     file = chunked / "run.mcap"
     content = bytearray(file.read_bytes())
-    with McapFile(file) as opened:
+    with closing(McapFile(file)) as opened:
         block = opened.contents.blocks[4]
     record = block.offset - 9 - 32 - 4 - 8
     assert content[record] == 6

@@ -2,6 +2,7 @@
 
 import pickle
 import socket
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -282,7 +283,7 @@ def test_damage_anywhere_is_an_error_that_names_the_file(
 ) -> None:
     local = drive(tmp_path / "d.mcap", samples=400, writer={"compression": CompressionType.ZSTD})
     content = bytearray(local.read_bytes())
-    with McapFile(local) as file:
+    with closing(McapFile(local)) as file:
         block = file.contents.blocks[1]
     channel, (index, _) = next(iter((block.index or {}).items()))
     summary = int.from_bytes(content[-28:-20], "little")
@@ -386,7 +387,7 @@ def test_chunks_that_are_listed_in_any_order_are_read_in_theirs_and_each_once(
 def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: Path) -> None:
     """It would be made of what was fetched behind it."""
     local = drive(tmp_path / "d.mcap", image_bytes=30_000, samples=20)
-    with McapFile(local) as file:
+    with closing(McapFile(local)) as file:
         block = file.contents.blocks[0]
         command = next(c.id for c in file.contents.declared.channels.values() if c.topic == CMD)
         record = file._read(*(block.index or {})[command])
