@@ -5,7 +5,7 @@ kept below 64, so that exponents never run into each other. Above them a key has
 linear in the exponents, so that no file can choose keys whose hashes are equal. A coefficient is a
 polynomial in s, packed into one integer by s = 2^width (Kronecker substitution). `norm` bounds the
 sum of the absolute values of all its integers, and below 2^(width - 1) the packing can be undone:
-`digits` refuses to otherwise, and `at_width` tries a larger width.
+`coefficients` refuses to otherwise, and `at_width` tries a larger width.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -178,20 +178,17 @@ class Ring:
         denominator = p.denominator * q.denominator
         return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
 
-    def digits(self, p: Polynomial) -> dict[int, bytes]:
+    def coefficients(self, p: Polynomial, cut: int = 0) -> dict[int, list[int]]:
         """Each monomial's whole coefficients of s^0 … s^order, over p.denominator.
 
-        width / 8 bytes each, the lowest first, with half of the range added.
+        cut: bytes that are cut off each, which rounds down.
         """
         needed = p.norm.bit_length() + 1
         if needed > self.width:
             raise TooNarrow(-(-needed // STEP) * STEP)
-        size = self.width // 8
-        halves = _halves(size, p.order + 1)
+        size, count = self.width // 8, p.order + 1
         return {
-            key: (value + halves).to_bytes(size * (p.order + 1), "little")
-            for key, value in p.terms.items()
-            if value
+            key: unpacked(value, size, count, cut=cut) for key, value in p.terms.items() if value
         }
 
 
@@ -202,12 +199,15 @@ def packed(row: Sequence[int], width: int) -> int:
     return int.from_bytes(lanes, "little") - _halves(width, len(row))
 
 
-def unpacked(line: int, width: int, count: int, first: int = 0) -> list[int]:
-    """The row of `packed` from `first` on, if every entry is below half of its lane."""
-    half = 1 << (8 * width - 1)
+def unpacked(line: int, width: int, count: int, first: int = 0, cut: int = 0) -> list[int]:
+    """The row of `packed` from `first` on, without `cut` bytes of each entry.
+
+    Every entry has to be below half of its lane.
+    """
+    half = 1 << (8 * (width - cut) - 1)
     lanes = (line + _halves(width, count)).to_bytes(width * count, "little")
     starts = range(width * first, width * count, width)
-    return [int.from_bytes(lanes[i : i + width], "little") - half for i in starts]
+    return [int.from_bytes(lanes[i + cut : i + width], "little") - half for i in starts]
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,8 @@ is left on the diagonal: c > 0 if something is left for the monomial 1. docs/cer
 
 from collections.abc import Mapping
 from fractions import Fraction
-from math import comb, lcm
+from math import comb
+from operator import mul
 from types import SimpleNamespace
 
 from .files import MAX_DEGREE, Node, Rejected, Table, itself, limit, no_more, refuse_if, whole
@@ -74,31 +75,36 @@ def positive(
 ) -> None:
     """Raise Rejected unless c > 0 (strict) or c >= 0 everywhere."""
     left = remainder(c, squares, ring, what)
-    refuse_if(strict and not left.get(0), f"{what}: not positive, only nonnegative", "not_positive")
+    some = min(left.get(0, (0,))) > 0
+    refuse_if(strict and not some, f"{what}: not positive, only nonnegative", "not_positive")
 
 
-def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[int, Fraction]:
-    """left[i] by monomial, so that c >= Σ_i left[i] v_i² >= 0 for every s in [0, 1] and every x.
+def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[int, tuple[int, ...]]:
+    """What r leaves on the diagonal by monomial, for each Bernstein coefficient: c >= Σ left v².
 
     Raises Rejected if r is not diagonally dominant; TooNarrow if the ring is.
     """
-    try:  # nearly always enough, and much shorter numbers
-        return _left(c, squares, ring, what, spare=SPARE)
+    try:  # with c rounded down to few bits, which is nearly always enough
+        return _left(c, squares, ring, what, rounded=True)
     except Rejected:
-        return _left(c, squares, ring, what, spare=None)
+        return _left(c, squares, ring, what, rounded=False)
 
 
 def _left(
-    c: Polynomial, squares: Squares, ring: Ring, what: str, *, spare: int | None
-) -> dict[int, Fraction]:
-    """The same; of c, at most `spare` bits below the unit of the squares are kept.
+    c: Polynomial, squares: Squares, ring: Ring, what: str, *, rounded: bool
+) -> dict[int, tuple[int, ...]]:
+    """The same, in a unit of its own.
 
     What is cut off a coefficient of c, from 0 to 1 in the last place, only adds to a square; where
     it is one of a product, all of it is charged. So c is as stated where something is left then.
     """
-    basis, columns, grams, digits = squares.keys, squares.columns, squares.grams, ring.digits(c)
-    highest, size, order, J = max(columns), ring.width // 8, c.order, len(grams) - 1
-    D, found = max(order, J), set(digits).union(*grams)
+    basis, columns, grams = squares.keys, squares.columns, squares.grams
+    # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
+    above, below = (squares.weight * c.denominator).as_integer_ratio()
+    spare = (above & -above).bit_length() - 1 - SPARE if rounded else 0
+    cut = min(max(0, spare // 8), ring.width // 8 - 1)  # bytes of c's numerators
+    of_c, above = ring.coefficients(c, cut), above >> 8 * cut
+    found = set(of_c).union(*grams)
     squared = {2 * key: i for i, key in enumerate(basis) if 2 * key in found}
     paired: dict[int, tuple[int, int]] = {}  # who is charged for a product
     for i, left_key in enumerate(basis):
@@ -108,58 +114,45 @@ def _left(
                 a, b = paired.setdefault(key, (i, j))
                 if columns[i] + columns[j] > columns[a] + columns[b]:
                     paired[key] = i, j
-    keys = [*squared, *paired]
-    balanced = len(keys) == len(found)
+    balanced = len(squared) + len(paired) == len(found)
     refuse_if(not balanced, f"{what}: a monomial is no product of the basis", "not_positive")
 
-    # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
-    above, below = (squares.weight * c.denominator).as_integer_ratio()
-    cut = 0  # bytes of c's numerators
-    if spare is not None:
-        cut = min(max(0, (above & -above).bit_length() - 1 - spare) // 8, size - 1)
-    above >>= 8 * cut
-    # One integer for each power of s and each factor, a lane for each monomial. A lane holds r: the
-    # weights below are at most 2^D, and a sum over powers of c at most `order` more than c.norm.
+    J, order = len(grams) - 1, c.order
+    D = max(order, J)
+    # Each times C(D, k): Bernstein coefficient k of s^i, of B_j, and of what is cut off.
+    of_powers = [[below * comb(D - i, D - k) for k in range(D + 1)] for i in range(order + 1)]
+    of_squares = [
+        [-above * comb(J, j) * comb(D - J, k - j) if k >= j else 0 for k in range(D + 1)]
+        for j in range(J + 1)
+    ]
+    lost = [sum(column) if cut else 0 for column in zip(*of_powers, strict=True)]
+    # A lane of `width` bytes for each k: below * Σ|c's numerators| + above * |that of the squares|,
+    # times 2^D, is less than half of it.
     largest = max((abs(entry) for gram in grams for entry in gram.values()), default=0)
-    bits = max(8 * (size - cut) + below.bit_length(), (largest * above).bit_length())
-    width = (bits + D + order.bit_length() + 2) // 8 + 1
-    pad, zero = bytes(width - size + cut), bytes(size - 1) + b"\x80"
-    halves = int.from_bytes((zero[cut:] + pad) * len(keys), "little")
-    rows = [digits.get(key, zero * (order + 1)) for key in keys]
-    lanes = []
-    for i in range(0, size * (order + 1), size):
-        lane = pad.join([row[i + cut : i + size] for row in rows])
-        lanes.append((int.from_bytes(lane, "little") - halves) * below)
-    lanes += [packed([gram.get(key, 0) for key in keys], width) * -above for gram in grams]
+    most = below * ((c.norm >> 8 * cut) + order + 2) + above * largest
+    width = (most.bit_length() + D + 1) // 8 + 1
+    lines, zeros = [packed(row, width) for row in of_powers + of_squares], [0] * (order + 1)
 
-    of_squares = [(i, 2 * (highest - columns[i]) + 1) for i in squared.values()]
-    of_pairs = [(i, j, 2 * highest - columns[i] - columns[j]) for i, j in paired.values()]
-    common = lcm(*(comb(D, k) for k in range(D + 1)))
-    least: list[int] = []
-    for k in range(D + 1):
-        of_c = [comb(D - i, k - i) if i <= k else 0 for i in range(order + 1)]
-        of_gram = [comb(J, j) * comb(D - J, k - j) if k >= j else 0 for j in range(J + 1)]
-        weights = of_c + of_gram
-        line = sum(weight * lane for weight, lane in zip(weights, lanes, strict=True) if weight)
-        lost = sum(of_c) * below if cut else 0
-        values = unpacked(line, width, len(keys))
-        left = [0] * len(basis)
-        for value, (i, shift) in zip(values, of_squares, strict=False):
-            left[i] = value << shift
-        for value, (i, j, shift) in zip(values[len(squared) :], of_pairs, strict=True):
-            charge = abs(value) + lost << shift
-            left[i] -= charge
-            left[j] -= charge
-        enough = min(left) > 0 if cut else min(left) >= 0
-        refuse_if(
-            not enough, f"{what}: not positive (Bernstein coefficient {k} of {D})", "not_positive"
-        )
-        left = [room * (common // comb(D, k)) for room in left]
-        least = list(map(min, least, left)) if k else left
-    return {
-        key: Fraction(room, 2 * c.denominator * below * common << 2 * (highest - column)) * 256**cut
-        for key, column, room in zip(basis, columns, least, strict=True)
-    }
+    def coefficients(key: int) -> list[int]:
+        values = of_c.get(key, zeros) + [gram.get(key, 0) for gram in grams]
+        return unpacked(sum(map(mul, lines, values)), width, D + 1)
+
+    left, highest = [[0] * len(basis) for _ in range(D + 1)], max(columns)
+    for key, i in squared.items():
+        shift = 2 * (highest - columns[i]) + 1
+        for row, value in zip(left, coefficients(key), strict=True):
+            row[i] = value << shift
+    for key, (i, j) in paired.items():
+        shift = 2 * highest - columns[i] - columns[j]
+        for row, value, more in zip(left, coefficients(key), lost, strict=True):
+            charge = abs(value) + more << shift
+            row[i] -= charge
+            row[j] -= charge
+    for k, row in enumerate(left):
+        enough = min(row) > 0 if cut else min(row) >= 0
+        failed = f"{what}: not positive (Bernstein coefficient {k} of {D})"
+        refuse_if(not enough, failed, "not_positive")
+    return dict(zip(basis, zip(*left, strict=True), strict=True))
 
 
 def _gram(keys: list[int], shifts: list[int], rows: list[list[int]]) -> dict[int, int]:
@@ -174,8 +167,7 @@ def _gram(keys: list[int], shifts: list[int], rows: list[list[int]]) -> dict[int
     gram: dict[int, int] = {}
     for i, left in enumerate(keys):  # a row's last entry belongs to the last monomial
         line = sum(line * row[i - size] for line, row in lines if len(row) >= size - i)
-        entries = unpacked(line, width, size, i)
-        for j, entry in enumerate(entries, start=i):
+        for j, entry in enumerate(unpacked(line, width, size, i), start=i):
             if entry:
                 key = left + keys[j]
                 gram[key] = gram.get(key, 0) + (entry << shifts[i] + shifts[j] + (i != j))
