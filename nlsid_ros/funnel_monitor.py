@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Iterable
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
@@ -39,7 +38,7 @@ from nlsid_ros import graph, qos
 from nlsid_ros.documents import DESIGN, DesignSubscription, expected_of, wiring_of
 from nlsid_ros.helping import Help
 from nlsid_ros.message_classes import installed_types
-from nlsid_ros.messages import numbers_at, off_clock, patience, stamp_ns_of
+from nlsid_ros.messages import numbers_at, off_clock, patience
 from nlsid_ros.running import REPORT, ManagedNode, Parameter, arm
 from nlsid_ros.starting import entry_point
 from nlsid_ros.subscribing import Topic
@@ -295,26 +294,28 @@ class FunnelMonitor(ManagedNode):
         assert self._watch is not None
         return "" if topic in self._watch.pairing.shared_topics else self._topics[topic].several
 
-    def _on_signal(self, topic: str, message: Any, info: dict[str, int]) -> None:
-        """Decode stamp and values, and judge whatever samples are complete."""
+    def _on_signal(self, topic: str, data: bytes, info: dict[str, int]) -> None:
+        """Read stamp and values, and judge whatever samples are complete."""
         watch, heard = self._watch, self._topics[topic]
         assert watch is not None
         logged = watch.pairing.clock == "log"
-        stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
+        stamp_ns = self.get_clock().now().nanoseconds
         heard.silence.end(1)
-        if watch.pairing.measures(topic, message):
-            heard.numbers.update(info["publication_sequence_number"])
-        responds = topic in watch.pairing.response_topics
-        if not responds:
-            unfit = self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
-            if unfit:  # nor does a stamp far ahead say that no other command is still to come
-                self._publish(watch.missing(unfit, doubted=True))
-                return
-        elif reason := self._distrust(topic, message, logged=logged):
-            self._publish(watch.refuse(stamp_ns, reason))
-            return
         try:
-            judged = watch.message(topic, stamp_ns, message)
+            stamp_ns = watch.pairing.stamp(data, stamp_ns)
+            if watch.pairing.measures(topic, data):
+                heard.numbers.update(info["publication_sequence_number"])
+            responds = topic in watch.pairing.response_topics
+            if not responds:
+                unfit = "" if logged else self._off_clock(topic, stamp_ns)
+                self._unfit_commands[topic] = unfit
+                if unfit:  # nor does a stamp far ahead say that no other command is still to come
+                    self._publish(watch.missing(unfit, doubted=True))
+                    return
+            elif reason := self._distrust(topic, data, logged=logged):
+                self._publish(watch.refuse(stamp_ns, reason))
+                return
+            judged = watch.message(topic, stamp_ns, data)
         except BagError as error:
             self._publish(watch.unreadable(topic, stamp_ns, str(error)))
             return
@@ -340,7 +341,7 @@ class FunnelMonitor(ManagedNode):
         if self._release.is_canceled():
             arm(self._release, wait_ns)
 
-    def _distrust(self, topic: str, message: Any, *, logged: bool) -> str:
+    def _distrust(self, topic: str, data: bytes, *, logged: bool) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
         said = self._doubt(topic)
         for each in self._topics.values():
@@ -348,7 +349,7 @@ class FunnelMonitor(ManagedNode):
         if said or logged:
             return said
         most = math.inf if self.values.allow_old_stamps else self._patient_for
-        said = self._topics[topic].distrust(message, most)
+        said = self._topics[topic].distrust(data, most)
         return said or next(filter(None, self._unfit_commands.values()), "")
 
     def _off_clock(self, topic: str, stamp_ns: int) -> str:

@@ -106,12 +106,13 @@ class Watch:
         if not self.monitor.goes_on:
             self._over = last_ns, reason
 
-    def message(self, topic: str, stamp_ns: int, message: Any) -> list[Stamped]:
-        """Feed a decoded message of a checked topic; the readings that can be given now, in order.
+    def message(self, topic: str, stamp_ns: int, data: bytes) -> list[Stamped]:
+        """Feed a serialised message of a checked topic; the readings that can be given now, in
+        order.
 
-        Raises BagError if it lacks an element that a signal names.
+        Raises BagError if it cannot be read, or lacks an element that a signal names.
         """
-        return self._take(topic, stamp_ns, self.pairing.numbers(topic, message))
+        return self._take(topic, stamp_ns, self.pairing.numbers(topic, data))
 
     def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
         """Feed every response as one message; the readings that can be given now, in order."""
