@@ -105,7 +105,7 @@ class Rig:
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            said = self.said.setdefault(status.name, Said())
+            said = self.said.setdefault(status.name.partition(":")[0], Said())
             said.level, said.text = status.level, status.message
             said.lines.append((time.monotonic(), status.level, status.message))
 

@@ -139,7 +139,7 @@ class Ear(Node):
 
     def _status(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name != "funnel_monitor":
+            if status.name.partition(":")[0] != "funnel_monitor":
                 continue
             self.ready = True
             if status.level == DiagnosticStatus.ERROR and not self.error_ns:

@@ -51,6 +51,7 @@ class Excitation(ManagedNode):
     """Plays one signal `repeats` times, resting in between."""
 
     name = "excitation"
+    task = "excitation"
     parameters = (
         Parameter("kind", "multisine", "one of " + ", ".join(KINDS)),
         Parameter("command", "", f"signal published; empty: that of config, else {COMMAND}"),

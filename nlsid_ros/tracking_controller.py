@@ -69,6 +69,7 @@ class TrackingController(ManagedNode):
     """Samples in, inputs out; between runs it is silent, so that others may drive."""
 
     name = "tracking_controller"
+    task = "tracking"
     parameters = (
         *DESIGN,
         Parameter("response_type", "nav_msgs/msg/Odometry", "type of the response's topic"),
