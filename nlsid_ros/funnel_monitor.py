@@ -57,7 +57,7 @@ LEVELS = {
     State.WARNING: DiagnosticStatus.WARN,
     State.ASSUMPTION_VIOLATED: DiagnosticStatus.ERROR,
     State.OUTSIDE: DiagnosticStatus.ERROR,
-    State.UNKNOWN: DiagnosticStatus.WARN,  # before anything was judged; then it is an error
+    State.UNKNOWN: DiagnosticStatus.WARN,
 }
 
 
@@ -457,7 +457,7 @@ class FunnelMonitor(ManagedNode):
         """Into the terminal, for whoever sees nothing else."""
         if said.level == DiagnosticStatus.OK:
             self.get_logger().info(said.message, throttle_duration_sec=REPORT)
-        elif said.level == DiagnosticStatus.ERROR and self._latched is not None:
+        elif said.level == DiagnosticStatus.ERROR:
             self.get_logger().error(said.message)
         else:
             self.get_logger().warning(said.message, throttle_duration_sec=REPORT)
@@ -477,8 +477,6 @@ class FunnelMonitor(ManagedNode):
         """Say what was said last, and whatever else is odd; an alarm comes before it."""
         reading, state = self._said
         level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
-        if state is State.UNKNOWN and self._judged:
-            level = DiagnosticStatus.ERROR
         if reading.alarm:  # no verdict: it warns, and latches nothing
             level = max(level, DiagnosticStatus.WARN)
             text += f"; {reading.alarm}"
