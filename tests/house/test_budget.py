@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_934,
+    ("nlsid_core",): 18_851,
     ("bags",): 12_077,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_442,
+    ("tests",): 23_341,
     ("benchmarks", "examples"): 3_830,
 }
 ARGUMENTS, FIELDS = 6, 8
