@@ -12,10 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError
+from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from nlsid_core import files
@@ -27,7 +28,7 @@ from nlsid_core.design.levels import followed
 from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.problems import OutputTube
 from nlsid_core.design.riccati import solve_riccati
-from nlsid_core.design.tube_program import Found, Pair, gramian, solved
+from nlsid_core.design.tube_program import TAU_ROOM, Found, Pair, gramian, slowed, solved
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -47,6 +48,9 @@ REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
 LONGEST_SETTLING = 0.25  # of the shortest trial
+SLOWER = (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)  # parts of L that are tried
+NEAR = 1.1  # times the response: a tube that is as narrow is narrow enough
+TINY = float(np.finfo(float).tiny)
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
 OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
@@ -78,14 +82,14 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
 
-    def tube_of(design: Found, samples: int | None) -> Tube:
+    def tube_of(design: Found, samples: int | None, peak: Peak | None = None) -> Tube:
         return Tube(
             rho=design.rho,
             L=design.L,
             P=design.P,
             R=design.R,
             tau=design.tau,
-            half_widths=1.0 / np.sqrt(0.99 * design.tau),
+            half_widths=np.ones(len(design.tau)),
             level=1.0,
             measured=0.0,
             safety_factor=safety_factor,
@@ -93,23 +97,10 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
             measured_on=trials.measured_on,
             samples=samples,
             inlet=inlet**2 / float(np.linalg.inv(design.P)[0, 0]) if inlet else 0.0,
+            peak=peak,
         )
 
-    def proved(
-        tubes: Sequence[Tube],
-        found: Sequence[Found],
-        response: Response | None = None,
-        alarm: Cusum | None = None,
-    ) -> OutputTubeDesign:
-        funnel = TubeFunnel(
-            tubes=tuple(tubes),
-            settling=settling,
-            model=files.digest(model.document()),
-            y_box=y_box,
-            u_box=u_box,
-            response=response,
-            cusum=alarm,
-        )
+    def proved(funnel: TubeFunnel, found: Sequence[Found]) -> OutputTubeDesign:
         policy = None
         if profile is not None and K is not None:
             assert isinstance(model, DifferenceEquation)
@@ -124,12 +115,14 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
         proof: Json = {} if trees[0] is None else {"multipliers": trees}
         return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
 
-    def decided(design: Found) -> str:
+    def around(*tubes: Tube) -> TubeFunnel:
+        return TubeFunnel(tubes, settling, files.digest(model.document()), y_box, u_box)
+
+    def decided(design: Found, peak: Peak | None = None) -> str:
         """Why the kernel refuses the candidate, whatever its level; empty if it is proved."""
         try:
-            tube = tube_of(design, 1 if design.rho == 1.0 else None)
-            wide = np.sqrt((1.0 + tube.rho * tube.inlet) / (0.99 * tube.tau))
-            proved([replace(tube, half_widths=wide)], [design])
+            tube = tube_of(design, 1 if design.rho == 1.0 else None, peak)
+            proved(around(replace(tube, half_widths=_widths(tube) / 0.99)), [design])
         except CertificateRejected as refusal:
             return str(refusal)
         return ""
@@ -155,44 +148,196 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     u = [trial.u for trial in train]
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
-        tube = tube_of(design, samples_left)
+        nothing = np.zeros(len(amplitudes))
+        peak = Peak(nothing + 1.0, nothing, nothing)
+        planned = samples_left is not None or profile is not None
+        tube = tube_of(design, samples_left, None if planned else peak)
         if level != "constant" and samples_left is None:
             spent = [energy(part[:, design.at], tube)[:, None] for part in e]
             tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
-        tubes.append(scaled_to(tube, model, trials.calibration, settling))
-    beside = TubeFunnel(tuple(tubes), settling, files.digest(model.document()), y_box, u_box)
-    refuse_far(model, beside, trials.calibration)
-    if profile is not None:  # what is assumed around a plan is what is held there
-        return proved([replace(tube, peak=None) for tube in tubes], found)
-    errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
-    response = Response(
-        np.ones(len(amplitudes)),
-        0.0,
-        safety_factor,
-        trials.designed_on,
-        trials.measured_on,
-        None
-        if level == "constant"
-        else followed([part**2 for part in errors], u, always=level == "commands"),
+        tubes.append(tube)
+    response = alarm = None
+    if profile is None:  # what is assumed around a plan is what is held there
+        slow = [innovations(model, _slower(found[0].L), trial, settling) for trial in train]
+        headline, peak = _headline(form, found[0], slow, amplitudes, decided)
+        if np.array_equal(headline.L, found[0].L) and tubes[0].follows is None:
+            found[0], tubes[0] = headline, tube_of(headline, None, peak)
+        elif headline is not found[0]:
+            found.append(headline)
+            tubes.append(tube_of(headline, None, peak))
+        errors = [part[:, -1] for part in slow]
+        rule = None
+        if level != "constant":
+            rule = followed([part**2 for part in errors], u, always=level == "commands")
+        response = Response(
+            np.ones(len(amplitudes)),
+            0.0,
+            safety_factor,
+            trials.designed_on,
+            trials.measured_on,
+            rule,
+        )
+        own = np.concatenate([part[:, found[0].at] for part in e])
+        alarm = Cusum(np.maximum(own.std(axis=0), np.finfo(float).tiny), DRIFT, DRIFT)
+    funnel = replace(around(*tubes), response=response, cusum=alarm)
+    funnel = calibrated(funnel, model, train, trials.calibration)
+    refuse_far(model, funnel, trials.calibration)
+    return proved(funnel, found)
+
+
+class Largest(NamedTuple):
+    """The most of each statistic over trials. E: of each tube. peaks: (tubes, p). response: (p,).
+
+    fast: (N, p) innovations of the first tube's observer, of each trial.
+    """
+
+    E: FloatArray
+    peaks: FloatArray
+    response: FloatArray
+    fast: list[FloatArray]
+
+    @classmethod
+    def of(cls, funnel: TubeFunnel, model: StableModel, trials: Dataset) -> "Largest":
+        """Of the funnel's rules, whatever its levels are."""
+        gains = np.stack([*(tube.L for tube in funnel.tubes), np.zeros_like(funnel.tubes[0].L)])
+        settling, response, found = funnel.settling, funnel.response, []
+        for trial in trials:
+            e = innovations(model, gains, trial, settling)
+            spent, peaks = [], []
+            for j, tube in enumerate(funnel.tubes):
+                g = np.ones(len(e))
+                if tube.follows is not None:
+                    g = tube.follows.along(trial.u)[settling:, 0]
+                spent.append(float((energy(e[:, j], tube) / g)[: tube.samples].max()))
+                peaks.append((np.abs(e[:, j]) / np.sqrt(np.maximum(g, 1.0))[:, None]).max(axis=0))
+            rows: FloatArray = np.ones(1)
+            if response is not None and response.follows is not None:
+                rows = response.follows.along(trial.u)[settling:]
+            away = (np.abs(e[:, -1]) / np.sqrt(rows)).max(axis=0)
+            found.append((spent, peaks, away, e[:, 0]))
+        E, peaks, away, fast = zip(*found, strict=True)
+        most = (np.maximum(np.max(part, axis=0), TINY) for part in (E, peaks, away))
+        return cls(*most, list(fast))
+
+
+def calibrated(
+    funnel: TubeFunnel, model: StableModel, design: Dataset, calibration: Dataset
+) -> TubeFunnel:
+    """The funnel with all its levels: those of the design's trials times one number, rounded up.
+
+    λ is the largest part of any of them that the calibration's trials reach, so a next trial
+    exceeds one of them as seldom as it exceeds λ: at factor 1 with probability 1/(m + 1) at most.
+    """
+    before, seen = (Largest.of(funnel, model, part) for part in (design, calibration))
+    watched = [j for j, tube in enumerate(funnel.tubes) if tube.peak is not None]
+    scale = float(np.sqrt(seen.E / before.E).max())
+    if funnel.response is not None:
+        scale = max(scale, float((seen.response / before.response).max()))
+        scale = max(scale, float((seen.peaks / before.peaks)[watched].max()))
+    alarm = funnel.cusum
+    if alarm is not None:
+        threshold = max(DRIFT, *(float(cusum(e / alarm.deviation).max()) for e in before.fast))
+
+        def above(scale: float) -> float:
+            z = [e / (scale * alarm.deviation) for e in seen.fast]
+            return max(float(cusum(part).max()) for part in z) - threshold
+
+        if above(scale) > 0.0:
+            largest = max(float(np.abs(e / alarm.deviation).max()) for e in seen.fast)
+            scale = _above(float(brentq(above, scale, largest / DRIFT, rtol=1e-6)) * (1.0 + 1e-5))
+        alarm = replace(alarm, deviation=scale * alarm.deviation, threshold=threshold)
+    tubes = tuple(
+        _scaled(tube, scale, (before.E[j], seen.E[j]), (before.peaks[j], seen.peaks[j]))
+        for j, tube in enumerate(funnel.tubes)
     )
-    calibrated = [
-        innovations(model, np.stack([np.zeros_like(found[0].L), found[0].L]), t, settling)
-        for t in trials.calibration
+    response = funnel.response
+    if response is not None:
+        most = response.safety_factor * scale * before.response
+        widths = np.array([_rounded_up(_above(float(w))) for w in most])
+        used = _above(float((seen.response / widths).max()))
+        response = replace(response, half_widths=widths, measured=used)
+    if alarm is not None:
+        factor = tubes[0].safety_factor
+        alarm = replace(alarm, deviation=factor * alarm.deviation)
+    return replace(funnel, tubes=tubes, response=response, cusum=alarm)
+
+
+def _scaled(
+    tube: Tube, scale: float, E: tuple[float, float], peaks: tuple[FloatArray, FloatArray]
+) -> Tube:
+    """With level, peaks and half-widths; E, peaks: of the design's trials, and measured."""
+    factor = tube.safety_factor
+    measured = _above(float(E[1]))
+    level = _above(max((factor * scale) ** 2 * float(E[0]), factor**2 * measured))
+    peak = tube.peak
+    if peak is not None:
+        seen = np.nextafter(peaks[1], np.inf)
+        most = np.maximum(factor * scale * peaks[0], factor * seen)
+        peak = replace(peak, at_most=np.nextafter(most * (1.0 + 1e-12), np.inf), measured=seen)
+    tube = replace(tube, measured=measured, level=level, peak=peak)
+    return replace(tube, half_widths=np.array([_rounded_up(float(w)) for w in _widths(tube)]))
+
+
+def _widths(tube: Tube) -> FloatArray:
+    """(p,) what level and peaks leave of the outputs."""
+    widths = np.sqrt((tube.level + tube.rho * tube.inlet) / tube.tau)
+    return np.asarray(
+        widths if tube.peak is None else widths + tube.peak.direct * tube.peak.at_most
+    )
+
+
+def _slower(L: FloatArray) -> FloatArray:
+    """sL of every s, and no observer."""
+    return np.stack([*(s * L for s in SLOWER), np.zeros_like(L)])
+
+
+def _headline(
+    form: Form,
+    fast: Found,
+    slow: Sequence[FloatArray],
+    amplitudes: FloatArray,
+    decided: Callable[[Found, Peak], str],
+) -> tuple[Found, Peak]:
+    """The fastest observer whose tube is about as narrow as the response; else the narrowest.
+
+    slow: innovations (N, B, p) of `_slower` in each trial of the design. Of an innovation the part
+    c is bounded by its peak ε, where √(ℓ (a + (1 - c)² r)) + c ε is least: ℓ the energy, a and r
+    the output's shares of it by V and by e.
+    """
+    sizes = [
+        np.max([np.abs(part[:, i]).max(axis=0) for part in slow], axis=0)
+        for i in range(len(SLOWER) + 1)
     ]
-    response = _scaled_response(
-        response,
-        errors,
-        u,
-        [part[:, 0] for part in calibrated],
-        [t.u for t in trials.calibration],
-    )
-    own = np.concatenate([part[:, found[0].at] for part in e])
-    deviation = np.maximum(own.std(axis=0), np.finfo(float).tiny)
-    threshold = max(
-        float(cusum(safety_factor * part[:, 1] / deviation).max()) for part in calibrated
-    )
-    alarm = Cusum(deviation, DRIFT, max(threshold, DRIFT))
-    return proved(tubes, found, response, alarm)
+    r = np.diag(np.linalg.inv(fast.R)) * (1.0 + TAU_ROOM)
+    nothing = np.zeros(len(amplitudes))
+    tried: list[tuple[float, Found, Peak]] = []
+    for i, s in enumerate(SLOWER):
+        found, peak = slowed(form, fast, s), np.maximum(sizes[i], TINY)
+        level = max(float(energy(part[:, i], fast).max()) for part in slow)
+        a, room = 1.0 / found.tau, np.maximum(level * r - peak**2, TINY)
+        rest = np.minimum(1.0, peak * np.sqrt(a / (r * room)))
+        share = a + rest**2 * r
+        width = np.sqrt(level * share) + (1.0 - rest) * peak
+        if i == 0:
+            tried.append(
+                (
+                    float(np.sum(np.sqrt(level / fast.tau) / amplitudes)),
+                    fast,
+                    Peak(peak, nothing, nothing),
+                )
+            )
+        tried.append(
+            (
+                float(np.sum(width / amplitudes)),
+                replace(found, tau=1.0 / share),
+                Peak(peak, nothing, 1.0 - rest),
+            )
+        )
+    enough = NEAR * float(np.sum(sizes[-1] / amplitudes))
+    for _, found, peak in sorted(tried, key=lambda entry: max(entry[0], enough)):
+        if not decided(found, peak):
+            return found, peak
+    return fast, tried[0][2]
 
 
 def _gain(model: StableModel, weights: tuple[float, float] | None) -> FloatArray:
@@ -218,56 +363,7 @@ def least_window(model: StableModel, train: Dataset, horizon: float | None = Non
     return LEAST_WINDOW * (settling + REACTION)
 
 
-def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
-    """The tube with its level, half-widths and, if it lasts, peak from these trials, rounded up."""
-    measured = largest = float(np.finfo(float).tiny)
-    for trial in calibration:
-        e = innovations(model, tube.L[None], trial, settling)[:, 0]
-        spent, single = energy(e, tube), np.einsum("ti,ij,tj->t", e, tube.R, e)
-        if tube.follows is not None:
-            g = tube.follows.along(trial.u)[settling:, 0]
-            spent, single = spent / g, single / np.maximum(g, 1.0)
-        measured = max(measured, float(spent[: tube.samples].max()))
-        largest = max(largest, float(single.max()))
-    measured, largest = _above(measured), _above(largest)
-    level = _above(tube.safety_factor**2 * measured)
-    peak = Peak(_above(tube.safety_factor**2 * largest), largest)
-    widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
-    return replace(
-        tube,
-        measured=measured,
-        level=level,
-        peak=peak if tube.samples is None else None,
-        half_widths=np.array([_rounded_up(float(width)) for width in widths]),
-    )
-
-
-def _scaled_response(
-    response: Response,
-    design: Sequence[FloatArray],
-    design_inputs: Sequence[FloatArray],
-    calibration: Sequence[FloatArray],
-    calibration_inputs: Sequence[FloatArray],
-) -> Response:
-    """The response with half-widths from output errors (N, p): ratios of the design's, scaled on
-    the others by one number, so that one trial exceeds all of them with the probability of one.
-    """
-
-    def parts(errors: Sequence[FloatArray], inputs: Sequence[FloatArray]) -> FloatArray:
-        """(p,): the largest |o_j| / √g_j."""
-        found = []
-        for o, u in zip(errors, inputs, strict=True):
-            g = 1.0 if response.follows is None else response.follows.along(u)[len(u) - len(o) :]
-            found.append((np.abs(o) / np.sqrt(g)).max(axis=0))
-        return np.asarray(np.maximum(np.max(found, axis=0), np.finfo(float).tiny))
-
-    sizes, largest = parts(design, design_inputs), parts(calibration, calibration_inputs)
-    scale = response.safety_factor * float((largest / sizes).max())
-    widths = np.array([_rounded_up(_above(float(w))) for w in scale * sizes])
-    return replace(response, half_widths=widths, measured=_above(float((largest / widths).max())))
-
-
-def energy(e: FloatArray, tube: Tube) -> FloatArray:
+def energy(e: FloatArray, tube: Tube | Found) -> FloatArray:
     """E_1 … E_N of innovations e (N, p)."""
     spent = np.einsum("ti,ij,tj->t", e, tube.R, e)
     return np.asarray(lfilter([1.0], [1.0, -tube.rho], spent))

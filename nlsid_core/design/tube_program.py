@@ -8,7 +8,7 @@ Source: docs/certificate_tube.md.
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple, TypeAlias
 
@@ -143,6 +143,44 @@ def _balanced(
         None if form.tree is None else _with_multipliers(form.tree, found),
         at,
     )
+
+
+def slowed(form: Form, found: Found, s: float) -> Found:
+    """A proof of the observer sL, of what an output has beside its own innovation (c = 1).
+
+    With ζ = s ζ̃ the inequalities of sL are those of L, in P/s² and diag(1/s, 1/s, 1) N/s; without
+    e in them, N_j bounds output j by V at every vertex by 1/τ_j = H_j (ρP + sym(N_j E))⁻¹ H_j'.
+    Source: docs/theory.md, "Slower observers".
+    """
+    states = form.F.shape[1]  # of ζ
+    supply = np.zeros((states, states))
+    supply[form.m :, form.m :] = found.rho * found.P
+    leaves = [] if found.multipliers is None else _multipliers(found.multipliers)
+    scales = np.concatenate([np.full(states, 1.0 / s), np.ones(len(form.H))])[:, None] / s
+    worst = np.zeros(len(form.H))
+    for vertices, Ns in zip(form.leaves, leaves, strict=True):
+        for N in Ns[1:]:
+            N[states:] = 0.0
+        for E, (j, h) in product(vertices, enumerate(form.H)):
+            cross = Ns[1 + j][:states] @ E
+            worst[j] = max(worst[j], h @ np.linalg.solve(supply + cross + cross.T, h))
+    if not form.m:
+        worst = np.einsum("ji,ij->j", form.H, np.linalg.solve(supply, form.H.T))
+    scaled = [[scales * N for N in Ns] for Ns in leaves]
+    return replace(
+        found,
+        L=s * found.L,
+        P=found.P / s**2,
+        tau=(1.0 - TAU_ROOM) / (s**2 * worst),
+        multipliers=None if form.tree is None else _with_multipliers(form.tree, scaled),
+    )
+
+
+def _multipliers(tree: Json) -> list[list[FloatArray]]:
+    """N_0 … N_p of every leaf, in order."""
+    if "split" in tree:
+        return [leaf for part in tree["parts"] for leaf in _multipliers(part)]
+    return [[np.array(N, dtype=np.float64) for N in tree["N"]]]
 
 
 def _shaped(N: FloatArray, ray: bool) -> FloatArray:

@@ -22,19 +22,23 @@ FORMAT = "nlsid/funnel"
 KIND = "tube"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Peak:
-    """e'R e <= level max(1, g) at every sample, g that of the tube's own level.
+    """|e_j| <= at_most_j √max(1, g) at every sample, g that of the tube's own level.
 
-    level = safety_factor² · measured, the largest on the trials and with the factor of its tube.
+    at_most: (p,), in the outputs' units. measured: the largest on the trials of its tube, times
+    the factor at most this. direct: (p,) the parts of e_j that the tube bounds by this, in [0, 1];
+    where it is 0 the tube's sentence does not need it.
     """
 
-    level: float
-    measured: float
+    at_most: FloatArray
+    measured: FloatArray
+    direct: FloatArray
 
     def __post_init__(self) -> None:
-        if not self.level > 0.0:
-            raise DataError(f"the level of a peak is {self.level}; it should be positive")
+        freeze(self, "peak", dict.fromkeys(("at_most", "measured", "direct"), (None,)))
+        if not (self.at_most > 0.0).all():
+            raise DataError(f"the peaks are {self.at_most.tolist()}; they should be positive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +127,9 @@ class Tube:
         if self.samples is not None:
             return f"Σ {energy} ≤ {self.level:.4g} over {self.samples} samples"
         g, where = (" g", ", g of the commands") if self.follows is not None else ("", "")
-        most = " max(1, g)" if g else ""
-        peak = "" if self.peak is None else f", {energy} ≤ {self.peak.level:.4g}{most}"
+        most = " √max(1, g)" if g else ""
+        peaks = [] if self.peak is None else self.peak.at_most.tolist()
+        peak = f", |e| ≤ {', '.join(f'{each:.4g}' for each in peaks)}{most}" if peaks else ""
         return f"E ≤ {self.level:.4g}{g}, E⁺ = {self.rho:.4g} E + {energy}{peak}{where}"
 
     def document(self) -> Json:
@@ -134,7 +139,10 @@ class Tube:
             kind = {"kind": "energy", "samples": self.samples}
         beside: Json = {} if self.follows is None else {"follows": self.follows.document()}
         if self.peak is not None:
-            beside["peak"] = {"level": self.peak.level, "measured": self.peak.measured}
+            named = ("at_most", "measured")
+            beside["peak"] = {name: getattr(self.peak, name).tolist() for name in named}
+            if self.peak.direct.any():
+                beside["direct"] = self.peak.direct.tolist()
         return beside | {
             "rho": self.rho,
             "level": self.level,
@@ -350,9 +358,10 @@ def _peak(document: Json, source: str) -> Peak | None:
     if "peak" not in document:
         return None
     given = files.member(document, "peak", dict, source=source)
-    return Peak(
-        *(files.number(given, key, source=f"{source} peak") for key in ("level", "measured"))
-    )
+    peaks = [files.array(given, k, (None,), source=source) for k in ("at_most", "measured")]
+    if "direct" not in document:
+        return Peak(*peaks, direct=np.zeros_like(peaks[0]))
+    return Peak(*peaks, direct=files.array(document, "direct", (None,), source=source))
 
 
 def _follows(document: Json, source: str) -> CommandLevel | None:

@@ -94,6 +94,8 @@ def reach(tube: Tube, linear: Linear | None, steps: int) -> FloatArray:
     """
     inverse = np.linalg.inv(tube.R)
     single, ever = np.diag(inverse), 1.0 / tube.tau
+    if tube.peak is not None:  # τ bounds the output but for what is direct
+        ever = ever + (1.0 - (1.0 - tube.peak.direct) ** 2) * single
     if linear is None:
         spread = np.linalg.eigvals(inverse @ tube.L.T @ tube.P @ tube.L).real.max()
         parts = np.minimum(1.0, spread * np.arange(steps))

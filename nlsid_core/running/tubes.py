@@ -64,8 +64,18 @@ class TubeRun:
         self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
         self._L = np.array([tube.L for tube in tubes])
         self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
-        peaks = [math.inf if tube.peak is None else tube.peak.level for tube in tubes]
+        unwatched = np.full(p, math.inf)
+        peaks = [unwatched if tube.peak is None else tube.peak.at_most for tube in tubes]
         self._peak = np.array(peaks) * (1.0 - ROUNDING)
+        self._single = np.array(
+            [
+                math.inf
+                if tube.peak is None
+                else tube.peak.at_most @ np.abs(tube.R) @ tube.peak.at_most
+                for tube in tubes
+            ]
+        )
+        self._direct = [tube.peak is not None and tube.peak.direct.any() for tube in tubes]
         self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
         self._unmoved = np.ones(len(tubes))
         self._samples = [tube.samples for tube in tubes]
@@ -266,11 +276,10 @@ class TubeRun:
             hidden = self._hides(simulated)
             sizes = (np.abs(deviation) + hidden) / widths
             spent = (self._spent / level).tolist()
-            peaks = (
-                used / self._peak
-                if g is self._unmoved
-                else used / (self._peak * np.maximum(g, 1.0))
-            ).tolist()
+            parts = (e / self._peak) ** 2
+            if g is not self._unmoved:
+                parts /= np.maximum(g, 1.0)[:, None]
+            peaks = parts.max(axis=1).tolist()
         self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         nominal = tuple(simulated.tolist())
@@ -393,9 +402,10 @@ class TubeRun:
             )
         elif not peaks[sharpest] <= 1.0:
             status = Status.ASSUMPTION_VIOLATED
+            beside = "" if self._direct[sharpest] else f" ({WATCHED})"
             reason = (
-                f"one sample's innovation energy is {peaks[sharpest]:.4g} times what is assumed "
-                f"({WATCHED}), at t = {t:g} s"
+                f"one sample's innovation is {math.sqrt(peaks[sharpest]):.4g} times what is "
+                f"assumed{beside}, at t = {t:g} s"
             )
         elif exceeded:
             status, reason = Status.ASSUMPTION_VIOLATED, f"{exceeded}, at t = {t:g} s"
@@ -471,7 +481,7 @@ class Ahead:
             1.0 - OUTWARD
         )
         self._total = run._rho * self._total + np.maximum(g, 1.0)
-        left = np.minimum(left, run._peak * self._total * (1.0 + OUTWARD))
+        left = np.minimum(left, run._single * self._total * (1.0 + OUTWARD))
         lasting = run._lasting(self._k + self.steps)
         if not lasting or not (left[lasting] >= 0.0).all():
             self.ended = self.ended or "what the tube assumes is broken, or over"
@@ -487,8 +497,8 @@ class Ahead:
 class _Judged(NamedTuple):
     """One sample against all tubes. sizes, widths: of each tube's outputs; spent, level: of it.
 
-    peaks: the sample's own energy as a part of the tube's peak. away: the output error.
-    innovation: of the first observer.
+    peaks: the squares of the sample's innovation as parts of the tube's peaks. away: the output
+    error. innovation: of the first observer.
     """
 
     sizes: list[list[float]]
