@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_875,
-    ("bags",): 12_077,
+    ("nlsid_core",): 18_991,
+    ("bags",): 12_079,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_380,
+    ("tests",): 23_392,
     ("benchmarks", "examples"): 3_830,
 }
 ARGUMENTS, FIELDS = 6, 8

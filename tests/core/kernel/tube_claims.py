@@ -145,9 +145,13 @@ def attacks(design: OutputTubeDesign, i: int, kind: str, samples: int, seed: int
         left = max(level - tube.rho * spent, 0.0)
         part = 1.0 if kind == "held" or rng.random() < 0.3 else rng.random()
         e = e * np.sqrt(part * left / (e @ tube.R @ e))
+        beside = np.zeros(p)
+        if tube.peak is not None:
+            beside = tube.peak.direct * tube.peak.at_most
+            e /= max(1.0, float((np.abs(e) / tube.peak.at_most).max()))
         spent = tube.rho * spent + float(e @ tube.R @ e)
         if spent <= level * (1.0 + 1e-12):  # a level that falls is not kept at once
-            used[k] = np.abs(y[0] + e - y[1]) / np.sqrt(level / tube.tau)
+            used[k] = np.abs(y[0] + e - y[1]) / (np.sqrt(level / tube.tau) + beside)
         x[0] = x[0] + tube.L @ e
         if tube.samples is not None and k % tube.samples == tube.samples - 1:
             x[0], spent = x[1], 0.0  # the energy is over: another run
