@@ -5,10 +5,10 @@ python -m benchmarks.tubes [--data DIR] [--case NAME]... [--lasting SAMPLES] [--
 DIR holds f1tenth, exchanger, wh2009, schunk_arm, emps and kuka_kr300; without it the shipped
 F1TENTH recordings are measured. Some trials identify a model and design its tube, others scale it,
 others yet are judged, untouched and sabotaged. Widths are per amplitude (half the range), the mean
-over outputs, at safety factor 1; by commands: the mean over the calibration trials. Times are of
-the processor, a sample's update that of the quickest trial. `unjudged` are sabotaged trials of
-which a part was unknown and nothing else was said. Published are earlier figures of such tubes,
-designed and scaled on all trials.
+over outputs, at safety factor 1: `fading` is the tube of the fast observer (where it follows the
+commands, its mean), `headline` the last of those for ever. Times are of the processor, a sample's
+update that of the quickest trial. `unjudged` are sabotaged trials of which a part was unknown and
+nothing else was said. Published are figures of a trial of the method, each scaled by itself.
 """
 
 import os
@@ -35,31 +35,29 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import recording
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube
-from nlsid_core.design.levels import followed
-from nlsid_core.design.tube import design_output_tube, energy, innovations, scaled_to
+from nlsid_core.design.tube import design_output_tube, energy, innovations
 from nlsid_core.errors import NlsidError
 from nlsid_core.funnels.tube import Tube
 from nlsid_core.identification import Degrees, FilterMapFilter, Network, Polynomial, Rse, identify
 from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 
 FACTOR = 1.5
 CHECKS = 5  # repetitions; the median is reported
-FORMS = ("response", "response_by_commands", "fading", "fading_by_commands", "energy")
+FORMS = ("response", "headline", "fading")
 PUBLISHED = {
-    "f1tenth_linear": (0.470, 0.111, 0.606, 0.153, 0.727),
-    "f1tenth_implicit": (0.968, 0.075, 1.19, 0.095, 1.28),
-    "f1tenth_two": (0.41, 0.265, 0.515, 0.40, 1.06),
-    "exchanger": (0.280, 0.280, 0.428, 0.49, 1.00),
-    "wh2009": (0.0066, 0.0040, 0.0085, 0.0054, 0.0183),
-    "schunk": (0.38, 0.30, 0.64, 0.62, 2.35),
-    "emps": (0.00019, 0.00019, 0.0005, 0.0005, 0.0008),
-    "kuka_1": (0.0039, 0.0035, 0.0073, 0.0067, 0.0071),
-    "kuka_2": (0.0167, 0.0059, 0.0219, 0.0078, 0.0219),
-    "kuka_3": (0.0068, 0.0020, 0.0261, 0.0072, 0.0253),
-}  # of several outputs the mean, of a range given its middle
+    "f1tenth_linear": (0.529, 0.551, 0.723),
+    "f1tenth_implicit": (0.649, 0.677, 0.880),
+    "f1tenth_two": (0.361, 0.376, 0.476),
+    "exchanger": (0.268, 0.284, 0.529),
+    "wh2009": (0.0189, 0.0202, 0.0257),
+    "schunk": (0.284, 0.300, 2.27),
+    "emps": (0.0003, 0.0003, 0.0015),
+    "kuka_1": (0.0040, 0.0041, 0.0047),
+    "kuka_2": (0.0058, 0.0066, 0.0143),
+    "kuka_3": (0.0329, 0.0351, 0.0430),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,43 +187,43 @@ RECORDED: dict[str, Callable[[Path], Case]] = {
 def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[str, float]:
     """Of every form, at factor 1, per amplitude: the mean over outputs."""
     settling: int = made.funnel.settling
-    fading: Tube = made.funnel.tubes[0]
-    ending: Tube = made.funnel.tubes[1]
-    still = np.zeros((1, *fading.L.shape))
-    errors, others = (
-        [innovations(model, still, t, settling)[:, 0] for t in data]
-        for data in (case.train, case.calibration)
-    )
-    u, other_u = ([t.u for t in data] for data in (case.train, case.calibration))
-    spent = [
-        energy(innovations(model, fading.L[None], t, settling)[:, 0], fading)[:, None]
-        for t in case.train
-    ]
-    following = followed(spent, u, always=True)
-    moving = followed([part**2 for part in errors], u, always=True)
-    assert following is not None
-    assert moving is not None
-    g = [moving.along(now)[settling:] for now in other_u]
-    parts = [np.abs(o) / np.sqrt(now) for o, now in zip(others, g, strict=True)]
-    most = np.max([part.max(axis=0) for part in parts], axis=0)
-    mean = np.mean(np.concatenate([np.sqrt(now) for now in g]), axis=0)
+    u = [trial.u for trial in case.calibration]
+    still = np.zeros((1, *made.funnel.tubes[0].L.shape))
+    errors = [innovations(model, still, t, settling)[:, 0] for t in case.calibration]
 
-    def width(tube: Tube) -> FloatArray:
-        scaled = scaled_to(tube, model, case.calibration, settling)
-        found = np.sqrt(scaled.measured / scaled.tau)
+    def mean(tube: Tube) -> FloatArray:
         if tube.follows is None:
-            return np.asarray(found)
-        rows = [tube.follows.along(now)[settling:, 0] for now in other_u]
-        return np.asarray(found * float(np.mean(np.sqrt(np.concatenate(rows)))))
+            return np.asarray(tube.half_widths)
+        rows = [tube.follows.along(now)[settling:, 0] for now in u]
+        return np.asarray(tube.half_widths * float(np.mean(np.sqrt(np.concatenate(rows)))))
 
+    lasting = [tube for tube in made.funnel.tubes if tube.samples is None]
     found = {
-        "response": np.max([np.abs(o).max(axis=0) for o in others], axis=0),
-        "response_by_commands": most * mean,
-        "fading": width(replace(fading, follows=None)),
-        "fading_by_commands": width(replace(fading, follows=following)),
-        "energy": width(ending),
+        "response": np.max([np.abs(o).max(axis=0) for o in errors], axis=0),
+        "headline": mean(lasting[-1]) / FACTOR,
+        "fading": mean(lasting[0]) / FACTOR,
     }
-    return {f"half_width_{form}": float(np.mean(found[form] / amplitudes)) for form in FORMS}
+    peak = lasting[-1].peak
+    inferred = 1.0 - peak.direct * peak.at_most / lasting[-1].half_widths
+    keys = {f"half_width_{form}": float(np.mean(found[form] / amplitudes)) for form in FORMS}
+    return keys | {"share_inferred": float(np.mean(inferred))}
+
+
+def outside(model: Any, made: Any, trial: Trajectory) -> int:
+    """Samples at which an output leaves a tube of which the assumption is kept so far."""
+    settling, count = made.funnel.settling, 0
+    for tube in made.funnel.tubes:
+        gains = np.stack([tube.L, 0.0 * tube.L])
+        e, o = innovations(model, gains, trial, settling).swapaxes(0, 1)
+        g = np.ones(len(e))
+        if tube.follows is not None:
+            g = tube.follows.along(trial.u)[settling:, 0]
+        kept = energy(e, tube) <= tube.level * g
+        if tube.peak is not None:
+            kept &= (np.abs(e) <= tube.peak.at_most * np.sqrt(np.maximum(g, 1.0))[:, None]).all(1)
+        left = (np.abs(o) > tube.half_widths * np.sqrt(g)[:, None]).any(axis=1)
+        count += int((left & np.logical_and.accumulate(kept))[: tube.samples].sum())
+    return count
 
 
 def measure(case: Case) -> dict[str, float | int]:
@@ -248,27 +246,21 @@ def measure(case: Case) -> dict[str, float | int]:
     y = np.concatenate([t.y for t in (*case.train, *case.calibration)])
     ranges = np.ptp(y, axis=0)
     keys |= widths(model, made, case, ranges / 2.0)
-    fading = made.funnel.tubes[0]
-    keys["follows"] = int(fading.follows is not None)
-    settling = made.funnel.settling
-    lasting = replace(made.funnel, tubes=(fading,))
+    keys["follows"] = int(made.funnel.tubes[0].follows is not None)
+    lasting = replace(
+        made.funnel, tubes=tuple(tube for tube in made.funnel.tubes if tube.samples is None)
+    )
+    keys["tubes"] = len(lasting.tubes)
     monitor = Monitor([Stage(model, None, lasting)])
-    outside, busy = 0, float("inf")
+    left, busy = 0, float("inf")
     for trial in case.judged:
         monitor.restart()
-        E = energy(innovations(model, fading.L[None], trial, settling)[:, 0], fading)
-        g = 1.0 if fading.follows is None else fading.follows.along(trial.u)[settling:, 0]
-        kept = np.concatenate([np.zeros(settling, bool), fading.level * g >= E])
         started = time.process_time()
-        said = [
+        for t, *given in zip(trial.t.tolist(), trial.y, trial.u, strict=True):
             monitor.update(t, *given)
-            for t, *given in zip(trial.t.tolist(), trial.y, trial.u, strict=True)
-        ]
         busy = min(busy, (time.process_time() - started) / len(trial))
-        outside += sum(
-            bool(k) and r.status is Status.OUTSIDE for k, r in zip(kept, said, strict=True)
-        )
-    keys |= {"update_us": 1e6 * busy, "outside_with_assumption_kept": outside}
+        left += outside(model, made, trial)
+    keys |= {"update_us": 1e6 * busy, "outside_with_assumption_kept": left}
     caught = what_it_catches(
         replace(made, funnel=lasting),
         held_back=case.judged,

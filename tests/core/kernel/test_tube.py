@@ -130,8 +130,13 @@ FALSE: dict[str, Change] = {
     ),
     "L": lambda c: scaled(tubes(c.funnel), "L", 1.3),
     "half-width": lambda c: scaled(tubes(c.funnel), "half_widths", 0.98),
-    "level": lambda c: scaled(tubes(c.funnel), "level", 1.03),
-    "inlet": lambda c: tubes(c.funnel).update(inlet=0.05 * tubes(c.funnel)["level"]),
+    # What the level bounds may be a small part of a half-width.
+    "level": lambda c: scaled(
+        tubes(c.funnel), "level", 9.0 if "direct" in tubes(c.funnel) else 1.03
+    ),
+    "inlet": lambda c: tubes(c.funnel).update(
+        inlet=tubes(c.funnel)["level"] * (9.0 if "direct" in tubes(c.funnel) else 0.05)
+    ),
     "no multiplier": lambda c: c.proof.clear() if c.proof else c.proof.update(multipliers=[]),
 }
 
