@@ -16,7 +16,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError
-from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from nlsid_core import files
@@ -223,57 +222,37 @@ class Largest(NamedTuple):
 def calibrated(
     funnel: TubeFunnel, model: StableModel, design: Dataset, calibration: Dataset
 ) -> TubeFunnel:
-    """The funnel with all its levels: those of the design's trials times one number, rounded up.
+    """The funnel with all its levels: the largest of the calibration's trials, rounded up.
 
-    λ is the largest part of any of them that the calibration's trials reach, so a next trial
-    exceeds one of them as seldom as it exceeds λ: at factor 1 with probability 1/(m + 1) at most.
+    Of several outputs the design's trials fix the ratios of their peaks and of the response, and
+    one number scales them, so that one trial exceeds all of them with the probability of one.
     """
     before, seen = (Largest.of(funnel, model, part) for part in (design, calibration))
-    watched = [j for j, tube in enumerate(funnel.tubes) if tube.peak is not None]
-    scale = float(np.sqrt(seen.E / before.E).max())
-    if funnel.response is not None:
-        scale = max(scale, float((seen.response / before.response).max()))
-        scale = max(scale, float((seen.peaks / before.peaks)[watched].max()))
-    alarm = funnel.cusum
-    if alarm is not None:
-        threshold = max(DRIFT, *(float(cusum(e / alarm.deviation).max()) for e in before.fast))
-
-        def above(scale: float) -> float:
-            z = [e / (scale * alarm.deviation) for e in seen.fast]
-            return max(float(cusum(part).max()) for part in z) - threshold
-
-        if above(scale) > 0.0:
-            largest = max(float(np.abs(e / alarm.deviation).max()) for e in seen.fast)
-            scale = _above(float(brentq(above, scale, largest / DRIFT, rtol=1e-6)) * (1.0 + 1e-5))
-        alarm = replace(alarm, deviation=scale * alarm.deviation, threshold=threshold)
     tubes = tuple(
-        _scaled(tube, scale, (before.E[j], seen.E[j]), (before.peaks[j], seen.peaks[j]))
+        _scaled(tube, float(seen.E[j]), (before.peaks[j], seen.peaks[j]))
         for j, tube in enumerate(funnel.tubes)
     )
-    response = funnel.response
+    factor, response, alarm = tubes[0].safety_factor, funnel.response, funnel.cusum
     if response is not None:
-        most = response.safety_factor * scale * before.response
-        widths = np.array([_rounded_up(_above(float(w))) for w in most])
+        scale = float((seen.response / before.response).max())
+        widths = np.array([_rounded_up(_above(float(w))) for w in factor * scale * before.response])
         used = _above(float((seen.response / widths).max()))
         response = replace(response, half_widths=widths, measured=used)
     if alarm is not None:
-        factor = tubes[0].safety_factor
-        alarm = replace(alarm, deviation=factor * alarm.deviation)
+        sums = (float(cusum(factor * e / alarm.deviation).max()) for e in seen.fast)
+        alarm = replace(alarm, threshold=max(DRIFT, *sums))
     return replace(funnel, tubes=tubes, response=response, cusum=alarm)
 
 
-def _scaled(
-    tube: Tube, scale: float, E: tuple[float, float], peaks: tuple[FloatArray, FloatArray]
-) -> Tube:
-    """With level, peaks and half-widths; E, peaks: of the design's trials, and measured."""
-    factor = tube.safety_factor
-    measured = _above(float(E[1]))
-    level = _above(max((factor * scale) ** 2 * float(E[0]), factor**2 * measured))
-    peak = tube.peak
+def _scaled(tube: Tube, E: float, peaks: tuple[FloatArray, FloatArray]) -> Tube:
+    """With level, peaks and half-widths; peaks: of the design's trials, and measured."""
+    measured, peak = _above(E), tube.peak
+    level = _above(tube.safety_factor**2 * measured)
     if peak is not None:
-        seen = np.nextafter(peaks[1], np.inf)
-        most = np.maximum(factor * scale * peaks[0], factor * seen)
-        peak = replace(peak, at_most=np.nextafter(most * (1.0 + 1e-12), np.inf), measured=seen)
+        most = float((peaks[1] / peaks[0]).max()) * peaks[0]
+        seen, factor = np.nextafter(peaks[1], np.inf), tube.safety_factor
+        most = factor * np.maximum(most, seen) * (1.0 + 1e-12)
+        peak = replace(peak, at_most=np.nextafter(most, np.inf), measured=seen)
     tube = replace(tube, measured=measured, level=level, peak=peak)
     return replace(tube, half_widths=np.array([_rounded_up(float(w)) for w in _widths(tube)]))
 

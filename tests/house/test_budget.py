@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_991,
+    ("nlsid_core",): 18_974,
     ("bags",): 12_079,
     ("nlsid_ros",): 2_679,
     ("tests",): 23_392,
