@@ -67,7 +67,9 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
     documents: tuple[Json, Json],
 ) -> None:
     _, funnel = documents
-    funnel["tubes"][0]["assumption"]["measured"] = 1.0
+    tube = funnel["tubes"][0]
+    tube |= {"peak": {"at_most": [1.0], "measured": [0.1]}}
+    tube["assumption"]["measured"] = 1.0
     case = next(case for case in corpus() if (case.kind, case.name) == ("tube", "following"))
     forged = case.copied()
     forged.about["funnel.json"] = funnel
