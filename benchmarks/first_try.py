@@ -295,7 +295,7 @@ def judged(
     for knot, count in ((0, starts), (len(found.funnel.t) // 2, starts // 4)):
         at: dict[str, Any] = {"starts": count, "rng": rng, "knot": knot}
         if "hold" in found.claim:
-            error = np.asarray(found.claim["error"])
+            error = np.asarray(found.claim.get("error", np.zeros(found.model.n)))
             runs.append(simulate_held(*parts, hold=found.claim["hold"], error=error, **at))
         else:
             runs.append(simulate_boundary(*parts, substeps=SUBSTEPS, **at))

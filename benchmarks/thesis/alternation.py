@@ -18,11 +18,12 @@ from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.design import ContinuousSearch, FunnelDesign, decided
+from nlsid_core.design.continuous.expanded_sweep import Swept
 from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.problem import ContinuousTracking
-from nlsid_core.design.continuous.search import Swept, proved_for
+from nlsid_core.design.continuous.search import proved_for
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
@@ -60,7 +61,7 @@ def design_by_alternation(
         found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
         return Swept(setting, found.funnel.rho, None)
 
-    _, funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
+    _, funnel, proved, _ = proved_for(setting.margin(float(start.rho[-1])), search)
     seconds = {"rho": time.perf_counter() - started}
     history = (("rho", funnel.volume_integral()),)
     searched = ContinuousSearch(setting.goal, proved, setting.first_guess(), history, seconds)

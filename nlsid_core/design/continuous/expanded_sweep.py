@@ -6,16 +6,19 @@ makes the funnel smaller: so ρ and the box of every interval are chosen togethe
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
+from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import Diagnosis, NoFunnel, diagnosed
 from nlsid_core.design.continuous.expansion import BACK, Expansion, NoExpansion
-from nlsid_core.design.continuous.lstep import Section, section_at
+from nlsid_core.design.continuous.lstep import Section, section_at, sections
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends, Wanted
-from nlsid_core.dynamics.taylor import Cubic
+from nlsid_core.design.continuous.shape import validity_caps
+from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends, Wanted, sweep_rho
+from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress, silent
 
@@ -30,19 +33,44 @@ BETWEEN = np.linspace(
 STEEP = 0.01  # of (Δρ/ρ)² over the interval's length: left where 1/ρ is far from linear in time
 
 
-@dataclass(frozen=True, eq=False)
-class Swept:
-    """ρ (K,), the L-steps at the ends of every interval, and the cubics they were made with."""
+class Swept(NamedTuple):
+    """ρ (K,), the L-steps at the knots if they are at hand, and the setting of their field."""
 
+    setting: Setting
     rho: FloatArray
-    ends: list[Ends]
-    cubics: list[Cubic]
+    ends: list[Ends] | None
+
+
+def wanted_of(
+    setting: Setting, below: FloatArray | None = None, widths: FloatArray | None = None
+) -> Wanted:
+    """What ρ keeps to: below (K,), and where the dynamics are valid; with the first margin.
+
+    widths: (K-1, m) that the applied input is off.
+    """
+    caps = validity_caps(setting.steps.field, setting.policy, setting.P, widths)
+    caps = caps if below is None else np.minimum(caps, below)
+    final = min(setting.rho_final, float(caps[-1]))
+    return Wanted(setting.margin(final), final, caps)
+
+
+def swept(
+    setting: Setting, wanted: Wanted, progress: Progress = silent, *, most_back: int = MAX_BACK
+) -> Swept:
+    """The largest ρ(t), and what it was found with; see `sweep_rho` and `sweep_expanded`."""
+    steps, policy = setting.steps, setting.policy
+    if setting.expansion is not None:
+        return sweep_expanded(setting, wanted, most_back=most_back, progress=progress)
+    pairs = sections(steps, policy, setting.P)
+    return Swept(setting, *sweep_rho(steps, pairs, wanted, progress))
 
 
 def sweep_expanded(
     setting: Setting, wanted: Wanted, *, most_back: int = MAX_BACK, progress: Progress = silent
 ) -> Swept:
     """The largest ρ(t) backward from the end, each interval expanded around what it gives.
+
+    The setting that is returned has their field.
 
     most_back: how often ρ at an interval's end is lowered for its start. Raises Infeasible naming
     the earliest time that was reached, and why it was not passed where least was missing.
@@ -80,7 +108,17 @@ def sweep_expanded(
             rho[-1] = caps[-1]
         else:
             k += 1
-    return Swept(rho, [ends[k] for k in range(K - 1)], [steps.local[k] for k in range(K - 1)])
+    return Swept(with_field(setting), rho, [ends[k] for k in range(K - 1)])
+
+
+def with_field(setting: Setting) -> Setting:
+    """The setting with the field of the cubics that its L-steps hold."""
+    steps, policy = setting.steps, setting.policy
+    field = field_of([steps.local[k] for k in range(len(policy.t) - 1)], policy.t)
+    policy = replace(policy, vector_field=files.digest(field.document()))
+    proving = steps.like(field, policy)
+    proving.kappa = steps.kappa
+    return replace(setting, steps=proving, policy=policy)
 
 
 @dataclass(eq=False)

@@ -93,11 +93,18 @@ class Setting:
         return own if self.hold is None else max(own, self.hold.needed)
 
 
-def prepare(problem: ContinuousTracking) -> Setting:
-    """The problem, checked and completed; see `design_funnel` for what is raised."""
+def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
+    """The problem, checked and completed; see `design_funnel` for what is raised.
+
+    saturated: whether inputs may be at their limits; else the funnel keeps them within. A given
+    policy is taken as it is: it clips at its limits.
+    """
     nominal = problem.nominal
     held = Hold.of(problem.hold, problem.error, nominal.x.control.shape[2])
-    field, expansion = _dynamics(problem, held)
+    limits = limits_of(problem.limits, nominal.u.control.shape[2])
+    refuse_saturated(nominal, limits)
+    clipped = saturated or problem.policy is not None
+    field, expansion = _dynamics(problem, held, limits[:0] if clipped else limits)
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
@@ -114,9 +121,9 @@ def prepare(problem: ContinuousTracking) -> Setting:
         P = lyapunov(field, problem.policy, Q=Q, P_final=final)
         tracking = Tracking(problem.policy, P)
     policy, S = tracking.policy, tracking.S
-    if problem.limits is not None:
-        policy = replace(policy, limits=limits_of(problem.limits, field.m))
-    refuse_saturated(policy)
+    if clipped and len(limits):
+        policy = replace(policy, limits=limits)
+    refuse_saturated(nominal, policy.limits)
     pushed = field.only_pushes and (field.is_pushed or expansion is not None)
     nonlinear = None
     if expansion is not None and (pushed or not len(field.uncertain)):
@@ -144,42 +151,53 @@ def default_weights(
     return goal.P / tau, np.diag(tau * effect)
 
 
-def limits_of(limits: ArrayLike, m: int) -> FloatArray:
-    """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too."""
-    rows = numbers(limits, "limits")
+def limits_of(limits: ArrayLike | None, m: int) -> FloatArray:
+    """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too. None: no rows."""
+    rows = numbers([] if limits is None else limits, "limits")
+    if not rows.size:
+        return np.zeros((0, 3))
     if rows.shape == (m, 2):
         return np.column_stack([np.arange(m), rows])
-    if rows.ndim != 2 or rows.shape[1] != 3:
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isin(rows[:, 0], range(m)).all():
         raise DataError(
-            f"limits should be rows (input, low, high), or one pair (low, high) for each of {m} "
-            f"inputs; they have shape {rows.shape}"
+            f"rows of limits should be (input, low, high), or one pair (low, high) for each of {m} "
+            f"inputs; they are {rows.tolist()}"
         )
     return rows
 
 
+def valid_rows(limits: FloatArray, n: int) -> FloatArray:
+    """Rows (input, low, high) as rows of what a field of n states says is valid."""
+    return np.column_stack([n + limits[:, 0], limits[:, 1:]])
+
+
 def _dynamics(
-    problem: ContinuousTracking, held: Hold | None
+    problem: ContinuousTracking, held: Hold | None, limits: FloatArray
 ) -> tuple[VectorField, Expansion | None]:
     """The field; or, where it is no polynomial of a degree that fits, its linearisation.
+
+    limits: rows (input, low, high) within which both say they are valid.
 
     A hold needs fields that are affine in each input, and cubics at most. Without a given policy
     the motion gets more knots where they are too far apart to expand anything.
     """
     dynamics, nominal, uncertain = problem.dynamics, problem.nominal, problem.uncertain
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
+    valid = valid_rows(limits, sizes[0])
     if isinstance(dynamics, VectorField):
         if uncertain is not None:
             raise DataError("a vector field states its own bounds of w: leave out `uncertain`")
-        return dynamics, None
+        return dynamics.within(valid), None
     try:
         field = VectorField.from_function(dynamics, *sizes, uncertain=uncertain)
         few = field.n <= FEW_STATES and not (held is not None and held.period)
         affine = held is None or not field.squares_inputs
         if field.degree <= (MAX_DEGREE if few else DEGREE) and affine:
-            return field, None
+            return field.within(valid), None
     except NotPolynomial:
         pass
     rates = Rates.of(dynamics, *sizes, uncertain, affine=held is not None)
+    rates = replace(rates, valid=valid)
     expansion = Expansion(rates, nominal).refined(
         MOST_KNOTS if problem.policy is None else len(nominal.t)
     )
@@ -211,10 +229,10 @@ def largest_defect(nominal: Nominal) -> float:
     return DEFECT * max(rate, AT_REST * max(size, 1.0))
 
 
-def refuse_saturated(policy: ContinuousPolicy) -> None:
-    """Raise DataError unless the nominal's own inputs are within the policy's limits."""
-    for i, low, high in policy.limits.tolist():
-        u = policy.u.control[:, :, int(i)]
+def refuse_saturated(nominal: Nominal, limits: FloatArray) -> None:
+    """Raise DataError unless the nominal's own inputs are within the limits (L, 3)."""
+    for i, low, high in limits.tolist():
+        u = nominal.u.control[:, :, int(i)]
         least, most = float(np.min(u)), float(np.max(u))
         if not (low < least and most < high):
             raise DataError(
