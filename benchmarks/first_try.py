@@ -295,8 +295,8 @@ def judged(
     for knot, count in ((0, starts), (len(found.funnel.t) // 2, starts // 4)):
         at: dict[str, Any] = {"starts": count, "rng": rng, "knot": knot}
         if "hold" in found.claim:
-            error = np.asarray(found.claim.get("error", np.zeros(found.model.n)))
-            runs.append(simulate_held(*parts, hold=found.claim["hold"], error=error, **at))
+            at["error"] = np.asarray(found.claim.get("error", np.zeros(found.model.n)))
+            runs.append(simulate_held(*parts, hold=found.claim["hold"], **at))
         else:
             runs.append(simulate_boundary(*parts, substeps=SUBSTEPS, **at))
     return {key: found.claim[key] for key in ("hold", "error") if key in found.claim} | {

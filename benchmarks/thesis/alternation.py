@@ -18,12 +18,11 @@ from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.design import ContinuousSearch, FunnelDesign, decided
-from nlsid_core.design.continuous.expanded_sweep import Swept
 from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.problem import ContinuousTracking
-from nlsid_core.design.continuous.search import proved_for
+from nlsid_core.design.continuous.search import proved
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
@@ -32,6 +31,7 @@ from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 
+MARGIN = 4.0  # times that of the sweep, with which every piece is proved
 HIGHEST_DECAY = 40.0  # of the exponential start
 
 
@@ -57,14 +57,12 @@ def design_by_alternation(
         start = ContinuousFunnel(policy.x, setting.P, first, policy.vector_field, "")
         refuse_start(start, solve_ends(steps, policy, start, executor=executor))
 
-    def search(margin: float) -> Swept:
-        found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
-        return Swept(setting, found.funnel.rho, None)
-
-    _, funnel, proved, _ = proved_for(setting.margin(float(start.rho[-1])), search)
+    margin = MARGIN * setting.margin(float(start.rho[-1]))
+    found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
+    _, funnel, shown, _ = proved(setting, found.funnel.rho, None, margin)
     seconds = {"rho": time.perf_counter() - started}
     history = (("rho", funnel.volume_integral()),)
-    searched = ContinuousSearch(setting.goal, proved, setting.first_guess(), history, seconds)
+    searched = ContinuousSearch(setting.goal, shown, setting.first_guess(), history, seconds)
     return decided(setting, funnel, searched)
 
 

@@ -85,7 +85,7 @@ def sweep_expanded(
             duals = ends[k + 1].start if k + 1 in ends else None
             try:
                 levels = (min(guess, float(caps[k])), after, float(caps[k]))
-                rho[k], ends[k] = _expanded(setting, k, levels, wanted, duals)
+                rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
                 progress(f"rho at {policy.t[k]:.3g} s", 1 - k / (K - 1))
                 k -= 1
                 continue

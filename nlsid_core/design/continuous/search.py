@@ -13,7 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expanded_sweep import Swept, swept, wanted_of
+from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
@@ -25,13 +25,13 @@ from nlsid_core.design.continuous.held_sweep import (
 )
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import Wanted
+from nlsid_core.design.continuous.sweep import Ends, Wanted
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
 
-MARGINS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)  # times the first, until every piece is proved
+LARGER, ROUNDS = 16.0, 4  # times the margin where a piece is not proved, so many times
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 
@@ -155,35 +155,33 @@ def expected(setting: Setting, progress: Progress) -> FloatArray:
 
 
 def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
-    """ρ by the backward sweep, and its proof."""
-
-    def search(margin: float) -> Swept:
-        return swept(setting, replace(wanted, margin=margin), progress)
-
-    return proved_for(wanted.margin, search)
-
-
-def proved_for(first: float, search: Callable[[float], Swept]) -> Found:
-    """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
-    for factor in MARGINS:
+    """ρ by the backward sweep, and its proof; with larger margins where there is none."""
+    times = np.ones(len(setting.P) - 1)
+    for _ in range(ROUNDS):
+        made, rho, ends = swept(setting, replace(wanted, times=times), progress)
         try:
-            return _proof_of(search(factor * first), factor * first)
+            return proved(made, rho, ends, wanted.margin)
         except Unproved as error:
             refusal = error
+            times = np.where(error.intervals, LARGER * times, times)
     raise refusal
 
 
-def _proof_of(found: Swept, margin: float) -> Found:
-    """The funnel of a sweep with its proof; Unproved if there is none on some part of time."""
-    steps, policy = found.setting.steps, found.setting.policy
+def proved(setting: Setting, rho: FloatArray, ends: list[Ends] | None, margin: float) -> Found:
+    """The funnel with this ρ and its proof; Unproved if there is none on some part of time.
+
+    ends: the L-steps at the knots, if they are at hand. margin: what was left in these, in 1/s.
+    """
+    steps, policy = setting.steps, setting.policy
     digest = files.digest(policy.document())
-    funnel = ContinuousFunnel(policy.x, found.setting.P, found.rho, policy.vector_field, digest)
+    funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
     refuse_unmonitorable(funnel)
-    proved = prove_pieces(steps, policy, funnel, found.ends)
-    if proved.unproved:
+    shown = prove_pieces(steps, policy, funnel, ends)
+    if shown.unproved:
         raise Unproved(
-            f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
+            f"no proof from {unsolved(policy, shown.unproved)} although the L-steps at its "
             "knots hold: try more knots there",
-            float(policy.t[proved.unproved[-1].interval]),
+            float(policy.t[shown.unproved[-1].interval]),
+            np.isin(np.arange(len(policy.t) - 1), [part.interval for part in shown.unproved]),
         )
-    return Found(found.setting, funnel, proved, margin)
+    return Found(setting, funnel, shown, margin)

@@ -5,7 +5,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -29,13 +29,21 @@ class Wanted:
     """What ρ(t) keeps to.
 
     margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. final: ρ(t_f). caps: (K,) that ρ keeps below
-    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first.
+    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first. times:
+    (K-1,) what the margin is multiplied by on each interval (None: 1).
     """
 
     margin: float
     final: float
     caps: FloatArray | None = None
     expected: bool = False
+    times: FloatArray | None = None
+
+    def on(self, k: int) -> "Wanted":
+        """With the margin of interval k."""
+        if self.times is None:
+            return self
+        return replace(self, margin=self.margin * float(self.times[k]), times=None)
 
     def cap(self, k: int) -> float:
         """The cap at knot k."""
@@ -66,8 +74,8 @@ def sweep_rho(
     ends: list[Ends] = []
     duals: list[SphereSolution] | None = None
     for k in range(len(instants) - 1, -1, -1):
-        cap = wanted.cap(k)
-        rho[k], found = largest_before(steps, instants[k], float(rho[k + 1]), cap, wanted, duals)
+        after, cap = float(rho[k + 1]), wanted.cap(k)
+        rho[k], found = largest_before(steps, instants[k], after, cap, wanted.on(k), duals)
         ends.append(found)
         duals = found.start
         progress(f"rho at {instants[k][0].t:.3g} s", 1 - k / len(instants))
