@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray
+from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.errors import DataError
 
 DEGREE = 3  # what L-steps take
@@ -28,7 +28,7 @@ GRID = np.linspace(-1.0, 1.0, CELLS + 1)
 NODES = np.cos(np.pi * np.arange(1, 8, 2) / 8)  # Chebyshev's points, for a cubic
 TO_POWERS = np.linalg.inv(np.vander(NODES, increasing=True))  # values there to coefficients
 CANCELLED = 1e3  # Σ of the coefficients that change a cubic of a cubic into Chebyshev's and back
-LEBESGUE = 16.0  # Σ|TO_POWERS| is 12.9: by how much more the values' errors are in a cubic
+LEBESGUE = 64.0  # Σ|TO_POWERS| is 12.9: so much of the values' errors is in a cubic, with room
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class TaylorModel:
             shifted[0] += number
             lost = 0.0 if number == 0 else 2 * ROUNDING * (abs(shifted[0]) + abs(number))
             moved = self._made(self.keys, shifted, self.error, lost)
-            return replace(moved, ridge=self._along([number, 0, 0, 0], 1.0))
+            return replace(moved, ridge=self._along(np.array([number, 0.0, 0.0, 0.0]), 1.0))
         keys, first, second = _union(self.keys.tobytes(), other.keys.tobytes())
         total = np.zeros(len(keys))
         total[first] = self.coefficients
@@ -231,9 +231,9 @@ class TaylorModel:
         if self.ridge is not None:
             a = self.ridge[1]
             values = np.polynomial.polynomial.polyval(GRID, a)
-            low, high = float(values.min()), float(values.max())
-            over = (abs(a[2]) + 3 * abs(a[3])) / CELLS**2 + self.error
-            return (low + high) / 2, ((high - low) / 2 + over) * SUMMED + ROUNDING * abs(a).sum()
+            middle, half = float(values.max() + values.min()) / 2, float(np.ptp(values)) / 2
+            over = float(abs(a[2]) + 3 * abs(a[3])) / CELLS**2 + ROUNDING * float(np.abs(a).sum())
+            return middle, (half + over + self.error) * SUMMED
         squares, lines, others = _alone(self.keys.tobytes())
         q = self.coefficients[squares]
         if not q.any():
@@ -253,8 +253,9 @@ class TaylorModel:
         """function(self), whose fourth derivative is 24 `fourth` at most on all its values.
 
         A cubic p interpolates it at Chebyshev's points of [c - b, c + b]. The error e has four
-        zeros, so |e''| ≤ 48 fourth b²; between two of CELLS + 1 points it is then at most
-        6 fourth b²h² above the larger of its values there, h = 2b/CELLS.
+        zeros, so |e'| ≤ 32 fourth b³ and |e''| ≤ 48 fourth b²; between two of CELLS + 1 points it
+        is then at most 6 fourth b²h² above the larger of its values there, h = 2b/CELLS. Of a
+        ridge, p is a polynomial in one form: what is above degree 3 is left out in Chebyshev's.
         """
         c, b = self._around()
         if b == 0:
@@ -266,8 +267,9 @@ class TaylorModel:
         between = 24 * fourth * b**4 / CELLS**2
         # Rounding: of the values, and of the points, which moves values by the slope.
         size = float(np.abs(grid).max())
-        slope = float(np.abs(a) @ range(4)) + 8 * fourth * b**4
-        lost = ROUNDING * (LEBESGUE * size + (abs(c) / b + 1) * slope)
+        slope = float(np.abs(a) @ range(4))
+        moved = (abs(c) / b + 1) * (slope + 32 * fourth * b**4)
+        lost = ROUNDING * (LEBESGUE * size + moved)
         within = float(gaps.max()) + between + lost
         ridge = self._as_ridge()
         if ridge is None:
@@ -278,8 +280,9 @@ class TaylorModel:
         inner = (inner - [c, 0, 0, 0]) / b
         outer = np.polynomial.Polynomial(a)(np.polynomial.Polynomial(inner))
         series = np.polynomial.chebyshev.poly2cheb(outer.coef)
-        kept = np.polynomial.chebyshev.cheb2poly(series[:4])
-        kept = np.append(kept, np.zeros(4 - len(kept)))
+        low = np.polynomial.chebyshev.cheb2poly(series[:4])
+        kept: FloatArray = np.zeros(4)
+        kept[: len(low)] = low
         within += float(np.abs(series[4:]).sum()) + slope * self.error / b
         within += CANCELLED * ROUNDING * float(np.abs(a) @ np.abs(inner).sum() ** np.arange(4))
         found = ((form * kept[3] + kept[2]) * form + kept[1]) * form + kept[0]
@@ -292,7 +295,7 @@ class TaylorModel:
         made = self._made(self.keys, scaled, abs(factor) * self.error, lost)
         return replace(made, ridge=self._along(np.zeros(4), factor))
 
-    def _along(self, shift: ArrayLike, factor: float) -> "tuple[TaylorModel, FloatArray] | None":
+    def _along(self, shift: FloatArray, factor: float) -> "tuple[TaylorModel, FloatArray] | None":
         """The ridge of shift + factor·self."""
         return None if self.ridge is None else (self.ridge[0], factor * self.ridge[1] + shift)
 

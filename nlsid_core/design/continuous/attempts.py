@@ -27,6 +27,7 @@ from nlsid_core.design.continuous.setting import (
 )
 from nlsid_core.design.continuous.shape import validity_caps
 from nlsid_core.dynamics import Nominal
+from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress
 
@@ -35,7 +36,7 @@ FINER = ("knots", "remainder")  # what is less where knots are closer
 FASTER, SLOWER = 0.25, 4.0  # of the default R
 MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
 AT_LIMIT = 0.99  # of ρ's cap: an input reaches its limit
-NARROW = 0.5  # of half-widths without limits: with less, the one limited input may saturate
+NARROW = 0.5  # of half-widths without limits: with less, few limited inputs may saturate
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +126,11 @@ def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, s
 
 
 def widened(problem: ContinuousTracking, found: Found, progress: Progress) -> Found:
-    """The funnel in which the one limited input saturates, if that is much wider at the start."""
+    """The funnel in which inputs saturate, if few may and it is much wider at the start."""
     setting, funnel, field = found.setting, found.funnel, found.setting.steps.field
     limits = _limits(problem)
-    if problem.policy is not None or len(limits) != 1 or len(setting.policy.limits):
+    few = len(limits) <= (MOST_LIMITED if field.n <= FEW_STATES else 1)
+    if problem.policy is not None or not len(limits) or not few or len(setting.policy.limits):
         return found
     kept = replace(field, valid=valid_rows(limits, field.n))
     if (funnel.rho < AT_LIMIT * validity_caps(kept, setting.policy, setting.P)).all():

@@ -27,15 +27,13 @@ KIND = "continuous_funnel"
 class ContinuousSearch:
     """What the search for a funnel leaves beside it.
 
-    proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. first: a
-    first guess to compare with, of which nothing is proved. history: (what, ∫ volume dt). seconds:
-    wall clock of each stage. cost: what a hold and measurement errors take, in words. tried: what
-    was refused with other weights before, in words.
+    proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. history:
+    (what, ∫ volume dt). seconds: wall clock of each stage. cost: what a hold and measurement errors
+    take, in words. tried: what was refused with other weights before, in words.
     """
 
     goal: Goal
     proved: Proved
-    first: ContinuousFunnel
     history: tuple[tuple[str, float], ...]
     seconds: dict[str, float]
     cost: str = ""
@@ -93,7 +91,6 @@ def design_funnel(
     search = ContinuousSearch(
         setting.goal,
         proved,
-        setting.first_guess(),
         tuple(history),
         seconds,
         _cost(setting, funnel),

@@ -34,8 +34,8 @@ MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its o
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
-DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
+SAME_MOTION = 1e-9  # of states, relative and absolute: the motion of a policy is the one given
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
@@ -57,12 +57,6 @@ class Setting:
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
-
-    def first_guess(self) -> ContinuousFunnel:
-        """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
-        t = self.policy.t
-        rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
-        return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
 
     def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
         """The members of a proof about how fast the input changes in the funnel.
@@ -97,14 +91,15 @@ def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
     """The problem, checked and completed; see `design_funnel` for what is raised.
 
     saturated: whether inputs may be at their limits; else the funnel keeps them within. A given
-    policy is taken as it is: it clips at its limits.
+    policy clips at its own limits.
     """
+    if problem.policy is not None:
+        problem = replace(problem, nominal=own_motion(problem.policy, problem.nominal))
     nominal = problem.nominal
     held = Hold.of(problem.hold, problem.error, nominal.x.control.shape[2])
     limits = limits_of(problem.limits, nominal.u.control.shape[2])
     refuse_saturated(nominal, limits)
-    clipped = saturated or problem.policy is not None
-    field, expansion = _dynamics(problem, held, limits[:0] if clipped else limits)
+    field, expansion = _dynamics(problem, held, limits[:0] if saturated else limits)
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
@@ -117,11 +112,10 @@ def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
         linear = problem.hold is not None  # a held input may not jump
         tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, linear=linear)
     else:
-        refuse_other(problem.policy, field, nominal)
-        P = lyapunov(field, problem.policy, Q=Q, P_final=final)
-        tracking = Tracking(problem.policy, P)
+        given = replace(problem.policy, vector_field=files.digest(field.document()))
+        tracking = Tracking(given, lyapunov(field, given, Q=Q, P_final=final))
     policy, S = tracking.policy, tracking.S
-    if clipped and len(limits):
+    if saturated:
         policy = replace(policy, limits=limits)
     refuse_saturated(nominal, policy.limits)
     pushed = field.only_pushes and (field.is_pushed or expansion is not None)
@@ -160,7 +154,7 @@ def limits_of(limits: ArrayLike | None, m: int) -> FloatArray:
         return np.column_stack([np.arange(m), rows])
     if rows.ndim != 2 or rows.shape[1] != 3 or not np.isin(rows[:, 0], range(m)).all():
         raise DataError(
-            f"rows of limits should be (input, low, high), or one pair (low, high) for each of {m} "
+            f"limits should be rows (input, low, high), or one pair (low, high) for each of {m} "
             f"inputs; they are {rows.tolist()}"
         )
     return rows
@@ -266,13 +260,14 @@ def _wanted_goal(goal: Goal | ArrayLike, nominal: Nominal, n: int) -> Goal:
     return Goal(wanted.centre, P)
 
 
-def refuse_other(policy: ContinuousPolicy, field: VectorField, nominal: Nominal) -> None:
-    """Raise DataError unless the policy was made for these dynamics and this motion."""
-    if policy.vector_field != files.digest(field.document()):
-        raise DataError("the policy was made for other dynamics")
-    same = np.array_equal(policy.x.control, nominal.x.control)
-    if not same or not np.array_equal(policy.t, nominal.t):
+def own_motion(policy: ContinuousPolicy, nominal: Nominal) -> Nominal:
+    """The motion of a policy, with its knots; DataError unless it is the nominal."""
+    own, t = Nominal(policy.x, policy.u), nominal.t
+    same = own.x.control.shape[2] == nominal.x.control.shape[2]
+    same = same and np.array_equal(own.t[[0, -1]], t[[0, -1]])
+    if not same or not np.allclose(own.x(t), nominal.x(t), SAME_MOTION, SAME_MOTION):
         raise DataError("the policy is around another nominal")
+    return own
 
 
 def final_level(
