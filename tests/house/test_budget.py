@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_888,
+    ("nlsid_core",): 18_842,
     ("bags",): 12_002,
     ("nlsid_ros",): 2_665,
     ("tests",): 23_377,
