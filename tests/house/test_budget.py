@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_874,
+    ("nlsid_core",): 18_828,
     ("bags",): 12_077,
     ("nlsid_ros",): 2_679,
     ("tests",): 23_362,
