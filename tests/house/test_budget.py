@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 12_077,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_362,
+    ("tests",): 23_365,
     ("benchmarks", "examples"): 3_826,
 }
 ARGUMENTS, FIELDS = 6, 8
