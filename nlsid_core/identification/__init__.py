@@ -1,9 +1,10 @@
 """Identification: a dataset in, a stable model with its proof out (thesis Part I)."""
 
-from nlsid_core.identification.choosing import Selection, Tried, select
+from nlsid_core.identification.choosing import Attempt, Choice, Promise, Row
 from nlsid_core.identification.families import ModelClass, describe, methods_of
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import identify
+from nlsid_core.identification.learning import Learned, learn
 from nlsid_core.identification.methods.options import (
     METHODS,
     LeastSquares,
@@ -28,40 +29,43 @@ from nlsid_core.identification.validation import (
 
 __all__ = [
     "METHODS",
+    "Attempt",
     "Candidate",
     "CellRow",
+    "Choice",
     "Degrees",
     "Feedback",
     "FilterMapFilter",
     "Fit",
     "History",
     "ImplicitProof",
+    "Learned",
     "LeastSquares",
     "Method",
     "Model",
     "ModelClass",
     "Network",
     "Polynomial",
+    "Promise",
     "Proof",
     "RepeatTest",
     "Residual",
     "Rie",
+    "Row",
     "Rse",
-    "Selection",
     "Sem",
     "StabilityProof",
     "Step",
-    "Tried",
     "Validation",
     "alike",
     "compare_repeats",
     "describe",
     "identify",
+    "learn",
     "methods_of",
     "predict",
     "prove_implicit",
     "prove_stability",
-    "select",
     "simulate_trial",
     "simulation_percent",
     "stated_rate",

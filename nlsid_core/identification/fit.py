@@ -104,7 +104,7 @@ class History:
 class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
-    errors: simulation error in % by dataset name ("train", "validation", "test", those given) and
+    errors: simulation error in % by dataset name ("train", "test", those given) and
     name of the method. max_rate: the slowest rate a sample that was searched, and proofs of which
     count. fit[name] is the candidate of the method called so.
     """

@@ -12,7 +12,7 @@ from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.identification.families import ModelClass, methods_of, search
 from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.methods.options import METHODS, Method, alike
-from nlsid_core.identification.rates import default_max_rate
+from nlsid_core.identification.rates import rate_of_memory
 from nlsid_core.identification.trail import Task
 from nlsid_core.progress import Progress, silent
 
@@ -23,7 +23,6 @@ def identify(
     *,
     method: Method | None = None,
     comparators: Sequence[Method] | None = None,
-    validation: Dataset | None = None,
     test: Dataset | None = None,
     transient: int = 0,
     max_rate: float | None = None,
@@ -35,11 +34,9 @@ def identify(
 
     method: one that is for the class (`model_class.methods`), such as `Rse(iterations=20)`; None:
     the first of them. comparators: what else runs beside it; None: what is quick, with the options
-    that it shares with the method. `test` is only scored; so is `validation`, but by it a
-    `FilterMapFilter` chooses its phases and knots (without it by every third training trial, the
-    second of two, or the last third of one). transient: samples at the start of every trial that
-    are simulated and not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a
-    sample: two solutions approach each other by it or faster, and a slower proof does not count
+    that it shares with the method. `test` is only scored. transient: samples at the start of every
+    trial that are simulated and not scored. max_rate: of models that are searched, 0 < max_rate < 1
+    a sample: two solutions approach each other by it or faster, and a slower proof does not count
     (None: the time constant is the length of the longest training trial). executor: shares work
     that splits, such as moments of many bags. progress: called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
@@ -50,18 +47,17 @@ def identify(
     for asked in (chosen, *(comparators or ())):
         if getattr(asked, "name", None) not in [one.name for one in known]:
             raise DataError(_unknown(asked, known))
-    datasets = {"train": train, "validation": validation, "test": test}
+    datasets = {"train": train, "test": test}
     scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
     _refuse_other_signals(scored)
     if max_rate is not None and not 0.0 < max_rate < 1.0:
         raise OptionError("max_rate", max_rate, "a number between 0 and 1")
-    slowest = default_max_rate(train) if max_rate is None else max_rate
+    slowest = rate_of_memory(train) if max_rate is None else max_rate
     quick = tuple(alike(one, chosen) for one in model_class.comparators if one.name != chosen.name)
     task = Task(
         method=chosen,
         comparators=quick if comparators is None else tuple(comparators),
         max_rate=slowest,
-        validation=validation,
         transient=transient,
         executor=executor,
         progress=progress,

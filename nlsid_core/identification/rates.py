@@ -13,9 +13,9 @@ from nlsid_core.identification.fit import Proof
 ROOM = 1.1  # of 1 - rate, that a search keeps so that an exact proof is not slower
 
 
-def default_max_rate(train: Dataset) -> float:
-    """exp(-1/N), N the samples of the longest trial: its time constant is that trial's length."""
-    return math.exp(-1.0 / max(map(len, train)))
+def rate_of_memory(train: Dataset, trials: float = 1.0) -> float:
+    """The rate whose time constant is so many times the longest trial."""
+    return math.exp(-1.0 / (trials * max(map(len, train))))
 
 
 def searched_rate(max_rate: float) -> float:

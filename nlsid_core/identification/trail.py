@@ -48,7 +48,6 @@ class Task:
     method: Method
     comparators: tuple[Method, ...]
     max_rate: float
-    validation: Dataset | None = None
     transient: int = 0
     executor: Executor | None = None
     progress: Progress = silent
@@ -90,9 +89,11 @@ class Trail(Generic[T]):
         started = time.process_time()
         try:
             model, proof = make(method)
-        except NlsidError as reason:
-            if method is self.task.method:
+        except (NlsidError, LinAlgError) as reason:
+            if method is self.task.method and isinstance(reason, NlsidError):
                 raise
+            if method is self.task.method:
+                raise SolverError(f"{method.title}: {reason}") from reason
             log.warning("no comparison with %s: %s", method.name, reason)
             return
         self._keep(method, model, proof, time.process_time() - started)

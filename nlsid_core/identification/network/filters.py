@@ -3,7 +3,7 @@
     x_j = B1_j/A1 u,    y = Σ_j B2_j/A2 f(x_j),    j = 0 … phases - 1
 
 Random starts on a part of the data, then all of it; the number of phases and of knots are chosen
-by the simulation error on validation data. `BlockCascade` says what the phases are.
+by the simulation error on trials that are held back. `BlockCascade` says what the phases are.
 """
 
 from dataclasses import dataclass, replace
@@ -113,7 +113,7 @@ class Choice:
 
     cascade: Cascade
     train_rms: float
-    validation_rms: float
+    judged_rms: float
 
     def __str__(self) -> str:
         M = self.cascade.phases
@@ -126,11 +126,11 @@ def filter_map_filter(
 ) -> tuple[BlockCascade, tuple[Step, ...]]:
     """A `BlockCascade` by simulation error, and the rms errors of the choices.
 
-    Without validation trials some of the training trials choose, and what they chose is fitted to
-    all. Raises ShapeError for several inputs or outputs, DataError on too little or constant data.
+    Some of the trials choose, and what they chose is fitted to all. Raises ShapeError for several
+    inputs or outputs, DataError on too little or constant data.
     """
     made, progress = model_class.structure, task.progress
-    fitted, judged = (train, task.validation) if task.validation else hold_out(train)
+    fitted, judged = hold_out(train)
     scaled = _scales(fitted)
     known, others = (_trials(data, scaled, made, task) for data in (fitted, judged))
     search = _Search(min(MAX_RADIUS, task.searched_rate), known, others, scaled.y[1])
@@ -146,24 +146,22 @@ def filter_map_filter(
             finer = search.choice(_with_intervals(base, known, K))
             tried.append(finer)
             progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
-            if finer.validation_rms > coarser:
+            if finer.judged_rms > coarser:
                 break  # finer knots still would fit noise
-            coarser, base = finer.validation_rms, finer.cascade
-    history = [Step(str(choice), choice.validation_rms) for choice in tried]
-    best = min(tried, key=lambda choice: choice.validation_rms)
+            coarser, base = finer.judged_rms, finer.cascade
+    history = [Step(str(choice), choice.judged_rms) for choice in tried]
+    best = min(tried, key=lambda choice: choice.judged_rms)
     polished = search.choice(best.cascade, FINAL_STEPS, FINAL_TOLERANCE)
-    history.append(Step(f"{polished}, minimised further", polished.validation_rms))
-    chosen = min(best, polished, key=lambda choice: choice.validation_rms).cascade
-    if task.validation is None:
-        progress("fitted to all trials", 1.0 - 1.0 / total)
-        every = replace(search, known=_trials(train, scaled, made, task))
-        again = every.choice(
-            _with_intervals(chosen, every.known, chosen.f.intervals), FINAL_STEPS, FINAL_TOLERANCE
-        )
-        chosen = again.cascade
-        history.append(Step("fitted to all trials, training error", again.train_rms))
+    history.append(Step(f"{polished}, minimised further", polished.judged_rms))
+    chosen = min(best, polished, key=lambda choice: choice.judged_rms).cascade
+    progress("fitted to all trials", 1.0 - 1.0 / total)
+    every = replace(search, known=_trials(train, scaled, made, task))
+    again = every.choice(
+        _with_intervals(chosen, every.known, chosen.f.intervals), FINAL_STEPS, FINAL_TOLERANCE
+    )
+    history.append(Step("fitted to all trials, training error", again.train_rms))
     progress("minimised further", 1.0)
-    return _model(chosen, scaled, train), tuple(history)
+    return _model(again.cascade, scaled, train), tuple(history)
 
 
 @dataclass(frozen=True, eq=False)

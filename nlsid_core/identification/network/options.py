@@ -22,7 +22,7 @@ class FilterMapFilter:
 
     orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models. phases:
     tried, each 1 to 4; several presume an input without power near half the sampling frequency.
-    intervals: of knots, tried, ascending, while that helps; validation data choose both. starts:
+    intervals: of knots, tried, ascending, while that helps; trials held back choose both. starts:
     random ones, 1 to 1000. begin: how trials begin, "measured" (in motion, from the first measured
     outputs) or "rest" (from zero states). Source: `theory-cascades-and-moments.md`.
     """
@@ -117,8 +117,3 @@ class Network(Generic[S]):
     def comparators(self) -> tuple[Method, ...]:
         """Those that run beside what is asked for, because they are quick."""
         return self.methods[1:]
-
-    @property
-    def needs_validation(self) -> bool:
-        """The search chooses by validation trials, or by some of the training trials."""
-        return isinstance(self.structure, FilterMapFilter)

@@ -17,7 +17,7 @@ from nlsid_core.identification.trail import Task, Trail
 # A structure's fit, and the error that its steps state.
 Fitted = Callable[[Dataset, Network[Any], Task], tuple[Any, tuple[Step, ...]]]
 FITS: dict[type, tuple[Fitted, str]] = {
-    FilterMapFilter: (filter_map_filter, "validation"),
+    FilterMapFilter: (filter_map_filter, "held-back"),
     CellRow: (cells_in_a_row, "training"),
     Feedback: (feedback_unrolled, "held-back"),
 }
