@@ -4,12 +4,12 @@ import math
 from typing import Any, Final
 
 from bags.chain.identification_config import section_of
+from bags.setup.ladder import STAGES, Stages, choose
 from bags.setup.proposal import Proposal
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.identification import Choice
 from nlsid_core.identification.choosing import HeldOut
-from nlsid_core.identification.learning import STAGES, Stages, choose
 from nlsid_core.progress import Progress
 
 SHOWN: Final = 6  # of what was tried
@@ -23,20 +23,14 @@ def tried(train: Dataset, stages: Stages = STAGES, *, progress: Progress) -> Cho
         return None
 
 
-def say_model(proposal: Proposal, choice: Choice | None) -> None:
+def say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> None:
     """Take what the rule takes, say what else was tried, and what to expect."""
     try:
         best = None if choice is None else choice.best
     except Infeasible:
         best = None
     if choice is None or best is None:
-        proposal.why["model"] = "a first guess"
-        proposal.walls.append(
-            "no class that was tried has a proved model of these trials: identification will "
-            "refuse; a response that adds up its command for ever needs |derivative or |washout"
-            if choice is not None
-            else "the trials are too short to hold a part of them out: nothing was tried"
-        )
+        _say_untried(proposal, train)
         return
 
     kept = {key: proposal.content["identification"].get(key) for key in ("input_range",)}
@@ -51,3 +45,21 @@ def say_model(proposal: Proposal, choice: Choice | None) -> None:
         f"{len(choice.rows)} were tried on {choice.held_out.on} that were held out, and the "
         f"simplest that is as good as the best is taken: {said}"
     )
+
+
+def _say_untried(proposal: Proposal, train: Dataset) -> None:
+    """What identification does with the first guess, where nothing could be held out."""
+    proposal.why["model"] = "a first guess"
+    try:
+        proposal.config().identification.identify(train)
+    except NlsidError as reason:
+        wall = (
+            f"identification will refuse ({reason}); a response that adds up its command for ever "
+            "needs |derivative or |washout behind its path"
+        )
+    else:
+        wall = (
+            "no class has a proved model of a part of these trials: the model is a first guess, "
+            "and nothing says how well it simulates other data"
+        )
+    proposal.walls.append(wall)

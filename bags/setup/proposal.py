@@ -50,7 +50,9 @@ class Proposal:
     def expectation(self) -> str:
         """How good a model will be, as far as what was tried says."""
         if self.promise is None:
-            return "no model that was tried is proved: expect identification to refuse"
+            return (
+                "nothing is promised: no model could be held against data that it was not fitted to"
+            )
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
         said = f"expect an error in simulation of {self.promise}: {grade}"
         return f"{said}, if the question above is answered" if self.doubts else said

@@ -17,6 +17,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
+from bags.setup import ladder
 from bags.setup.attempts import say_model, tried
 from bags.setup.candidates import Found, Pair, slope_window
 from bags.setup.direction import say_direction
@@ -29,7 +30,6 @@ from bags.signals.signal import SignalPath
 from nlsid_core.data.repeats import same_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import learning
 from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
@@ -153,8 +153,8 @@ def propose(
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
-    choice = tried(trials.train, learning.LINEAR, progress=progress)
-    say_model(proposal, choice)
+    choice = tried(trials.train, ladder.LINEAR, progress=progress)
+    say_model(proposal, choice, trials.train)
     if linear and _may_add_up(proposal, found):
         washed = f"{responses[0]}|washout({WASHOUT:g} s)"
         moved = propose(bags, found, replace(chosen, responses=(washed,)), progress=progress)
@@ -173,8 +173,8 @@ def propose(
             wider.why |= {text: wider.why[text] + without for text in others}
             return wider
     if choice is not None and not is_swapped:  # who swapped them has to say so first
-        more = learning.choose(choice.held_out, learning.BEYOND, choice.rows, progress=progress)
-        say_model(proposal, more)
+        more = ladder.choose(choice.held_out, ladder.BEYOND, choice.rows, progress=progress)
+        say_model(proposal, more, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)
     proposal.walls += _beside(proposal, found) if alone else []

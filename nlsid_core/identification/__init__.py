@@ -4,7 +4,6 @@ from nlsid_core.identification.choosing import Attempt, Choice, Promise, Row
 from nlsid_core.identification.families import ModelClass, describe, methods_of
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import identify
-from nlsid_core.identification.learning import Learned, learn
 from nlsid_core.identification.methods.options import (
     METHODS,
     LeastSquares,
@@ -12,7 +11,6 @@ from nlsid_core.identification.methods.options import (
     Rie,
     Rse,
     Sem,
-    alike,
 )
 from nlsid_core.identification.network.options import CellRow, Feedback, FilterMapFilter, Network
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
@@ -39,7 +37,6 @@ __all__ = [
     "Fit",
     "History",
     "ImplicitProof",
-    "Learned",
     "LeastSquares",
     "Method",
     "Model",
@@ -57,11 +54,9 @@ __all__ = [
     "StabilityProof",
     "Step",
     "Validation",
-    "alike",
     "compare_repeats",
     "describe",
     "identify",
-    "learn",
     "methods_of",
     "predict",
     "prove_implicit",

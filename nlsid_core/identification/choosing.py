@@ -13,7 +13,7 @@ Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
@@ -23,6 +23,7 @@ from nlsid_core.data.repeats import by_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.families import ModelClass, describe
+from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.identify import identify
 from nlsid_core.identification.methods.options import Method, Rse
 from nlsid_core.identification.polynomial.options import Polynomial
@@ -34,10 +35,9 @@ STRETCHES = 6  # of a recording, where stretches of time are held out
 FEW = 5  # excitations: of fewer, each is judged in stretches
 STARTS = (10, 20, 30, 45)  # samples that may show how a stretch starts, a fifth of it at most;
 PLACES = (0.0, 0.15, 0.3, 0.45)  # of a trial, where it is tried how many are needed,
-START_LAGS, START_STEPS, START_CLOSE = 4, 12, 1.04  # by a linear model, and its squared error
+START_LAGS, START_STEPS, START_CLOSE = 4, 6, 1.04  # by a linear model, and its squared error
 SHORTEST = 20  # samples of a stretch
 SAMPLES = 8000  # that a fold is fitted to, at most
-GLANCE = 1500  # samples, to which an attempt is fitted to see whether it is worth a closer look
 CLOSE = 1.05  # times the best error: what is worse is not "as good", however few folds there are
 SURE = 0.9  # probability of the promised interval, were squared errors normal
 
@@ -143,12 +143,6 @@ class HeldOut:
             error = float(np.mean(np.concatenate(squares)))
         return error if np.isfinite(error) else np.inf
 
-    def glance(self, attempt: Attempt) -> Row:
-        """A row of the first fold alone, fitted to a few samples: what is worth a closer look."""
-        first = self.folds[0]
-        few = Fold(_shortened(first.fitted.trajectories, GLANCE), first.judged)
-        return replace(self, folds=(few,)).judged(attempt)
-
     def judged(self, attempt: Attempt) -> Row:
         """The row of an attempt."""
         errors, size = np.full(len(self.fold_of), np.nan), 0
@@ -226,7 +220,7 @@ def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
 
 def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Model:
     """The attempt's proved model of a part of the data. Raises as `identify`."""
-    fit = identify(
+    fit: Fit[Model] = identify(
         train,
         attempt.model_class,
         method=attempt.method,
@@ -244,7 +238,7 @@ def _start(data: Dataset, shortest: int) -> int:
     rows = [min(samples, shortest // 5) for samples in STARTS]
     attempt = Attempt(Polynomial(START_LAGS), Rse(START_STEPS))
     try:
-        model = fitted(_shortened(data.trajectories, GLANCE), attempt, data)
+        model = fitted(shortened(data.trajectories), attempt, data)
     except (DataError, SolverError):
         return rows[0]
     errors = []
@@ -268,7 +262,7 @@ def _folds_of(groups: Sequence[Sequence[Trajectory]]) -> Iterator[Fold]:
         judged = [list(group) for i, group in enumerate(groups) if i % count == k]
         if len(groups) < FEW:
             judged = [part for group in judged for part in _stretches(group, FOLDS)]
-        yield Fold(_shortened(rest), tuple(tuple(_cut(part)) for part in judged))
+        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
 
 
 def _folds_in_time(data: Dataset) -> Iterator[Fold]:
@@ -281,7 +275,7 @@ def _folds_in_time(data: Dataset) -> Iterator[Fold]:
             runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
             rest += [_part(trial, ends[run[0]], ends[run[-1] + 1]) for run in runs]
         judged = _stretches(data.trajectories, STRETCHES)[k::FOLDS]
-        yield Fold(_shortened(rest), tuple(tuple(_cut(part)) for part in judged))
+        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
 
 
 def _stretches(trials: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
@@ -312,7 +306,7 @@ def _cut(trials: Sequence[Trajectory]) -> list[Trajectory]:
     return [trial.rows(slice(SAMPLES // FOLDS)) for trial in trials]
 
 
-def _shortened(trials: Sequence[Trajectory], samples: int = SAMPLES) -> Dataset:
+def shortened(trials: Sequence[Trajectory], samples: int = SAMPLES) -> Dataset:
     """At most about so many: the first of each trial, or of as many trials as have enough."""
     share = max(samples // len(trials), min(min(map(len, trials)), samples // FOLDS))
     every = max(1, round(sum(min(len(t), share) for t in trials) / samples))

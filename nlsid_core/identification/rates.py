@@ -8,7 +8,6 @@ neither. So unless it is given the slowest rate is exp(-1/N) a sample of the lon
 import math
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.identification.fit import Proof
 
 ROOM = 1.1  # of 1 - rate, that a search keeps so that an exact proof is not slower
 
@@ -21,8 +20,3 @@ def rate_of_memory(train: Dataset, trials: float = 1.0) -> float:
 def searched_rate(max_rate: float) -> float:
     """The rate that a search keeps, so that the proof of what it finds is at most `max_rate`."""
     return max(1.0 - ROOM * (1.0 - max_rate), 0.5 * max_rate)
-
-
-def is_too_slow(proof: Proof, max_rate: float) -> bool:
-    """The proof states a rate, and that is slower than asked for."""
-    return max_rate < proof.rate < 1.0

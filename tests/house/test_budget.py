@@ -11,14 +11,14 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_971,
-    ("bags",): 12_002,
+    ("nlsid_core",): 18_974,
+    ("bags",): 11_844,
     ("nlsid_ros",): 2_665,
-    ("tests",): 23_478,
-    ("benchmarks", "examples"): 3_809,
+    ("tests",): 23_284,
+    ("benchmarks", "examples"): 3_782,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 13, 14  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 12, 14  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

@@ -1,64 +1,38 @@
-"""`learn`: from recordings to the right model, every choice by data that were held out.
+"""What is tried for recordings, in which order; the one rule (`choosing`) takes what is best.
 
-What is tried is a list, cheap first: linear models, what bends them, networks, then the best of
-them with more or fewer lags, other methods, and a shorter memory.
+It is a list, cheap first: linear models, what bends them, networks, then the best of them with more
+or fewer lags, higher degrees, more or fewer steps, and a shorter memory.
 """
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, SolverError
-from nlsid_core.identification.choosing import Attempt, Choice, HeldOut, Row
-from nlsid_core.identification.fit import Fit
-from nlsid_core.identification.identify import identify
+from nlsid_core.errors import DataError
+from nlsid_core.identification.choosing import Attempt, Choice, Fold, HeldOut, Row, shortened
 from nlsid_core.identification.methods.options import LeastSquares, Method, Rse, Sem
-from nlsid_core.identification.network.options import CellRow, FilterMapFilter, Limit, Network
+from nlsid_core.identification.network.options import (
+    CellRow,
+    Feedback,
+    FilterMapFilter,
+    Limit,
+    Network,
+)
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
-from nlsid_core.identification.rates import rate_of_memory
-from nlsid_core.progress import Progress, part, silent
-
-log = logging.getLogger(__name__)
+from nlsid_core.progress import Progress, silent
 
 LAGS = (1, 2, 3, 4, 6, 8, 10)  # of one input and output
 FEW_LAGS = (1, 2, 3, 4)
 STEPS = 6  # of a search while it is one of many
-MORE_STEPS = 40  # of the best
+MORE_STEPS = 20  # of the best
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
+GLANCE = 1000  # samples, to which an attempt is fitted to see whether it is worth a closer look
 DROPPED = 1.25  # times the best glance of a stage: worse ones are not looked at again
-ENOUGH = 1.0  # % of the spread, below which nothing more curved is tried
-
-
-@dataclass(frozen=True, eq=False)
-class Learned:
-    """The fit of what was chosen to all data, and everything that was tried."""
-
-    fit: Fit[Any]
-    attempt: Attempt
-    choice: Choice
-
-
-def learn(train: Dataset, *, progress: Progress = silent) -> Learned:
-    """Choose the class, its options, the method and the memory, and identify the model."""
-    choice = choose(HeldOut.of(train), STAGES, progress=part(progress, 0.0, 0.8))
-    for row in choice.ranked:
-        try:
-            fit = identify(
-                train,
-                row.attempt.model_class,
-                method=row.attempt.method,
-                max_rate=rate_of_memory(train, row.attempt.memory),
-                progress=part(progress, 0.8, 1.0),
-            )
-        except (DataError, SolverError) as refusal:
-            log.warning("%s, fitted to all data: %s", row.attempt, refusal)
-            continue
-        return Learned(fit, row.attempt, choice)
-    raise Infeasible("nothing that was tried has a proved model of all data")
+MOST_FILTERED = 6  # states of filters
+SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
+ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
 
 
 def choose(
@@ -73,24 +47,26 @@ def choose(
     known: what was tried before.
     """
     rows, best = list(known), math.inf
+    first = held_out.folds[0]
+    few = Fold(shortened(first.fitted.trajectories, GLANCE), first.judged)
+    glance = replace(held_out, folds=(few,))
     for number, (stage, kept) in enumerate(stages):
         before = {row.attempt for row in rows}
         attempts = [one for one in dict.fromkeys(stage(held_out.data, rows)) if one not in before]
         glances = []
         for attempt in attempts:
             progress(str(attempt), number / len(stages))
-            glances.append(held_out.glance(attempt))
+            glances.append(glance.judged(attempt))
             best = min(best, glances[-1].percent)
         glances.sort(key=lambda row: row.percent)
-        for place, glance in enumerate(glances):
-            if glance.refusal:
-                rows.append(glance)
-            elif place < kept and glance.percent <= DROPPED * best:
-                progress(str(glance.attempt), (number + 0.5) / len(stages))
-                rows.append(held_out.judged(glance.attempt))
+        for place, row in enumerate(glances):
+            if row.refusal:
+                rows.append(row)
+            elif place < kept and row.percent <= DROPPED * best:
+                progress(str(row.attempt), (number + 0.5) / len(stages))
+                rows.append(held_out.judged(row.attempt))
             else:
-                said = f"{glance.percent:.3g} % at a glance"
-                rows.append(replace(glance, refusal=said))
+                rows.append(replace(row, refusal=f"{row.percent:.3g} % at a glance"))
     return Choice(held_out, tuple(rows))
 
 
@@ -123,7 +99,7 @@ def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     if best is None or best.percent < ENOUGH:
         return
     certified = Sem(STEPS, certified=True)
-    lags = max(2, min(best.attempt.model_class.lags, FEW_LAGS[-1]))
+    lags = max(2, min(_lags(best), FEW_LAGS[-1]))
     for degree in (2, 3):
         delays = excited(data, lags, degree)
         yield Attempt(Polynomial(lags, delays, Degrees(inputs=degree)), Rse(STEPS))
@@ -146,11 +122,14 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     for cells, limit in limits:
         yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
     if inputs == 1:
-        straight = least(row for row in rows if row.attempt.model_class.is_linear)
-        n = 4 if straight is None else max(2, min(straight.attempt.model_class.lags, 6))
+        straight = least(row for row in rows if row.attempt.model_class == Polynomial(_lags(row)))
+        n = 4 if straight is None else max(2, min(_lags(straight), MOST_FILTERED))
         for orders in dict.fromkeys(((n, 0), (0, n), (n - n // 2, n // 2))):
-            filters = FilterMapFilter(orders, phases=(1,), intervals=(8, 16), starts=4)
+            filters = FilterMapFilter(orders, intervals=12, starts=4)
             yield Attempt(Network(filters), certified)
+    if best.percent > SWINGS:
+        loop = Network(Feedback(2, stages=2, imitated=20))
+        yield Attempt(loop, certified)
 
 
 def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
@@ -166,9 +145,9 @@ def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         if made.degrees.leading:
             higher = replace(made.degrees, inputs=3, leading=2 if signals_of(data) == (1, 1) else 1)
             yield replace(attempt, model_class=replace(made, lags=made.lags - 1, degrees=higher))
-    if hasattr(attempt.method, "iterations"):
+    if isinstance(method := attempt.method, Rse | Sem):
         for iterations in (1, MORE_STEPS):
-            yield replace(attempt, method=replace(attempt.method, iterations=iterations))
+            yield replace(attempt, method=replace(method, iterations=iterations))
 
 
 def memories(_data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
@@ -177,6 +156,12 @@ def memories(_data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     if best is not None and best.attempt.method != LeastSquares():  # which knows no limit
         for memory in MEMORIES:
             yield replace(best.attempt, memory=memory)
+
+
+def _lags(row: Row) -> int:
+    """Of an equation; 0 of a network."""
+    made = row.attempt.model_class
+    return made.lags if isinstance(made, Polynomial) else 0
 
 
 def signals_of(data: Dataset) -> tuple[int, int]:
