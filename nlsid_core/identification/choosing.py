@@ -23,7 +23,6 @@ from nlsid_core.data.repeats import by_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.families import ModelClass, describe
-from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.identify import identify
 from nlsid_core.identification.methods.options import Method, Rse
 from nlsid_core.identification.polynomial.options import Polynomial
@@ -193,11 +192,10 @@ class Choice:
         for k in range(len(self.held_out.folds)):
             errors[fold_of == k] = simplest(known, fold_of != k).errors[fold_of == k]
         n, mean = len(errors), float(errors.mean())
-        varies = float(errors.std(ddof=1)) / max(mean, np.finfo(float).tiny)
-        width = float(student.ppf(0.5 + 0.5 * SURE, n - 1)) * varies / math.sqrt(n)
+        deviation = float(errors.std(ddof=1)) / max(mean, np.finfo(float).tiny) / math.sqrt(n)
+        factor = math.exp(float(student.ppf(0.5 + 0.5 * SURE, n - 1)) * deviation)
         percent = 100.0 * math.sqrt(mean)
-        on = self.held_out.on
-        return Promise(percent, percent * math.exp(-width), percent * math.exp(width), on)
+        return Promise(percent, percent / factor, factor * percent, self.held_out.on)
 
 
 def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
@@ -220,14 +218,14 @@ def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
 
 def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Model:
     """The attempt's proved model of a part of the data. Raises as `identify`."""
-    fit: Fit[Model] = identify(
+    model: Model = identify(
         train,
         attempt.model_class,
         method=attempt.method,
         comparators=(),
         max_rate=rate_of_memory(whole, attempt.memory),
-    )
-    return fit.model
+    ).model
+    return model
 
 
 def _start(data: Dataset, shortest: int) -> int:
@@ -245,9 +243,8 @@ def _start(data: Dataset, shortest: int) -> int:
     for samples in rows:
         squares = []
         for trial in data:
-            for place in PLACES:
-                part = trial.rows(slice(int(place * len(trial)), None))
-                part = part.rows(slice(min(shortest, SAMPLES // FOLDS)))
+            for first in (int(place * len(trial)) for place in PLACES):
+                part = trial.rows(slice(first, first + min(shortest, SAMPLES // FOLDS)))
                 missed = simulate_started(model, part, samples) - part.y
                 squares.append(np.mean(missed[rows[-1] :] ** 2))
         errors.append(float(np.mean(squares)))

@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_974,
+    ("nlsid_core",): 18_971,
     ("bags",): 11_844,
     ("nlsid_ros",): 2_665,
     ("tests",): 23_284,

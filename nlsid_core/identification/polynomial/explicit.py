@@ -40,8 +40,8 @@ def search(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Model]:
     problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
     trail: Trail[Model] = Trail(task, prove_stability, BOUND)
     radius, n_y = task.searched_rate, len(problem.y_scale[0])
-    is_iterated = any(method != LeastSquares() for method in (task.method, *task.comparators))
-    found = stable_starts(train, model_class.lags, radius) if is_iterated else ()
+    is_solved = {task.method, *task.comparators} == {LeastSquares()}  # without an iteration
+    found = () if is_solved else stable_starts(train, model_class.lags, radius)
     starts = [(name, problem.embedded(theta)) for name, theta in found]
     trail.add("least_squares", lambda _: equation_error(problem))
     trail.follow(
