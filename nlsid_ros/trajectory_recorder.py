@@ -37,6 +37,7 @@ from nlsid_ros.type_descriptions import TypeDescriptions
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
+MOST_TOPICS = 12  # that a status names: with the rest it has at most 20 values
 SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
 EXPERIMENT = "experiment"  # and the custom datum that holds it
 
@@ -45,6 +46,7 @@ class TrajectoryRecorder(ManagedNode):
     """Records topics into one new bag after another."""
 
     name = "trajectory_recorder"
+    task = "recording"
     is_watched = True
     parameters = (
         Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
@@ -253,11 +255,11 @@ class TrajectoryRecorder(ManagedNode):
         return True, f"{count} messages in {path}"
 
     def _report(self) -> None:
-        """Counts per topic; a warning while a topic is missing, silent or losing messages."""
+        """Counts; a warning while a topic is missing, silent or losing messages."""
         recording = self._recording
         level, text, values = DiagnosticStatus.OK, "waiting for ~/start", {}
         if recording is not None:
-            values = {"bag": str(recording.bag.path)} | recording.counts()
+            values = {"bag": str(recording.bag.path)} | recording.summary(MOST_TOPICS)
             text = "recording"
             self._topics.follow()
             if warnings := [*recording.warnings(), *self._topics.warnings.values()]:

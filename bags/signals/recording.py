@@ -10,6 +10,7 @@ from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Regularity, Sequence
 
+COUNTED: Final = ("received", "lost", "gaps", "rate [Hz]", "jitter [ms]")
 UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"
 UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
 
@@ -107,6 +108,20 @@ class Recording:
             values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
             values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
         return values
+
+    def summary(self, most: int) -> dict[str, str]:
+        """Of all topics together, and then a line each of the `most` that lose most, in words."""
+        counts = self.counts()
+        lost = {topic: self._lost_on(topic) for topic in self._regularity}
+        values = {
+            "topics": len(lost),
+            "messages": sum(self.bag.counts.values()),
+            "lost": sum(lost.values()),
+        }
+        lines = {}
+        for topic in sorted(lost, key=lambda topic: -lost[topic])[:most]:
+            lines[topic] = ", ".join(f"{what} {counts[f'{topic} {what}']}" for what in COUNTED)
+        return {name: str(value) for name, value in values.items()} | lines
 
     def warnings(self) -> list[str]:
         """What a person should look at."""

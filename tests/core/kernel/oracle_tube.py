@@ -13,7 +13,6 @@ from nlsid_core import files
 from tests.core.kernel.oracle_stability import (
     Json,
     Rows,
-    between,
     cascade,
     exact,
     increments,
@@ -140,13 +139,15 @@ class Implicit:
 
 
 def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
-    """F, m, the box, whether there is a ray, and the E_i of a part of the box with its ends."""
+    """F, m, the box, whether there is a ray, and the E_i of a part of the box."""
     if model["kind"] != "implicit":
         assert given is None
         F, m, box = increments(model)
 
-        def hull(part: Box, ends: Json | None) -> list[Rows] | None:
-            return vertices(model, part) if ends is None else between(model, part, ends)
+        def hull(part: Box) -> list[Rows]:
+            found = vertices(model, part)
+            assert found is not None
+            return found
 
         ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
         return F, m, box, ray, hull
@@ -155,9 +156,9 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
     if found is not None:
         assert given is None
         E, ray = found
-        return implicit.F(), implicit.p, [], ray, lambda _, __: [E]
+        return implicit.F(), implicit.p, [], ray, lambda _: [E]
     assert given is not None
-    return implicit.F(), implicit.p, implicit.box(given), False, lambda box, _: implicit.hull(box)
+    return implicit.F(), implicit.p, implicit.box(given), False, implicit.hull
 
 
 def quadratic(rows: Rows, P: Rows) -> Rows:
@@ -171,6 +172,16 @@ def quadratic(rows: Rows, P: Rows) -> Rows:
         [sum((rows[a][i] * PF[a][j] for a in range(n)), Fraction(0)) for j in range(size)]
         for i in range(size)
     ]
+
+
+def direct(tube: Json, j: int) -> tuple[Fraction, Fraction]:
+    """c_j and the peak of e_j."""
+    if "direct" not in tube:
+        return Fraction(0), Fraction(0)
+    peaks = tube["peak"]["at_most"]
+    assert set(tube["peak"]) == {"at_most", "measured"}
+    assert len(tube["direct"]) == len(peaks) == len(tube["tau"])
+    return exact(tube["direct"][j]), exact(peaks[j])
 
 
 def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, kept: int) -> bool:
@@ -192,7 +203,7 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, k
         [[a - b for a, b in zip(x, y, strict=True)] for x, y in zip(supply, moved, strict=True)]
     ]
     for j in range(p):
-        h = H[j] + [Fraction(int(i == j)) for i in range(p)]
+        h = H[j] + [(1 - direct(tube, j)[0]) * int(i == j) for i in range(p)]
         forms.append(
             [[supply[a][b] - tau[j] * h[a] * h[b] for b in range(size)] for a in range(size)]
         )
@@ -217,10 +228,8 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, k
             return False
         if ray and any(N[0][0] < 0 or any(row[0] != 0 for row in N[1:]) for N in Ns):
             return False
-        found = hull(box, tree.get("ends"))
-        if found is None:
-            return False
-        for E, (M, N) in product(found, zip(forms, Ns, strict=True)):
+        assert set(tree) == {"N"}
+        for E, (M, N) in product(hull(box), zip(forms, Ns, strict=True)):
             cross, whole = zeros(size, size), zeros(size, size)
             for i, j in product(range(size), range(m + n)):
                 cross[i][j] = sum((N[i][k] * E[k][j] for k in range(m)), Fraction(0))
@@ -305,8 +314,12 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
         kept = m + len(F) if model["kind"] == "implicit" and m > 1 and box else 0
         if not all(holds(F, H, m, tube, tree, (box, ray, hull), kept) for F, H in modes):
             return False
-        for tau, width in zip(tube["tau"], tube["half_widths"], strict=True):
-            if not width > 0 or level + rho * inlet > exact(tau) * exact(width) ** 2:
+        for j, (tau, width) in enumerate(zip(tube["tau"], tube["half_widths"], strict=True)):
+            c, peak = direct(tube, j)
+            if not 0 <= c <= 1 or peak < 0 or (c and ("follows" in tube or policy)):
+                return False
+            left = exact(width) - c * peak
+            if not (width > 0 and left > 0) or level + rho * inlet > exact(tau) * left**2:
                 return False
     return True
 
