@@ -12,13 +12,13 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_828,
-    ("bags",): 12_077,
+    ("bags",): 11_919,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_365,
-    ("benchmarks", "examples"): 3_826,
+    ("tests",): 23_171,
+    ("benchmarks", "examples"): 3_799,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 12, 14  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 11, 14  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
