@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_828,
+    ("nlsid_core",): 18_829,
     ("bags",): 11_919,
     ("nlsid_ros",): 2_679,
     ("tests",): 23_171,
