@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_829,
-    ("bags",): 11_919,
+    ("nlsid_core",): 18_828,
+    ("bags",): 11_961,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_171,
+    ("tests",): 23_181,
     ("benchmarks", "examples"): 3_799,
 }
 ARGUMENTS, FIELDS = 6, 8
