@@ -190,6 +190,11 @@ def check(
     that contradicts itself. Status 2 if a proof cannot be read, so that nothing was decided about
     it, or if the second kernel was asked and has no opinion of it.
     """
+    raise typer.Exit(decided(paths, deciding.Limits(seconds, memory), second=second))
+
+
+def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False) -> int:
+    """Say of every proof whether it is one; the status that `check` ends with."""
     from bags.designs.provenance import of_proof
 
     status = 0
@@ -197,7 +202,6 @@ def check(
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            limits = deciding.Limits(seconds, memory)
             said = str(deciding.Deciding(path, limits, remembered=False).wait())
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
@@ -217,7 +221,7 @@ def check(
         except OSError as error:
             status = 2
             typer.echo(f"NOT READ {name}: {error.strerror}")
-    raise typer.Exit(status)
+    return status
 
 
 def _proofs(path: Path) -> list[Path]:
@@ -242,6 +246,7 @@ def report(
     from bags.commands.page import folder_page, recorded
     from bags.designs import documents
     from bags.designs.wiring import sampler_of
+    from bags.monitoring.replay import to_judge
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
     from nlsid_core import files
@@ -257,7 +262,7 @@ def report(
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
                 recordings.append(bag_info(bag, topics=topics))
-        chosen = show.chosen_bags(design, folders, settings)
+        chosen = to_judge(design, folders)
         replays = show.replayed(design, chosen.judged, settings)
         held = recorded(recordings, replays, chosen.said)
         out.print(show.replay_table(replays))

@@ -343,8 +343,7 @@ def _summand(term: Members, u: Sequence[Signal]) -> str:
     elif term["centre"]:
         product = f"({product} - {centre})"
     square = "" if product == scale == "1" else f"({product} / {scale})^2"
-    fading = text.exact(term["fading"])
-    return f"(sum {fading}^i {square or '1'})" if term["fading"] else square
+    return f"(sum {text.exact(term['fading'])}^i {square or '1'})" if term["fading"] else square
 
 
 def _plain(word: str, operators: str) -> str:
