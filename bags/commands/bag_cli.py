@@ -80,16 +80,26 @@ class Timed(Source):
 
 @bag_app.command()
 def info(
-    bags: BagsArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
+    bags: BagsArgument,
+    messages: Annotated[
+        bool,
+        typer.Option("--messages", help="Read every message too: clocks, stamps, losses, sizes."),
+    ] = False,
+    definitions: DefinitionsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Show topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
+    """Show when and how a bag was recorded, and of each topic type, count, rate, jitter and gaps.
+
+    They are read from the bag's indexes.
+    """
     from bags.commands import bag_show
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
 
     for path in expand_bags(bags):
         with progress_bar("reading", after=PROGRESS_AFTER) as progress:
-            found = bag_info(path, definitions=_definitions(definitions), progress=progress)
+            types = _definitions(definitions)
+            found = bag_info(path, messages=messages, definitions=types, progress=progress)
         if as_json:
             typer.echo(bag_show.info_json(found))
         else:

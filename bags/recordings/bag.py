@@ -20,6 +20,7 @@ from bags.recordings.names import did_you_mean, listed
 from bags.recordings.quality import Profile
 from bags.recordings.remote import place
 from bags.recordings.storage import Channel, Raw, Storage, defined
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
@@ -64,9 +65,8 @@ class Bag:
         if not self._described.finished:
             self.ending = f"it has no {METADATA}: the recording was not closed"
         self._storage = Storage(self.files, salvage=salvage)
-        release = self._described.release or self._storage.release
         self._storage.channels = [
-            defined(self._encoded(channel), definitions or {}, release)
+            defined(self._encoded(channel), definitions or {}, self.release)
             for channel in self._storage.channels
         ]
         if self._storage.ending is not None:  # of a bag that is one file that is said already
@@ -111,6 +111,16 @@ class Bag:
     def custom(self) -> dict[str, str]:
         """The bag's own metadata: `custom_data` of the MCAP files and, before it, metadata.yaml."""
         return {**self._storage.custom, **self._described.custom}
+
+    @property
+    def release(self) -> str:
+        """The release of ROS 2 that recorded it, as it says; empty if it does not."""
+        return self._described.release or self._storage.release
+
+    @property
+    def kinds(self) -> dict[str, list[str]]:
+        """`storage`: what its files are. `compression`: how their chunks are compressed."""
+        return self._storage.kinds
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -233,6 +243,11 @@ class Bag:
             yield self.channels[key], batch, later_ns
             done += len(batch)
             progress("reading", done / total)
+
+    def log_times(self, topics: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
+        """(topic, log times in ns) part by part; of MCAP from its indexes, without a message."""
+        for key, log_ns in self._storage.log_times(self._keys(topics)):
+            yield self.channels[key].topic, log_ns
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""

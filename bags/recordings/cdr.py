@@ -73,6 +73,10 @@ class Step:
 
 
 Target = Sequence[Step]
+STAMP: Final = (
+    (Step("header"), Step("stamp"), Step("sec")),
+    (Step("header"), Step("stamp"), Step("nanosec")),
+)
 Numbers = NDArray[Any]  # (N,) of any type of number
 
 

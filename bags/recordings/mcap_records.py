@@ -211,8 +211,8 @@ def messages_at(
     )
 
 
-def index_entries(record: bytes, channel: int, where: str) -> IntArray:
-    """Offsets of a channel's messages in a chunk, from its message index record.
+def index_entries(record: bytes, channel: int, where: str) -> Any:
+    """Read INDEX_ENTRY of each message that a channel has in a chunk, from its index record.
 
     Raises BagError if that is damaged.
     """
@@ -222,9 +222,18 @@ def index_entries(record: bytes, channel: int, where: str) -> IntArray:
     fits = INDEX.size + size <= len(record) and INDEX.size + size <= RECORD.size + length
     if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or size % INDEX_ENTRY.itemsize:
         raise BagError(f"{where} is damaged")
-    listed: Any = np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
-    offsets: IntArray = listed["offset"].astype(np.int64)
+    return np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
+
+
+def index_offsets(record: bytes, channel: int, where: str) -> IntArray:
+    """Read where the same messages begin in the chunk."""
+    offsets: IntArray = index_entries(record, channel, where)["offset"].astype(np.int64)
     return offsets
+
+
+def index_times(record: bytes, channel: int, where: str) -> IntArray:
+    """Read their log times in ns."""
+    return _time(index_entries(record, channel, where)["log"], where)
 
 
 def counted(statistics: Statistics) -> dict[int, int] | None:

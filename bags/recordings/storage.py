@@ -44,6 +44,7 @@ UNPACKED_BYTES: Final = 2**20  # of a file that was compressed whole, at once
 NEVER: Final = 2**63 - 1  # ns: after every message
 
 DataFile = McapFile | SqliteFile | Ros1File
+KINDS: Final = {McapFile: "mcap", SqliteFile: "sqlite3", Ros1File: "ros1"}
 
 
 @dataclass(frozen=True)
@@ -263,6 +264,15 @@ class Storage:
         return next(filter(None, named), "")
 
     @property
+    def kinds(self) -> dict[str, list[str]]:
+        """What the files are, and how what is in them is compressed."""
+        blocks = [block.compression for file in self.files for block in file.contents.blocks]
+        return {
+            "storage": sorted({KINDS[type(file)] for file in self.files}),
+            "compression": sorted(set(blocks) - {"", "none"}),
+        }
+
+    @property
     def start_ns(self) -> int:
         """The first log time; 0 if there are no messages."""
         first = min(map(_first_ns, self.files), default=NEVER)
@@ -305,6 +315,17 @@ class Storage:
                     for number, batch in batches:
                         yield wanted[number], self._plain(wanted[number], batch), earliest
                     earliest = later[n, block.offset]
+
+    def log_times(self, keys: Collection[int]) -> Iterator[tuple[int, IntArray]]:
+        """(channel key, log times in ns), in the order of the files; from indexes if there are."""
+        for file, known in zip(self.files, self._keys, strict=True):
+            wanted = {number: key for number, key in known.items() if key in keys}
+            with reading(file.path):
+                if isinstance(file, McapFile):
+                    yield from ((wanted[c], log_ns) for c, log_ns in file.log_times(wanted))
+                    continue
+                for _, batches in _runs(file, wanted):
+                    yield from ((wanted[c], batch.log_ns) for c, batch in batches)
 
     def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages in the order of the files."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, Numbers, Step, UnreadableMessageError
+from bags.recordings.cdr import STAMP, Gatherer, Numbers, Step, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath
@@ -20,10 +20,6 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
-STAMP: Final = (
-    (Step("header"), Step("stamp"), Step("sec")),
-    (Step("header"), Step("stamp"), Step("nanosec")),
-)
 MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
 
 

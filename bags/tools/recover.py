@@ -14,8 +14,8 @@ from bags.recordings.description import METADATA
 from bags.recordings.message_types import decode, types_in_bag
 from bags.recordings.storage import Channel
 from bags.recordings.writer import RESERVE, BagWriter
+from bags.signals.timing import missing
 from bags.tools.copying import copy_messages
-from bags.tools.info import missing
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent

@@ -189,7 +189,7 @@ def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path)
         assert set(values["/t:a"].values) == {1.0}
         assert set(values["/t:b"].values) == {2.0}
     run("convert", source, "--out", tmp_path / "all")
-    assert "parts with different definitions" in run("info", tmp_path / "all")[1]
+    assert "parts with different definitions" in run("info", "--messages", tmp_path / "all")[1]
 
 
 @needs_cases
@@ -197,7 +197,7 @@ def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path)
 def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str, more: list[str]) -> None:
     run(how, CASES / "what_a_copy_loses" / "a.mcap", "--out", tmp_path / "copy", *more)
     copy = tmp_path / ("copy_01" if more else "copy")
-    said = run("info", copy)[1]
+    said = run("info", "--messages", copy)[1]
     for word in ("/quiet", "3 sequence numbers are missing", "robot: x"):
         assert word in said
     with Bag(CASES / "what_a_copy_loses" / "a.mcap") as before, Bag(copy) as after:
@@ -367,7 +367,7 @@ def test_a_message_that_cannot_be_unpacked_is_named_and_left_out_of_copies(tmp_p
     )
     with pytest.raises(BagError, match=r"/x: message 3 cannot be read"):
         read_signals(bag, ["/x:data"])
-    assert "cannot be read" in run("info", bag)[1]
+    assert "cannot be read" in run("info", "--messages", bag)[1]
     status, said = run("export", bag, "--out", tmp_path / "out")
     assert (status, table(tmp_path / "out", "y")["data"]) == (0, ["7.0"])
     assert "left out" in said
@@ -563,7 +563,10 @@ def test_one_damaged_topic_of_ros_1_does_not_spoil_the_others(tmp_path: Path) ->
     good = ros1_bag(tmp_path / "good.bag", [(0, struct.pack("<d", k)) for k in range(10)])
     bad = ros1_bag(tmp_path / "bad.bag", [(0, b"\0" * 3)] * 10)
     assert "10 messages" in run("info", bad)[1]
-    assert "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1" in run("info", bad)[1]
+    assert (
+        "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1"
+        in run("info", "--messages", bad)[1]
+    )
     status, said = run("export", bad, "--out", tmp_path / "out")
     assert (status, "nothing was exported" in said) == (2, True)
     run("convert", good, bad, "--out", tmp_path / "all")
@@ -753,12 +756,12 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
     assert channel[0] == "/cmd"
     run("convert", file, "--out", tmp_path / "one")
     run("convert", tmp_path / "one", "--out", tmp_path / "two")
-    assert "4 sequence numbers are missing" in run("info", tmp_path / "two")[1]
+    assert "4 sequence numbers are missing" in run("info", "--messages", tmp_path / "two")[1]
     with Bag(tmp_path / "two") as bag:
         assert len(list(bag.kept_beside)) == 2
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
     run("convert", tmp_path / "one", merged, "--out", tmp_path / "both")
-    assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
+    assert "8 sequence numbers are missing" in run("info", "--messages", tmp_path / "both")[1]
 
 
 def test_what_only_a_file_says_of_its_bag_is_kept(tmp_path: Path) -> None:
