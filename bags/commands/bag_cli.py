@@ -232,11 +232,16 @@ def export_command(
     target: OutOption = None,
     form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
     signals: Annotated[
-        list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
+        list[str] | None,
+        typer.Option("--signal", "-s", help="Signals, or topics; default: every field of all."),
     ] = None,
 ) -> None:
-    """Write signals as CSV or Parquet, a table per topic in the folder BAG_tables."""
-    from bags.tools.export import export_topics
+    """Write topics as CSV or Parquet, a table of each in the folder BAG_tables.
+
+    Fields keep their types; an array is a list, and `-s '/joints:position[*]'` a column for each
+    element.
+    """
+    from bags.tools.tables import export_topics
 
     target = target or _beside(bag, "tables")
     with (

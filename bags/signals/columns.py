@@ -95,6 +95,7 @@ def read_columns(
     """
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
+        check_path(bag, signal)
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
     growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
@@ -111,7 +112,7 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
     expanded: list[SignalPath] = []
     for path in paths:
         msgtype, types = bag.types_on(path.topic)
-        _check(bag, path)
+        check_path(bag, path)
         if not path.every:
             expanded.append(path)
             continue
@@ -123,12 +124,10 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
 
 
 class TopicReader:
-    """Turns batches of one topic into columns; BagError for signals that are not on it."""
+    """Turns batches of one topic into columns; the signals are known to be on it."""
 
     def __init__(self, bag: Bag, topic: str, signals: Mapping[str, SignalPath]) -> None:
         msgtype, types = bag.types_on(topic)
-        for signal in signals.values():
-            _check(bag, signal)
         self._where = f"{bag.path}: {topic}"
         self._topic = topic
         self._signals = signals
@@ -171,7 +170,8 @@ class TopicReader:
         return np.array(found)
 
 
-def _check(bag: Bag, path: SignalPath) -> None:
+def check_path(bag: Bag, path: SignalPath) -> None:
+    """Raise a BagError that names the bag unless its messages have a number at `path`."""
     try:
         path.check(*bag.types_on(path.topic))
     except BagError as error:
