@@ -22,6 +22,7 @@ from bags.commands.options import (
     flat,
 )
 from bags.commands.progress import progress_bar
+from bags.tools.copies import Into, What
 from nlsid_core.errors import BagError, DataError
 
 if TYPE_CHECKING:
@@ -258,49 +259,30 @@ def export_command(
     _say_notes(rows.notes)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Which part of a bag is copied, and into what it is cut."""
-
-    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0
-    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None
-    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None
-    every: Annotated[
-        float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
-    ] = None
-
-
-@bag_app.command()
+@bag_app.command("convert")
 @flat
-def convert(
+def convert_command(
     bags: BagsArgument,
-    stretch: Stretch,
+    what: What,
+    into: Into,
     source: Source,
     bag_out: OutOption = None,
 ) -> None:
-    """Copy bags into a new MCAP bag: a stretch of time, some topics, several as one, or in parts.
+    """Copy bags into a new bag, or parts: a stretch of time, some topics, several bags as one.
 
-    Several are merged by log time. Parts are OUT_01, OUT_02, ... The default of --out is
-    BAG_converted.
+    Several are merged by log time. The default of --out is BAG_converted.
     """
     from contextlib import ExitStack
 
     from bags.recordings.folders import expand_bags
-    from bags.tools import edit
+    from bags.tools.convert import convert
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    every = stretch.every
-    if every is not None and (stretch.start or stretch.end is not None):
-        raise DataError("take the stretch first (--start, --end), then cut that into parts")
     with ExitStack() as stack:
         opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
-        if every is not None:
-            parts = edit.parts_every(opened, target, every)
-        else:
-            parts = [edit.stretch(opened, target, stretch.start, stretch.end)]
         progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
-        copied = edit.convert(opened, parts, topics=stretch.topics or (), progress=progress)
+        copied = convert(opened, target, what, into, progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
     out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
@@ -315,9 +297,6 @@ class TableRows:
     time_column: Annotated[
         str | None, typer.Option("--time", help="The column with the rows' times in s.")
     ] = None
-    drop_repeats: Annotated[
-        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
-    ] = False
     start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0
 
 
@@ -332,8 +311,7 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help="signal=column: /joints:position[name=elbow]=angle; default: every column "
-            "as a number on a topic of its name.",
+            help="signal=column: /joints:position[name=elbow]=angle; repeat.",
         ),
     ] = None,
     types: Annotated[
@@ -345,32 +323,20 @@ def import_command(
     ] = None,
 ) -> None:
     """Write columns of a table as a bag of standard messages, named as the table."""
-    from bags.tools.importing import Rows, every_column, import_table, said_units
+    from bags.tools.importing import Rows, import_table
 
-    kinds = _pairs(types or (), "--type")
     bag_out = bag_out or Path(table.stem)
-    rows = Rows(given.period, given.time_column, given.drop_repeats, round(given.start * 1e9))
-    if not assignments:
-        rows, assignments, numbers = every_column(table, rows)
-        kinds = numbers | kinds
     imported = import_table(
         table,
         bag_out,
-        assignments,
-        types=kinds,
-        rows=rows,
+        assignments or (),
+        types=_pairs(types or (), "--type"),
+        rows=Rows(given.period, given.time_column, round(given.start * 1e9)),
         custom=_pairs(custom or (), "--custom"),
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
     out.print(imported.times, soft_wrap=True, markup=False)
-    if units := said_units(assignments, kinds):
-        out.print(
-            f"units by the message types, not by the table: {units}; where a column is in another, "
-            "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
-            soft_wrap=True,
-            markup=False,
-        )
 
 
 def _say_notes(notes: "Sequence[str]") -> None:

@@ -19,7 +19,7 @@ from bags.recordings.message_types import are_same, ros2_definition, types_in_ba
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.quality import Profile
 from bags.recordings.remote import place
-from bags.recordings.storage import Channel, Raw, Storage, defined
+from bags.recordings.storage import ALWAYS, Channel, Raw, Spans, Storage, defined
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -271,12 +271,19 @@ class Bag:
                 raise BagError(f"{self.path}: {channel.topic}: {raw.error}")
             yield Message(channel.topic, channel.msgtype, raw.log_ns, raw.data, raw.publish_ns)
 
-    def raws(self, topics: Sequence[str] | None = None, *, nearly: bool = False) -> Iterator[Raw]:
+    def raws(
+        self,
+        topics: Sequence[str] | None = None,
+        *,
+        nearly: bool = False,
+        spans: Spans = ALWAYS,
+    ) -> Iterator[Raw]:
         """As `messages`, with all that is recorded of them, and those that cannot be unpacked.
 
-        nearly: where more chunks overlap in time than memory is meant for, do not refuse.
+        nearly: where more chunks overlap in time than memory is meant for, do not refuse. spans:
+        only what was logged in one of them; nothing else is read.
         """
-        return self._storage.messages(self._keys(topics), nearly=nearly)
+        return self._storage.messages(self._keys(topics), nearly=nearly, spans=spans)
 
     def _keys(self, topics: Sequence[str] | None) -> list[int]:
         wanted = None if topics is None else set(topics)

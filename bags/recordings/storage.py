@@ -4,12 +4,14 @@ What a file is, its first bytes say, not its name. Whatever it is, its messages 
 those of ROS 1 are translated, those that rosbag2 compressed one by one are unpacked.
 """
 
-import heapq
 import shutil
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -22,7 +24,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from bags.recordings.batch import Batch, joined
 from bags.recordings.definitions import Definition
 from bags.recordings.mcap_file import Batches, McapFile
-from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, ROSBAG2, Block
+from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, NEVER, ROSBAG2, Block
 from bags.recordings.message_types import JAZZY, ros2_definition, standard_types, types_in_bag
 from bags.recordings.quality import KEY, Profile, offered
 from bags.recordings.remote import RemotePath
@@ -41,7 +43,9 @@ ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_OVERLAP_BYTES: Final = 256 * 2**20  # chunks that overlap in time are sorted in memory
 MOST_PADDING: Final = 3  # bytes that rosserial leaves after a message
 UNPACKED_BYTES: Final = 2**20  # of a file that was compressed whole, at once
-NEVER: Final = 2**63 - 1  # ns: after every message
+ALWAYS: Final = ((0, NEVER),)
+
+Spans = Sequence[tuple[int, int]]  # ns: from the first to before the second
 
 DataFile = McapFile | SqliteFile | Ros1File
 KINDS: Final = {McapFile: "mcap", SqliteFile: "sqlite3", Ros1File: "ros1"}
@@ -333,34 +337,36 @@ class Storage:
             for i in range(len(file.contents.blocks)):
                 yield from sorted(self._raws(n, i, keys), key=lambda raw: raw.place)
 
-    def messages(self, keys: Collection[int], *, nearly: bool = False) -> Iterator[Raw]:
-        """The messages by log time; equal log times as recorded.
+    def messages(
+        self, keys: Collection[int], *, nearly: bool = False, spans: Spans = ALWAYS
+    ) -> Iterator[Raw]:
+        """The messages that were logged in one of `spans`, by log time; equal ones as recorded.
 
-        Raises BagError if so many chunks overlap in time that sorting needs MAX_OVERLAP_BYTES;
-        with `nearly` they are sorted as far as that goes.
+        Chunks outside the spans are not read. Raises BagError if so many chunks overlap in time
+        that sorting needs MAX_OVERLAP_BYTES; with `nearly` they are sorted as far as that goes.
         """
         order = sorted(
             (block.start_ns, n, i)
             for n, file in enumerate(self.files)
             for i, block in enumerate(file.contents.blocks)
+            if any(block.start_ns < end and start <= block.end_ns for start, end in spans)
         )
         waiting: list[Raw] = []
-        held = 0
-        for start_ns, n, i in order:
-            while waiting and (waiting[0].log_ns < start_ns or held > MAX_OVERLAP_BYTES):
-                raw = heapq.heappop(waiting)
-                held -= len(raw.data)
-                yield raw
-            for raw in self._raws(n, i, keys):
-                heapq.heappush(waiting, raw)
-                held += len(raw.data)
-            if held > MAX_OVERLAP_BYTES and not nearly:
-                raise BagError(
-                    f"{self.files[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes overlap "
-                    "in time; sort the file first (`mcap sort`)"
-                )
-        while waiting:
-            yield heapq.heappop(waiting)
+        for (_, n, i), (later_ns, *_) in pairwise([*order, (NEVER,)]):
+            waiting += self._raws(n, i, keys)
+            waiting.sort()
+            ready = bisect_left(waiting, later_ns, key=attrgetter("log_ns"))
+            if sum(len(raw.data) for raw in waiting[ready:]) > MAX_OVERLAP_BYTES:
+                if not nearly:
+                    raise BagError(
+                        f"{self.files[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes "
+                        "overlap in time; sort the file first (`mcap sort`)"
+                    )
+                ready = len(waiting)
+            for raw in waiting[:ready]:
+                if any(start <= raw.log_ns < end for start, end in spans):
+                    yield raw
+            waiting = waiting[ready:]
 
     def _raws(self, n: int, i: int, keys: Collection[int]) -> Iterator[Raw]:
         file = self.files[n]

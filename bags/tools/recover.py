@@ -13,9 +13,9 @@ from bags.recordings.bag import Bag
 from bags.recordings.description import METADATA
 from bags.recordings.message_types import decode, types_in_bag
 from bags.recordings.storage import Channel
-from bags.recordings.writer import RESERVE, BagWriter
+from bags.recordings.writer import RESERVE
 from bags.signals.timing import missing
-from bags.tools.copying import copy_messages
+from bags.tools.convert import convert
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -46,12 +46,10 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -
     back and compared. Raises BagError if nothing can be read or if `out` exists.
     """
     path, out = Path(path), Path(out)
-    with Bag(path, salvage=True) as bag, BagWriter(out, custom=bag.custom) as writer:
-        copied = copy_messages([bag], [writer], lambda _: writer, nearly=True, progress=progress)
-        statements = bag.statements
-        if not copied.messages and copied.notes:
-            raise BagError(f"{path}: no message can be read: {'; '.join(copied.notes[:5])}")
-        counts = dict(writer.counts)
+    with Bag(path, salvage=True) as bag:
+        copied = convert([bag], out, nearly=True, progress=progress)
+        statements, topics = bag.statements, bag.topics
+    counts = {topic: copied.sums.get(topic, (0, 0))[0] for topic in topics}
     lost = (*copied.notes, *_verify(out, copied.sums))
     return Recovery(out, counts, lost, statements)
 
@@ -110,8 +108,8 @@ def repair(bag: Path) -> int:
         raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
     with tempfile.TemporaryDirectory(dir=bag.parent, prefix=f".{bag.name}.repair.") as folder:
         whole = Path(folder) / bag.name
-        with Bag(bag, salvage=True) as old, BagWriter(whole, custom=old.custom) as writer:
-            copied = copy_messages([old], [writer], lambda _: writer, nearly=True)
+        with Bag(bag, salvage=True) as old:
+            copied = convert([old], whole, nearly=True)
         for name in (f"{bag.name}.mcap", METADATA):  # without metadata.yaml it is still unfinished
             (whole / name).replace(bag / name)
     (bag / RESERVE).unlink(missing_ok=True)

@@ -24,6 +24,7 @@ from bags.recordings.batch import Batch
 from bags.recordings.cdr import Numbers
 from bags.recordings.message_types import decode, fields_of
 from bags.recordings.storage import NEVER
+from bags.recordings.writer import refuse_existing
 from bags.signals.columns import Columns, TopicReader, joined_columns
 from bags.signals.expressions import Expression, Running
 from bags.signals.reader import expanded
@@ -312,8 +313,7 @@ def _new(out: Path | str, form: str) -> Path:
         raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
     if form == "parquet" and find_spec("pyarrow") is None:
         raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv")
-    if Path(out).exists():
-        raise BagError(f"{out} exists already; take another name or move it away")
+    refuse_existing(Path(out))
     return Path(out)
 
 
