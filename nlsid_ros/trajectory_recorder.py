@@ -179,17 +179,17 @@ class TrajectoryRecorder(ManagedNode):
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
     ) -> None:
         arrival_ns = self._clock_of_log.at(info["received_timestamp"])
-        stamp_ns = arrival_ns
+        publish_ns = arrival_ns
         if stamped:
             with suppress(BagError):  # serialised by rules whose header we do not know
                 stamp_ns = header_stamp_ns(data)
-        publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
+                publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
         number = info["publication_sequence_number"]
         arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns, number)
         if self._recent is not None:
             self._recent.add(arrival)
         if self._recording is not None:
-            self._recording.add(arrival, stamp_ns)
+            self._recording.add(arrival)
 
     def lose(self, topic: str, count: int) -> None:
         """Count messages that could not wait."""

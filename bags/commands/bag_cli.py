@@ -4,7 +4,6 @@ A command imports what it runs when it is called.
 """
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +21,7 @@ from bags.commands.options import (
     flat,
 )
 from bags.commands.progress import progress_bar
-from bags.tools.copies import Into, What
+from bags.tools.copies import Into, Rows, What
 from nlsid_core.errors import BagError, DataError
 
 if TYPE_CHECKING:
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
 PICTURE = Path("signals.png")
-PROGRESS_AFTER = 2.0  # s of work before a progress bar appears
 
 bag_app = typer.Typer(
     name="bag",
@@ -42,13 +40,6 @@ bag_app = typer.Typer(
 )
 out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
 err = Console(stderr=True)
-
-
-class Format(StrEnum):
-    """What a table is written as."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
@@ -72,13 +63,6 @@ class Source:
     ] = False
 
 
-@dataclass(frozen=True)
-class Timed(Source):
-    """The same, by which stamps."""
-
-    clock: ClockOption = Clock.HEADER
-
-
 @bag_app.command()
 def info(
     bags: BagsArgument,
@@ -98,7 +82,7 @@ def info(
     from bags.tools.info import bag_info
 
     for path in expand_bags(bags):
-        with progress_bar("reading", after=PROGRESS_AFTER) as progress:
+        with progress_bar("reading") as progress:
             types = _definitions(definitions)
             found = bag_info(path, messages=messages, definitions=types, progress=progress)
         if as_json:
@@ -121,7 +105,7 @@ def signals(
 
     with (
         Bag(bag, unfinished=True, definitions=_definitions(definitions)) as source,
-        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+        progress_bar("reading") as progress,
     ):
         found = bag_signals(source, progress=progress)
     if as_json:
@@ -134,9 +118,10 @@ def signals(
 @flat
 def plot(
     bag: BagArgument,
-    source: Timed,
+    source: Source,
     signals: SignalsOption = None,
-    picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")] = PICTURE,
+    clock: ClockOption = Clock.HEADER,
+    picture: Annotated[Path, typer.Option("--out", help="A .png or .svg file.")] = PICTURE,
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
@@ -148,13 +133,13 @@ def plot(
     from bags.pictures.signal_plots import draw_signals, write_picture
 
     drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
-    texts = [Grid(clock=source.clock.value).path(text, response=True) for text in drawn]
+    texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
     with (
         _opened(bag, source) as opened,
-        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+        progress_bar("reading") as progress,
     ):
         samples = read_signals(opened, texts, progress=progress)
-    write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
+    write_picture(picture, draw_signals(list(samples.values()), title=str(bag)))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
 
 
@@ -202,7 +187,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
     """
     from bags.tools.recover import recover
 
-    with progress_bar("recovering", after=PROGRESS_AFTER) as progress:
+    with progress_bar("recovering") as progress:
         found = recover(bag, bag_out or _beside(bag, "recovered"), progress=progress)
     for topic, count in found.counts.items():
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
@@ -231,7 +216,7 @@ def export_command(
     bag: BagArgument,
     source: Source,
     target: OutOption = None,
-    form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
+    form: Annotated[str, typer.Option("--format", "-f", help="csv or parquet.")] = "csv",
     signals: Annotated[
         list[str] | None,
         typer.Option("--signal", "-s", help="Signals, or topics; default: every field of all."),
@@ -247,11 +232,9 @@ def export_command(
     target = target or _beside(bag, "tables")
     with (
         _opened(bag, source) as opened,
-        progress_bar("exporting", after=PROGRESS_AFTER) as progress,
+        progress_bar("exporting") as progress,
     ):
-        rows = export_topics(
-            opened, target, form=form.value, signals=signals or (), progress=progress
-        )
+        rows = export_topics(opened, target, form=form, signals=signals or (), progress=progress)
     for file, count in rows.counts.items():
         out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
     for what in rows.left_out:
@@ -281,7 +264,7 @@ def convert_command(
     target = bag_out or _beside(folders[0], "converted")
     with ExitStack() as stack:
         opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
-        progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
+        progress = stack.enter_context(progress_bar("copying"))
         copied = convert(opened, target, what, into, progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
@@ -289,22 +272,11 @@ def convert_command(
     _say_notes(copied.notes)
 
 
-@dataclass(frozen=True)
-class TableRows:
-    """When the rows of tables were."""
-
-    period: Annotated[float | None, typer.Option(help="s between rows.")] = None
-    time_column: Annotated[
-        str | None, typer.Option("--time", help="The column with the rows' times in s.")
-    ] = None
-    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0
-
-
 @bag_app.command("import")
 @flat
 def import_command(
     table: Annotated[Path, typer.Argument(help="A CSV file.")],
-    given: TableRows,
+    rows: Rows,
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
@@ -323,7 +295,7 @@ def import_command(
     ] = None,
 ) -> None:
     """Write columns of a table as a bag of standard messages, named as the table."""
-    from bags.tools.importing import Rows, import_table
+    from bags.tools.importing import import_table
 
     bag_out = bag_out or Path(table.stem)
     imported = import_table(
@@ -331,7 +303,7 @@ def import_command(
         bag_out,
         assignments or (),
         types=_pairs(types or (), "--type"),
-        rows=Rows(given.period, given.time_column, round(given.start * 1e9)),
+        rows=rows,
         custom=_pairs(custom or (), "--custom"),
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())

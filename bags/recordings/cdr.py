@@ -427,13 +427,10 @@ class _Walk:
 
     def _check_end(self) -> None:
         if self._at > len(self._data):
-            raise self._too_short()
-
-    def _too_short(self) -> BagError:
-        return BagError(
-            f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
-            f"one with its lengths has at least {self._at}"
-        )
+            raise BagError(
+                f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
+                f"one with its lengths has at least {self._at}"
+            )
 
     def _count_step(self) -> None:
         self._steps += 1

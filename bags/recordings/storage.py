@@ -335,7 +335,7 @@ class Storage:
         """The messages in the order of the files."""
         for n, file in enumerate(self.files):
             for i in range(len(file.contents.blocks)):
-                yield from sorted(self._raws(n, i, keys), key=lambda raw: raw.place)
+                yield from sorted(self._raws(n, i, keys), key=attrgetter("place"))
 
     def messages(
         self, keys: Collection[int], *, nearly: bool = False, spans: Spans = ALWAYS

@@ -1,4 +1,4 @@
-"""What is chosen of bags that are copied, and how the copy is written: the options of `convert`."""
+"""The options of `nlsid bag convert` and `import`: what is copied, and how it is written."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -29,3 +29,16 @@ class Into:
     compression: Annotated[str, "Of mcap: zstd, lz4 or none."] = "zstd"
     every: Annotated[float | None, "s per part: OUT_01, OUT_02, ..."] = None
     max_size: Annotated[float | None, "MB per part."] = None
+
+
+@dataclass(frozen=True)
+class Rows:
+    """When the rows of a table were recorded: `period` s apart, or at the times of a column.
+
+    Without a unit behind the column, `stamp|unit(ms)`, its times are in what the title says, `t_ms`
+    or `t [ms]`; of times since 1970, in which of s, ms, us and ns can be meant; else in s.
+    """
+
+    period: Annotated[float | None, "s between rows."] = None
+    time: Annotated[str | None, "The column with the rows' times."] = None
+    start: Annotated[float, "s since 1970 of time 0."] = 0.0

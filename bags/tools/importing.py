@@ -20,6 +20,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.reader import stamp_text
 from bags.signals.signal import SignalPath
 from bags.signals.units import UNITS
+from bags.tools.copies import Rows
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
@@ -29,22 +30,6 @@ SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
 _TITLE: Final = re.compile(r".+?(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """When the rows of a table were recorded: `period` s apart, or at the times of a column.
-
-    Attributes:
-        period: s.
-        time: the column, and its unit, `stamp|unit(ms)`. Without a unit it is what the title says,
-            `t_ms` or `t [ms]`; of times since 1970, which of s, ms, us and ns can be meant; else s.
-        start_ns: of time 0, since 1970.
-    """
-
-    period: float | None = None
-    time: str | None = None
-    start_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -167,7 +152,7 @@ def import_table(
     if not topics:
         raise BagError("nothing is assigned, so there is nothing to write")
     times, unit = _times(tables, rows)
-    stamps = _stamps(times, rows.start_ns)
+    stamps = _stamps(times, round(rows.start * 1e9))
     streams = []
     for topic, columns in topics.items():
         if topic not in types:

@@ -11,8 +11,7 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.description import METADATA
-from bags.recordings.message_types import decode, types_in_bag
-from bags.recordings.storage import Channel
+from bags.recordings.message_types import decode
 from bags.recordings.writer import RESERVE
 from bags.signals.timing import missing
 from bags.tools.convert import convert
@@ -64,7 +63,7 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             topic = channel.topic
             if channel.encoding == "cdr" and channel.key not in looked_into:
                 looked_into.add(channel.key)
-                if why := _unreadable(channel, batch.data(0)):
+                if why := _unreadable(bag, topic, batch.data(0)):
                     yield f"{topic}: its messages are kept, and cannot be read: {why}"
             count, total = found.get(topic, (0, 0))
             total += sum(zlib.crc32(batch.data(k)) for k in range(len(batch)))
@@ -78,14 +77,14 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             yield f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
 
 
-def _unreadable(channel: Channel, data: bytes) -> str:
+def _unreadable(bag: Bag, topic: str, data: bytes) -> str:
     """Why a message is none of its type; empty if it is, or if its type is not known."""
     try:
-        types = types_in_bag(channel.msgtype, channel.definition)
+        kind = bag.types_on(topic)
     except BagError:
         return ""
     try:
-        decode(data, channel.msgtype, types)
+        decode(data, *kind)
     except BagError as error:
         return str(error)
     return ""

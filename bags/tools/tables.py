@@ -135,7 +135,7 @@ def frame(
 
     parts: dict[str, list[Table]] = {}
     with nullcontext(bag) if isinstance(bag, Bag) else Bag(bag) as source:
-        tables = _wanted(source, wanted, None)
+        tables = _wanted(source, wanted, [])
         for topic, table in _tables(source, tables, None, silent):
             parts.setdefault(topic, []).append(table)
         frames = []
@@ -160,11 +160,11 @@ def frame(
 
 
 def _wanted(
-    bag: Bag, texts: Sequence[str], left_out: list[str] | None
+    bag: Bag, texts: Sequence[str], left_out: list[str]
 ) -> dict[str, dict[str, Expression]]:
     """The columns of each topic; of none that are named, of all that have messages.
 
-    left_out: gets what cannot be read; None: that is an error.
+    left_out: gets what of all topics cannot be read.
     """
     found: dict[str, dict[str, Expression]] = {}
     for text in texts:
@@ -172,35 +172,34 @@ def _wanted(
             for signal in expanded(bag, [text]).values():
                 found.setdefault(signal.path.topic, {})[str(signal).partition(":")[2]] = signal
         else:
-            found[text] = _every_field(bag, text, left_out if left_out is not None else [])
-    filled = {channel.topic for channel in bag.channels if channel.count}
-    for topic in () if texts else [topic for topic in bag.topics if topic in filled]:
+            found[text] = _every_field(bag, text)
+    for topic in () if texts else dict.fromkeys(c.topic for c in bag.channels if c.count):
         try:
-            found[topic] = _every_field(bag, topic, left_out if left_out is not None else [])
+            found[topic] = _every_field(bag, topic)
+            _leave_out_large(bag, topic, found[topic], left_out)
         except BagError as error:
-            if left_out is None:
-                raise
+            found.pop(topic, None)
             left_out.append(str(error))
     return found
 
 
-def _every_field(bag: Bag, topic: str, left_out: list[str]) -> dict[str, Expression]:
-    """Each field of a topic's messages, those of messages in it by their paths.
+def _every_field(bag: Bag, topic: str) -> dict[str, Expression]:
+    """Each field of a topic's messages, those of messages in it by their paths."""
+    texts = _fields(*bag.types_on(topic))
+    return {t.removesuffix("[*]"): Expression(SignalPath.parse(f"{topic}:{t}")) for t in texts}
 
-    Arrays with more than MAX_ELEMENTS in the first message are left out.
-    """
-    msgtype, types = bag.types_on(topic)
-    first = next((batch for _, batch in bag.batches([topic])), None)
-    message = None if first is None else decode(first.data(0), msgtype, types)
-    found = {}
-    for text in _fields(msgtype, types):
-        path, name = SignalPath.parse(f"{topic}:{text}"), text.removesuffix("[*]")
-        value = [] if message is None else _value(message, path)
-        if isinstance(value, str) or np.size(value) <= MAX_ELEMENTS:
-            found[name] = Expression(path)
-        else:
+
+def _leave_out_large(
+    bag: Bag, topic: str, columns: dict[str, Expression], left_out: list[str]
+) -> None:
+    """Leave out arrays with more than MAX_ELEMENTS in the first message."""
+    first = next(batch for _, batch in bag.batches([topic]))
+    message = decode(first.data(0), *bag.types_on(topic))
+    for name, signal in list(columns.items()):
+        value = _value(message, signal.path)
+        if not isinstance(value, str) and np.size(value) > MAX_ELEMENTS:
             left_out.append(f"{topic}:{name}: {np.size(value)} elements; name those you need")
-    return found
+            del columns[name]
 
 
 def _fields(msgtype: str, types: Typestore) -> Iterator[str]:

@@ -26,8 +26,9 @@ from bags.recordings.writer import BagWriter
 from bags.samples import schunk
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
+from bags.tools.copies import Rows
 from bags.tools.fitness import Level, check_fitness
-from bags.tools.importing import Rows, import_table
+from bags.tools.importing import import_table
 from bags.tools.info import bag_info
 from nlsid import frame
 from nlsid_core.errors import BagError, DataError
@@ -237,7 +238,7 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path:
 
 
 @pytest.mark.pictures
-@pytest.mark.parametrize("name", ["a.png", "a.html", "a.svg"])
+@pytest.mark.parametrize("name", ["a.png", "a.svg"])
 def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
     run("plot", bag, "--out", tmp_path / name, "-s", SPEED, "-s", f"{SPEED}|derivative(0.2 s)")
     content = (tmp_path / name).read_bytes()
@@ -610,7 +611,7 @@ TABLES: list[tuple[str, Rows, list[float] | str]] = [
         BY_T,
         f"^the time of row 1 is 2147483648 s {SEVENTIES}",
     ),
-    ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start_ns=10**8), [1.0, 2.0]),
+    ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start=0.1), [1.0, 2.0]),
 ]
 
 

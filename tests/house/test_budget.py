@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_971,
-    ("bags",): 12_241,
+    ("bags",): 12_041,
     ("nlsid_ros",): 2_665,
-    ("tests",): 23_543,
+    ("tests",): 23_491,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
