@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 
 from bags.recordings.bag import Bag
+from bags.recordings.mcap_records import NEVER
 from bags.recordings.message_types import (
     are_same,
     header_stamp_ns,
@@ -28,7 +29,7 @@ from bags.recordings.message_types import (
     standard_types,
 )
 from bags.recordings.quality import Profile
-from bags.recordings.storage import NEVER, Channel, Raw, Spans
+from bags.recordings.storage import Channel, Raw, Spans
 from bags.recordings.writer import BagWriter, refuse_existing
 from bags.tools.copies import Into, What
 from nlsid_core.errors import BagError

@@ -22,8 +22,8 @@ from rosbags.typesys.store import Typestore
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
 from bags.recordings.cdr import Numbers
+from bags.recordings.mcap_records import NEVER
 from bags.recordings.message_types import decode, fields_of
-from bags.recordings.storage import NEVER
 from bags.recordings.writer import refuse_existing
 from bags.signals.columns import Columns, TopicReader, joined_columns
 from bags.signals.expressions import Expression, Running
