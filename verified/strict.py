@@ -17,7 +17,6 @@ DIGEST = re.compile(r"sha256:[0-9a-f]{64}\Z")
 DEGREES = 63
 PHASES = 8
 TEXT, STATES, SIGNALS, POWER, SPLITS = 200, 120, 50, 20, 40
-ORDER = 200  # of a matrix
 IMPLICIT_STATES, IMPLICIT_INPUTS = 30, 60
 MONOMIALS, TUBES, TERMS, FACTORS = 20_000, 8, 200, 4
 COUNT, PLAN, MOST = 10**9, 10**6, 2**53
@@ -32,17 +31,13 @@ class Refused(Exception):  # noqa: N818 - says what the pages do not allow
 
 @dataclass(frozen=True)
 class Sizes:
-    """n states, m unknowns, p outputs, recorded inputs, and entries of a box that may be split.
-
-    ends: bounds of the leading coefficient may be stated.
-    """
+    """n states, m unknowns, p outputs, recorded inputs, and entries of a box that may be split."""
 
     n: int
     m: int
     p: int
     inputs: int
     box: int
-    ends: bool = False
 
 
 def need(holds: bool, said: str) -> None:
@@ -206,10 +201,7 @@ def _affine(model: dict[str, Any]) -> Sizes:
     for low, high in matrix(model["u_range"], "u_range", inputs, 2):
         need(low < high, "u_range: low >= high")
     word(model["on_out_of_range"], "on_out_of_range", ("clip", "refuse"))
-    leading, *others = (G["exponents"] for G in model["G"])
-    ends = p == 1 and not any(any(e) for rows in others for e in rows)
-    ends = ends and all(sum(e) <= 2 for e in leading) and 0 < box < ORDER
-    return Sizes(lags * p, p, p, inputs, box, ends)
+    return Sizes(lags * p, p, p, inputs, box)
 
 
 def _monotone(model: dict[str, Any]) -> Sizes:
@@ -293,15 +285,7 @@ def tree(value: Any, where: str, sizes: Sizes, forms: int | None, depth: int = 0
         for part in listed(value["parts"], where, 2, 2):
             tree(part, where, sizes, forms, depth + 1)
         return
-    members(value, where, "N", "ends")
-    if "ends" in value:
-        need(sizes.ends, f"{where}: ends are of one quadratic leading coefficient")
-        names = [f"{name}{more}" for more in ("", "_weights") for name in ("low", "high")]
-        ends = members(value["ends"], f"{where}.ends", " ".join(names))
-        for name in names[:2]:
-            real(ends[name], f"{where}.ends")
-        for name in names[2:]:
-            need(min(reals(ends[name], f"{where}.ends", sizes.box)) >= 0, f"{where}: weights >= 0")
+    members(value, where, "N")
     if forms is None:
         matrix(value["N"], where, sizes.m + sizes.n, sizes.m)
         return

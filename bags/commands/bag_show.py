@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 WORDS = ("good", "look", "bad")  # of the levels of a finding
 STYLES = ("green", "dark_orange3", "red")
 VERDICTS = ("fit for identification", "usable, with care", "not fit for identification")
-JITTER_KEY = "jitter: intervals of <0.5 0.5 0.8 0.95 1.05 1.25 2 >5 times the median"
 
 
 def show_info(console: Console, info: BagInfo) -> None:
@@ -52,7 +51,7 @@ def show_info(console: Console, info: BagInfo) -> None:
             Text(topic.msgtype.replace("/msg/", "/")),
             str(topic.count),
             "-" if math.isnan(topic.times.rate) else f"{topic.times.rate:.4g} Hz",
-            topic.times.jitter,
+            "-" if math.isnan(topic.times.jitter) else f"{topic.times.jitter:.3g} s",
             str(topic.times.gaps) if topic.times.gaps else "-",
             "-" if math.isnan(topic.times.longest) else f"{topic.times.longest:.3g} s",
             "-" if topic.messages is None else _size(topic.messages.size),
@@ -64,7 +63,6 @@ def show_info(console: Console, info: BagInfo) -> None:
             _say(console, f"{topic.topic}: {what}")
     for key, value in info.custom.items():
         _say(console, f"{key}: {value}")
-    console.print(JITTER_KEY, style="dim", highlight=False)
 
 
 def _said_messages(found: Messages) -> list[str]:

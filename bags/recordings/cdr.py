@@ -240,7 +240,7 @@ def _view(buffer: Buffer, kind: str) -> Any:
     return np.ndarray((max(0, len(buffer) - dtype.itemsize + 1),), dtype, buffer, strides=(1,))
 
 
-def _is_strings(description: FieldDesc) -> bool:
+def is_strings(description: FieldDesc) -> bool:
     """Whether it is an array of strings."""
     if description[0] not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         return False
@@ -296,7 +296,7 @@ class _Walk:
             here = [(i, depth, hop) for i, depth, hop in hops if hop.field == name]
             if not self._missing and not self._of.is_static(description):
                 return False
-            if name in key_fields or (here and _is_strings(description)):
+            if name in key_fields or (here and is_strings(description)):
                 keys[name] = self._strings(description)
                 for i, _, hop in here:
                     found: Any = keys[name]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from io import StringIO
-from itertools import combinations
+from itertools import combinations, repeat
 from pathlib import Path
 from typing import Final
 
@@ -97,7 +97,7 @@ def convert(
     unreadable: dict[tuple[str, str], int] = {}
     total = sum(channel.count for known in channels for channel in known.values())
     streams = [
-        _numbered(n, bag.raws(list(topics), nearly=nearly, spans=spans))
+        zip(bag.raws(list(topics), nearly=nearly, spans=spans), repeat(n))
         for n, bag in enumerate(bags)
     ]
     with _written(out, into, bags, channels) as parts:
@@ -127,11 +127,6 @@ def convert(
         copied.notes.append(f"{into.storage} keeps no {LEFT_OUT}")
     copied.parts = parts.paths
     return copied
-
-
-def _numbered(n: int, raws: Iterator[Raw]) -> Iterator[tuple[Raw, int]]:
-    for raw in raws:
-        yield raw, n
 
 
 def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:

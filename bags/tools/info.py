@@ -23,8 +23,6 @@ from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
 GAP: Final = 5.0  # median intervals without a message
-BINS: Final = np.array([0.0, 0.5, 0.8, 0.95, 1.05, 1.25, 2.0, 5.0, np.inf])  # median intervals
-BARS: Final = " ▁▂▃▄▅▆▇█"
 LOST: Final = " lost"  # how the recorder's counts of lost messages end, after the topic
 
 
@@ -33,25 +31,16 @@ class LogTimes:
     """When messages were logged, in ns; of the intervals, in s, NaN with fewer than two messages.
 
     rate: Hz, how many intervals there are by how long they last together. interval: the median.
-    histogram: intervals per bin of BINS, which are in median intervals.
+    jitter: s, by which 95 % of them differ from it at most. gaps: intervals above GAP medians.
     """
 
     first_ns: int = 0
     last_ns: int = 0
     rate: float = float("nan")
     interval: float = float("nan")
-    histogram: tuple[int, ...] = ()
+    jitter: float = float("nan")
     gaps: int = 0
     longest: float = float("nan")
-
-    @property
-    def jitter(self) -> str:
-        """The histogram as a line of bars, from half the median interval to five times it."""
-        most = max(self.histogram, default=0)
-        if not most:
-            return ""
-        height = [np.ceil((len(BARS) - 1) * n / most) for n in self.histogram]
-        return "".join(BARS[int(h)] for h in height)
 
 
 @dataclass(frozen=True)
@@ -248,7 +237,7 @@ def _log_times(log_ns: IntArray) -> LogTimes:
         last_ns,
         1e9 * len(intervals) / (last_ns - first_ns) if last_ns > first_ns else float("nan"),
         median,
-        tuple(np.histogram(intervals / scale, BINS)[0].tolist()),
+        float(np.quantile(np.abs(intervals - median), 0.95)),
         int((intervals > GAP * scale).sum()),
         float(np.max(intervals)),
     )

@@ -10,7 +10,7 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.identification.proofs.stability import prove_stability, storage_on
 from nlsid_core.kernel import increments
-from nlsid_core.kernel.files import Node, parse
+from nlsid_core.kernel.files import parse
 from nlsid_core.kernel.increments import Box
 from nlsid_core.kernel.models import read_model
 from nlsid_core.models import StableModel
@@ -65,8 +65,8 @@ class Form:
             )
         F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
         leaves: list[FloatArray] = [
-            np.array(form.E.vertices(part, ends), dtype=np.float64)
-            for part, ends in _parts(proof.multipliers, form.E.box)
+            np.array(form.E.vertices(part), dtype=np.float64)
+            for part in _parts(proof.multipliers, form.E.box)
         ]
         inputs = None
         if form.linear is not None:
@@ -130,14 +130,12 @@ def _closed(rows: FloatArray, E: FloatArray) -> FloatArray:
     return np.asarray(rows[:, m:] - rows[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]))
 
 
-def _parts(tree: Json | None, box: Box) -> list[tuple[Box, Node | None]]:
-    """The leaves' parts of the box, and what bounds E there."""
+def _parts(tree: Json | None, box: Box) -> list[Box]:
+    """The leaves' parts of the box."""
     if tree is None:
         return []
     if "split" not in tree:
-        if "ends" not in tree:
-            return [(box, None)]
-        return [(box, parse(files.encode(tree["ends"]), "ends"))]
+        return [box]
     i = tree["split"]
     low, high = box[i]
     middle = (low + high) / 2

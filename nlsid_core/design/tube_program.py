@@ -295,5 +295,4 @@ def _with_multipliers(tree: Json, leaves: list[list[FloatArray]]) -> Json:
     if "split" in tree:
         parts = [_with_multipliers(part, leaves) for part in tree["parts"]]
         return {"split": tree["split"], "parts": parts}
-    ends = {"ends": tree["ends"]} if "ends" in tree else {}
-    return {"N": [N.tolist() for N in leaves.pop(0)]} | ends
+    return {"N": [N.tolist() for N in leaves.pop(0)]}

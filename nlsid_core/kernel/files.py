@@ -212,6 +212,11 @@ def itself(node: Node) -> Node:
     return node
 
 
+def no_more(node: Node) -> None:
+    """A reader of what left: nothing makes it since version 0.3."""
+    raise Rejected(f"{node.where} is not decided since version 0.3", "left")
+
+
 def whole(least: int, most: int = MAX_WHOLE) -> Reader:
     """A reader of a whole number in [least, most]."""
     return lambda node: node.whole(least, most)
@@ -222,10 +227,12 @@ def each(reader: Callable[[Node], Any], least: int, most: int = MAX_ENTRIES) -> 
     return lambda node: list(map(reader, node.items(least, most)))
 
 
-def one_of(*texts: str, reason: str = "malformed") -> Reader:
-    """A reader of one of these texts."""
+def one_of(*texts: str, reason: str = "malformed", former: Sequence[str] = ()) -> Reader:
+    """A reader of one of these texts; former ones are refused by name."""
 
     def read(node: Node) -> str:
+        if node.value in former:
+            no_more(Node(node.value, f"{node.where} {node.value}"))
         found, wanted = node.text(), " or ".join(map(repr, texts))
         node.require({f"should be {wanted}, not {found!r}": found in texts}, reason)
         return found

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .files import Node, Table, Terms, each, itself, one_of
+from .files import Node, Table, Terms, each, itself, no_more, one_of
 
 MAX_STATES, MAX_WINDOW = 30, 60  # of x, and of w
 
@@ -14,7 +14,8 @@ IMPLICIT: Table = {
     "inputs": each(Node.text, 0, MAX_WINDOW),
     "monotonicity": (),
     "h": itself,
-    **dict.fromkeys(("shift?", "centre?", "y?", "u?", "window?", "training?", "bags?"), itself),
+    **dict.fromkeys(("shift?", "y?", "u?", "window?", "training?", "bags?"), itself),
+    "centre?": no_more,
 }
 
 
@@ -32,8 +33,8 @@ def read_implicit(node: Node) -> Implicit:
             "a shift gives the states without an equation": bool(given["shift"]) == (k < n),
         }
     )
-    for name, count, size in (("h", k + n + m, k), ("shift", n + m, n - k), ("centre", k, k)):
-        given[name] = _read_stack(given[name], count, size) if given[name] else []
+    given["h"] = _read_stack(given["h"], k + n + m, k)
+    given["shift"] = _read_stack(given["shift"], n + m, n - k) if k < n else []
     return given
 
 

@@ -18,9 +18,9 @@ from itertools import chain, product
 from math import comb, prod
 from types import SimpleNamespace
 
-from .exact import MAX_ORDER, Matrix, Rows, combined, definite, scaled, transposed
+from .exact import Matrix, Rows, combined, definite, scaled, transposed
 from .exact import product as times
-from .files import Node, Table, Terms, limit, refuse_if
+from .files import Node, Terms, limit, no_more, refuse_if
 from .signals import Signal
 
 MAX_POWER = 20  # of a variable in a monomial of E
@@ -37,21 +37,41 @@ class Hull:
     """E(θ), each (m, m + n), for θ in a box.
 
     ray: E(θ) may have any multiple of [1, 0] added. whole: so many entries of the box, the first,
-    cannot be split. bounded: a proof may state the ends of the first entry of E.
+    cannot be split.
     """
 
     E: Entries
     box: Box = field(default_factory=list)
     ray: bool = False
     whole: int = 0
-    bounded: bool = False
 
-    def vertices(self, box: Box, ends: Node | None) -> list[Matrix]:
-        """Matrices whose convex hull holds E(θ) for θ in a part of the box."""
-        if ends is None:
-            return _bernstein(self.E, box)
-        ends.require({"ends are for state-affine models": self.bounded})
-        return _between(self.E, box, ends)
+    def vertices(self, box: Box) -> list[Matrix]:
+        """The Bernstein coefficients of E(θ) on a part of the box: their hull holds its values.
+
+        On [lo, hi], at index k of degree d, θ^e has the coefficient
+        Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j).
+        Where they differ in one entry only, the two extreme ones have the same hull.
+        """
+        powers = {e for row in self.E for entry in row for e, _ in entry}
+        highest = [max(e[i] for e in powers) for i in range(len(box))]
+        limit(max(highest, default=0), MAX_POWER, "the power of a variable")
+        degrees = [
+            most if low < high else 0 for most, (low, high) in zip(highest, box, strict=True)
+        ]
+        limit(prod(d + 1 for d in degrees), MAX_VERTICES, "vertices of a box")
+        tables = [
+            [[_weight(e, k, d, *ends) for k in range(d + 1)] for e in range(most + 1)]
+            for most, d, ends in zip(highest, degrees, box, strict=True)
+        ]
+        found: list[Matrix] = []
+        for k in product(*(range(d + 1) for d in degrees)):
+            weights = {e: prod(t[e[i]][k[i]] for i, t in enumerate(tables)) for e in powers}
+            found.append(
+                [[Fraction(sum(c * weights[e] for e, c in p)) for p in row] for row in self.E]
+            )
+        columns = zip(*(chain.from_iterable(matrix) for matrix in found), strict=True)
+        varying = sum(any(entry != column[0] for entry in column) for column in columns)
+        return found if varying > 1 else [min(found), max(found)][: 1 + varying]
 
 
 @dataclass(frozen=True)
@@ -96,8 +116,7 @@ def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, M
 
     `multipliers` is a leaf {N}, N of M's order × m, a list of one for each gap if there are
     several; or {split, parts}: the entry of the box that is halved, and the multipliers of the
-    lower and of the upper half. A leaf may state `ends` beside N: bounds of the one entry of E that
-    varies, in the place of the vertices.
+    lower and of the upper half.
     """
     m, size = model.unknowns, len(gaps[0][1])
     refuse_if((multipliers is None) != (m == 0), "multipliers are for models with ν, and needed")
@@ -105,24 +124,25 @@ def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, M
         for what, M in gaps:
             definite(M, what)
         return
-    for box, leaf in _leaves(multipliers, model.E, model.E.box):
-        given = leaf["N"]
+    for box, given in _leaves(multipliers, model.E, model.E.box):
         Ns = given.array(len(gaps), size, m) if len(gaps) > 1 else [given.array(size, m)]
         pointed = all(N[0][0] >= 0 and not any(row[0] for row in N[1:]) for N in Ns)
         shape = {"with a ray N should be (T >= 0, 0, ..., 0)": pointed or not model.E.ray}
         given.require(shape, "not_below")
-        for E in model.E.vertices(box, leaf.get("ends")):
+        for E in model.E.vertices(box):
             wide = [row + [Fraction(0)] * (size - len(row)) for row in E]
             for (what, M), N in zip(gaps, Ns, strict=True):
                 cross = times(N, wide)
                 definite(combined(M, combined(cross, transposed(cross))), what)
 
 
-def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box, dict[str, Node]]]:
-    """Every leaf of the tree, and its part of the box."""
+def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box, Node]]:
+    """The N of every leaf of the tree, and its part of the box."""
     parts = node.members("", "N ends split parts")
-    if set(parts) == {"N"} or (set(parts) == {"N", "ends"} and box):
-        yield box, parts
+    if "ends" in parts:
+        no_more(parts["ends"])
+    if set(parts) == {"N"}:
+        yield box, parts["N"]
         return
     splits = set(parts) == {"split", "parts"} and box
     node.require({"should be a multiplier N, or split and parts of a box": splits})
@@ -134,66 +154,9 @@ def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box
         yield from _leaves(part, E, [*box[:i], half, *box[i + 1 :]], depth + 1)
 
 
-def _bernstein(E: Entries, box: Box) -> list[Matrix]:
-    """The Bernstein coefficients of E(θ) on a box: their convex hull holds its values.
-
-    On [lo, hi], θ^e has the coefficient Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j) at index k
-    of degree d. Where they differ in one entry only, the two extreme ones have the same hull.
-    """
-    powers = {e for row in E for entry in row for e, _ in entry}
-    highest = [max(e[i] for e in powers) for i in range(len(box))]
-    limit(max(highest, default=0), MAX_POWER, "the power of a variable")
-    degrees = [most if low < high else 0 for most, (low, high) in zip(highest, box, strict=True)]
-    limit(prod(d + 1 for d in degrees), MAX_VERTICES, "vertices of a box")
-    tables = [
-        [[_weight(e, k, d, *ends) for k in range(d + 1)] for e in range(most + 1)]
-        for most, d, ends in zip(highest, degrees, box, strict=True)
-    ]
-    found: list[Matrix] = []
-    for k in product(*(range(d + 1) for d in degrees)):
-        weights = {e: prod(t[e[i]][k[i]] for i, t in enumerate(tables)) for e in powers}
-        found.append([[Fraction(sum(c * weights[e] for e, c in p)) for p in row] for row in E])
-    columns = zip(*(chain.from_iterable(matrix) for matrix in found), strict=True)
-    varying = sum(any(entry != column[0] for entry in column) for column in columns)
-    return found if varying > 1 else [min(found), max(found)][: 1 + varying]
-
-
 def _weight(e: int, k: int, d: int, low: Fraction, high: Fraction) -> Fraction:
     parts = (
         comb(e, j) * low ** (e - j) * (high - low) ** j * Fraction(comb(k, j), comb(d, j))
         for j in range(min(e, k) + 1)
     )
     return sum(parts, Fraction(0))
-
-
-def _between(E: Entries, box: Box, node: Node) -> list[Matrix]:
-    """E at the stated ends of its first entry q, a quadratic; the others are constant.
-
-    low <= q(w) <= high on the box by the S-procedure: with weights a, b >= 0, as forms in [1; w],
-        q - low - Σ a_i (w_i - lo_i)(hi_i - w_i) ≻ 0,
-        high - q - Σ b_i (w_i - lo_i)(hi_i - w_i) ≻ 0.
-    """
-    q, *lags = E[0]
-    others = any(c and any(e) for lag in lags for e, c in lag)
-    fits = len(E) == 1 and not others and all(sum(e) <= 2 for e, c in q if c)
-    node.require({"ends are for one output, constant lags, and degree 2 at most": fits})
-    limit(len(box), MAX_ORDER - 1, f"{node.where}: entries of the box")
-    weighted = (len(box),)
-    table: Table = {"low": (), "high": (), "low_weights": weighted, "high_weights": weighted}
-    given = node.read(table)
-    for name, sign in (("low", 1), ("high", -1)):
-        weights = given[f"{name}_weights"]
-        node.require({"weights should be 0 or more": min(weights) >= 0}, "not_below")
-        parts = [(0, 0, -sign * given[name])]
-        for e, c in q:
-            i, j = [0, 0, *(i for i, power in enumerate(e, 1) for _ in range(power))][-2:]
-            parts.append((i, j, sign * c))
-        for i, (weight, (low, high)) in enumerate(zip(weights, box, strict=True), 1):
-            parts += [(0, 0, weight * low * high), (0, i, -weight * (low + high)), (i, i, weight)]
-        M = [[Fraction(0)] * (len(box) + 1) for _ in range(len(box) + 1)]
-        for i, j, part in parts:
-            M[i][j] += part / 2
-            M[j][i] += part / 2
-        definite(M, f"the {name} end of the leading coefficient")
-    constants = [sum((c for _, c in lag), Fraction(0)) for lag in lags]
-    return [[[given[end], *constants]] for end in ("low", "high")]

@@ -103,12 +103,11 @@ def _read_affine(node: Node) -> Model:
     box = [scaled[i] for i, _ in window]
     F = identity(p + size)[:size]  # x⁺ = [ν; all but the oldest of x]
     H = [[scale * entry for entry in unit(i, p + size)] for i, scale in enumerate(given["y_scale"])]
-    hull = Hull(E, box, bounded=True)
     shown = ranges(given["u"], list(map(text.PRINTED["inner_range"], limits)))
     where = f"for every input (the model clips its inputs: {shown})"
     if given["on_out_of_range"] == "refuse":
         where = f"for every input in the model's range ({shown}; it refuses others)"
-    return Model(given["period"], given["y"], given["u"], F, H, hull, where)
+    return Model(given["period"], given["y"], given["u"], F, H, Hull(E, box), where)
 
 
 def _matrix(node: Node, variables: int, *shape: int) -> list[tuple[bytes, Any]]:

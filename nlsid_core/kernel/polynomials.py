@@ -5,7 +5,7 @@ kept below 64, so that exponents never run into each other. Above them a key has
 linear in the exponents, so that no file can choose keys whose hashes are equal. A coefficient is a
 polynomial in s, packed into one integer by s = 2^width (Kronecker substitution). `norm` bounds the
 sum of the absolute values of all its integers, and below 2^(width - 1) the packing can be undone:
-`digits` refuses to otherwise, and `at_width` tries a larger width.
+`coefficients` refuses to otherwise, and `at_width` tries a larger width.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -17,20 +17,23 @@ from math import comb, lcm
 from secrets import randbits
 from typing import TypeVar, Union
 
-from .files import MAX_DEGREE, Rejected, Terms, refuse_if
+from .files import MAX_DEGREE, Rejected, Terms, limit
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
 SECRET = 61  # bits of a variable's secret: Python's hash of a whole number is modulo 2^61 - 1
 MAX_TERMS = 10**6  # of one polynomial
-WIDTHS = (64, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 16384)
-FREE_OF_S = 1024  # a width for polynomials in x alone: nothing is packed, so it costs nothing
+STEP, MAX_WIDTH = 64, 16384  # bits of a width: a multiple of the first
 
 Scalar = Union["Polynomial", Fraction, int]
 Case = TypeVar("Case")
 
 
 class TooNarrow(Exception):  # noqa: N818 - a signal to try again
-    """The width of a ring does not hold a result."""
+    """The width of a ring does not hold a result; the width that does."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,7 @@ class Ring:
     def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
         """p q."""
         degree, norm = p.degree + q.degree, p.norm * q.norm
-        if degree > MAX_DEGREE or norm.bit_length() > WIDTHS[-1]:
+        if degree > MAX_DEGREE or norm.bit_length() > MAX_WIDTH:
             raise Rejected(f"a product beyond degree {MAX_DEGREE} or too long", "too_large")
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
@@ -175,19 +178,17 @@ class Ring:
         denominator = p.denominator * q.denominator
         return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
 
-    def digits(self, p: Polynomial) -> dict[int, bytes]:
+    def coefficients(self, p: Polynomial, cut: int = 0) -> dict[int, list[int]]:
         """Each monomial's whole coefficients of s^0 … s^order, over p.denominator.
 
-        width / 8 bytes each, the lowest first, with half of the range added.
+        cut: bytes that are cut off each, which rounds down.
         """
-        if p.norm >> (self.width - 1):
-            raise TooNarrow
-        size = self.width // 8
-        halves = _halves(size, p.order + 1)
+        needed = p.norm.bit_length() + 1
+        if needed > self.width:
+            raise TooNarrow(-(-needed // STEP) * STEP)
+        size, count = self.width // 8, p.order + 1
         return {
-            key: (value + halves).to_bytes(size * (p.order + 1), "little")
-            for key, value in p.terms.items()
-            if value
+            key: unpacked(value, size, count, cut=cut) for key, value in p.terms.items() if value
         }
 
 
@@ -198,12 +199,15 @@ def packed(row: Sequence[int], width: int) -> int:
     return int.from_bytes(lanes, "little") - _halves(width, len(row))
 
 
-def unpacked(line: int, width: int, count: int, first: int = 0) -> list[int]:
-    """The row of `packed` from `first` on, if every entry is below half of its lane."""
-    half = 1 << (8 * width - 1)
+def unpacked(line: int, width: int, count: int, first: int = 0, cut: int = 0) -> list[int]:
+    """The row of `packed` from `first` on, without `cut` bytes of each entry.
+
+    Every entry has to be below half of its lane.
+    """
+    half = 1 << (8 * (width - cut) - 1)
     lanes = (line + _halves(width, count)).to_bytes(width * count, "little")
     starts = range(width * first, width * count, width)
-    return [int.from_bytes(lanes[i : i + width], "little") - half for i in starts]
+    return [int.from_bytes(lanes[i + cut : i + width], "little") - half for i in starts]
 
 
 @lru_cache(maxsize=64)
@@ -212,18 +216,14 @@ def _halves(width: int, count: int) -> int:
     return int.from_bytes((bytes(width - 1) + b"\x80") * count, "little")
 
 
-def at_width(
-    count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], None], least: int = WIDTHS[0]
-) -> None:
+def at_width(count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], None]) -> None:
     """Decide each case in a ring of `count` variables, wider from the first that needs it on."""
-    widths = [width for width in WIDTHS if width >= least]
-    ring = Ring(count, widths[0])
+    ring = Ring(count, STEP)
     for case in cases:
         while True:
             try:
                 decide(ring, case)
                 break
-            except TooNarrow:
-                widths = widths[1:]
-                refuse_if(not widths, f"coefficients beyond {WIDTHS[-1]} bits", "too_large")
-                ring = Ring(count, widths[0])
+            except TooNarrow as found:
+                limit(found.width, MAX_WIDTH, "bits of a coefficient")
+                ring = Ring(count, found.width)

@@ -1,9 +1,10 @@
 """Claim `sampled_funnel`: a tube and an inlet around a motion of an identified model hold.
 
 With x̄ = xhat - x_k and d_k the observer's correction, x̄⁺ = f̄_k(x̄) + d_k exactly. Sizes are |S_k x̄|.
+The disturbance keeps |S_k r_k| <= bound, where r_{k+1} = A_k r_k + d_k from r_0 = 0.
 For both chains of radii, the tube and the inlet, and at each step: `positive` proves that
-|ξ| <= radius implies |f̄_k(ξ)| <= reach; and the reach, with what the disturbance adds to it in the
-assumption's form, is within the next radius. A trapezoidal model's f̄ is any root of its equation
+|ξ| <= radius implies |f̄_k(ξ)| <= reach; and the reach, with what |r| <= bound adds to it, is within
+the next radius. A trapezoidal model's f̄ is any root of its equation
 h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄⁺ = T⁺w.
 Why that is enough: docs/certificate_sampled_funnel.md.
 """
@@ -14,8 +15,18 @@ from typing import Any
 
 from . import text
 from .exact import at_most, identity, inverse_forms, product, transposed
-from .files import Members, Node, Read, Table, bound_files, itself, limit, refuse_if
-from .polynomials import FREE_OF_S, Polynomial, Ring, at_width
+from .files import (
+    Members,
+    Node,
+    Read,
+    Table,
+    bound_files,
+    itself,
+    limit,
+    one_of,
+    refuse_if,
+)
+from .polynomials import Polynomial, Ring, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 from .sampled_step import Sample, nonnegative, read_step, stretch, triangular
 from .signals import apart, ranges, signals
@@ -24,22 +35,19 @@ CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
-
+LEFT = ("peak", "energy", "fading")  # forms of the assumption that are not decided any more
 
 SENTENCE = (
     "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
-    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k]{bound}, at all {samples} samples "
+    "x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k] + bound, at all {samples} samples "
     "over {span:down} s and ends within {ends} of the nominal; one that starts with "
     "|S[0] (xhat - x[0])| <= {inlet:down} ends within {goal} of it; at the samples both stay in "
     "the box of the model's data, {box}"
 )
-DISTURBANCE = "disturbance {form} {kept} at every sample, d = xhat+ - f(xhat, u)"
-KEPT = {
-    "response": "|S r| <= {bound:down}, r+ = A r + d from r = 0,",
-    "peak": "|S+ d| <= {bound:down}",
-    "energy": "sqrt(E) <= {bound:down}, E+ = E + {gain:up} |S+ d|^2 from E = 0,",
-    "fading": "sqrt(E) <= {bound:down}, E+ = {rate:up} E + {gain:up} |S+ d|^2 from E = 0,",
-}
+DISTURBANCE = (
+    "disturbance response |S r| <= {bound:down}, r+ = A r + d from r = 0, at every sample, "
+    "d = xhat+ - f(xhat, u)"
+)
 APPLIED = "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
 ROOTS = (
     "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1], {low:down} to "
@@ -65,10 +73,10 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     def prove(ring: Ring, k: int) -> None:
         after = {"x_next": x[k + 1], "S_next": S[k + 1]}
         at = Sample(x=x[k], u=u[k], K=K[k], S=S[k], A=A[k], **after)
-        step = read_step(steps[k], model, at, funnel["form"], ring)
+        step = read_step(steps[k], model, at, ring)
         rooms.extend([_prove_chain(step, bases, funnel, chain, k) for chain in CHAINS])
 
-    at_width(model["variables"], range(len(u)), prove, FREE_OF_S)
+    at_width(model["variables"], range(len(u)), prove)
     said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
     return text.Verdict(said, min(rooms), assumptions, digests)
 
@@ -78,21 +86,20 @@ def _prove_chain(
 ) -> Fraction:
     """Prove one step of one chain; the part of the next radius that it leaves free."""
     ring, d, what = step["size"].ring, len(step["h"]), f"{chain}, step {k}"
-    names = "reach columns squares ball" + " roots equations" * bool(d)
-    names += " spread extents" * (bool(d) and funnel["form"] == "response")
+    names = "reach columns squares ball" + " roots equations spread extents" * bool(d)
     stated = step[chain].members(names)
     reach, (radius, following) = nonnegative(stated["reach"]), funnel[chain][k : k + 2]
     parts = [reach**2 - ring.dot(step["rows"], step["rows"])]
     parts.append(_ball(stated["ball"], bases["ball_basis"], radius, step["size"]))
     if d:
-        far, added = step["kappa_next"] * funnel["roots"][k + 1], funnel["bound"]
-        if funnel["form"] == "response":
-            far, added = _implicit_addition(step, stated, funnel["bound"], radius, far)
+        far = step["kappa_next"] * funnel["roots"][k + 1]
+        far, added = _implicit_addition(step, stated, funnel["bound"], radius, far)
         w = ring.variables[-d:]
         parts.append(_ball(stated["roots"], bases["roots_basis"], far, ring.dot(w, w)))
         parts += _equations(stated["equations"], bases["equation_basis"], step["h"])
     else:
-        added = _explicit_addition(step, funnel, radius, what)
+        z, r = step["kappa"] * radius, step["kappa"] * funnel["bound"]
+        added = stretch(step["curvature"], z, r, least=1) * r
     shown = text.above(reach), text.above(added)
     exceeds = f"{what}: reach {shown[0]} and disturbance {shown[1]} exceed the next radius"
     at_most(reach + added, following, exceeds)
@@ -117,23 +124,10 @@ def _equations(node: Node, basis: Node, h: list[Polynomial]) -> list[Polynomial]
     return [ring.dot(row, monomials) * equation for row, equation in zip(nu, h, strict=True)]
 
 
-def _explicit_addition(step: Members, funnel: Members, radius: Fraction, what: str) -> Fraction:
-    """What the disturbance adds to the reach of an explicit model from `radius`."""
-    form, bound, kappa = funnel["form"], funnel["bound"], step["kappa"]
-    if form == "peak":
-        return Fraction(bound)
-    mu = kappa * stretch(step["curvature"], kappa * radius, kappa * bound, least=1)
-    if form == "response":
-        return Fraction(mu * bound)
-    much = f"{what}: deviations stretch by {text.above(mu)}, too much for rate and gain"
-    at_most(funnel["gain"] * mu**2, (funnel["gain"] - 1) * funnel["rate"], much)
-    return Fraction(0)
-
-
 def _implicit_addition(
     step: Members, stated: dict[str, Node], bound: Fraction, radius: Fraction, far: Fraction
 ) -> tuple[Fraction, Fraction]:
-    """|w| that the reach has to be proved for, and what a response adds to the reach."""
+    """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
     z, r, spread = step["kappa"] * radius, step["kappa"] * bound, nonnegative(stated["spread"])
     wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
     # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
@@ -162,7 +156,7 @@ def _prove_box(
     |g'x̄| <= room where |S x̄| <= radius if radius² g'(S'S)⁻¹g <= room².
     """
     S, n = funnel["S"][k], len(model["x"])
-    tube, inlet = (funnel[chain][k] + funnel["widens"] for chain in CHAINS)
+    tube, inlet = (funnel[chain][k] + funnel["bound"] for chain in CHAINS)
     forms = inverse_forms(product(transposed(S), S), identity(n) + K, "S'S")
     rooms = [(tube, width, "its stated half-width") for width in funnel["half_widths"][k]]
     for centre, (low, high) in zip(centres, model["box"], strict=False):
@@ -219,11 +213,13 @@ def _read_policy(node: Node, model: Members, made_for: str) -> Members:
 
 
 def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]) -> Members:
-    """The members of a funnel and its assumption; `widens`: what a disturbance adds to a radius."""
+    """The members of a funnel, and the bound of its assumption."""
     n, samples = len(model["x"]), (steps + 1,)
     assumed: Table = {  # what was measured is no part of the claim
-        "form": Node.text,
-        **dict.fromkeys(("bound", "rate", "gain"), nonnegative),
+        "form": one_of("response", former=LEFT),
+        "bound": nonnegative,
+        "rate": (),
+        "gain": (),
         **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),
     }
     table: Table = {
@@ -236,26 +232,23 @@ def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]
     }
     made_for = {role: digests[role] for role in ("model", "policy")}
     given = node.document("funnel", table, "sampled", made_for)
-    funnel = {"roots": [], **given, **given["assumption"]}
-    form, rate, gain = (funnel[name] for name in ("form", "rate", "gain"))
+    assumption = given["assumption"]
+    fits = assumption["rate"] == assumption["gain"] == 1
+    node.require({"rate and gain should be 1": fits}, "not_below")
+    funnel = {"roots": [], **given, "bound": assumption["bound"]}
     starts = funnel["tube"][0] <= funnel["inlet"][0]
     positive_radii = min(funnel["tube"] + funnel["inlet"] + funnel["roots"]) > 0
     wanted = "radii and roots should be positive, and the tube start in the inlet"
     node.require({wanted: positive_radii and starts}, "not_below")
     for S in funnel["S"]:
         triangular(S, node)
-    forms = ["response", "peak"] + ["energy", "fading"] * (not model["trapezoidal"])
-    node.require({f"the form should be one of {', '.join(forms)}": form in forms})
-    own = (form == "fading" or rate == 1) and (form in ("energy", "fading") or gain == 1)
-    wanted = f"rate and gain should be those of form {form}"
-    node.require({wanted: rate <= 1 <= gain and own}, "not_below")
-    return {**funnel, "widens": Fraction(0) if form == "peak" else funnel["bound"]}
+    return funnel
 
 
 def _sentence(model: Members, funnel: Members, steps: int) -> str:
     """What is proved, its numbers rounded outward."""
     tube, inlet = (funnel[chain] for chain in CHAINS)
-    wider = (inlet[-1] + funnel["widens"]) / (tube[-1] + funnel["widens"])
+    wider = (inlet[-1] + funnel["bound"]) / (tube[-1] + funnel["bound"])
     ends, goal = (
         ", ".join(
             signal.quantity(f"{signal.name} {text.above(width * factor)}")
@@ -266,7 +259,6 @@ def _sentence(model: Members, funnel: Members, steps: int) -> str:
     return text.say(
         SENTENCE,
         tube=tube[0],
-        bound=" + bound" if funnel["widens"] else "",
         samples=steps + 1,
         span=steps * model["period"],
         ends=ends,
@@ -277,8 +269,7 @@ def _sentence(model: Members, funnel: Members, steps: int) -> str:
 
 
 def _assumptions(model: Members, funnel: Members) -> tuple[str, ...]:
-    kept = text.say(KEPT[funnel["form"]], **funnel)
-    said = (text.say(DISTURBANCE, form=funnel["form"], kept=kept), APPLIED)
+    said = (text.say(DISTURBANCE, bound=funnel["bound"]), APPLIED)
     if not model["trapezoidal"]:
         return said
     return (*said, text.say(ROOTS, low=min(funnel["roots"][1:]), high=max(funnel["roots"][1:])))

@@ -20,7 +20,7 @@ MAX_CURVED = 64  # degrees with a bound of their curvature
 Sample = SimpleNamespace
 
 
-def read_step(node: Node, model: Members, at: Sample, form: str, ring: Ring) -> Members:
+def read_step(node: Node, model: Members, at: Sample, ring: Ring) -> Members:
     """A step's members, its stated bounds verified; with S⁺x̄⁺ (rows), h, and |S T z|² (size)."""
     n, d, where, trapezoidal = len(at.x), len(at.x) // 2, node.where, model["trapezoidal"]
     norms = ["kappa"] + ["kappa_next", "state", "rates", "direct", "through"] * trapezoidal
@@ -43,10 +43,9 @@ def read_step(node: Node, model: Members, at: Sample, form: str, ring: Ring) -> 
         for name, M in {**norm, "direct": direct}.items():
             prove_norm(M, step[name], f"{where}: the bound {name}")
     else:
-        rows = moved = explicit_step(model["map"], at, T, ring)
-        if form == "response":
-            turned = ring.product(unit, ring.variables[:n])
-            moved = [p - q for p, q in zip(rows, turned, strict=True)]
+        rows = explicit_step(model["map"], at, T, ring)
+        turned = ring.product(unit, ring.variables[:n])
+        moved = [p - q for p, q in zip(rows, turned, strict=True)]
     prove_curvature(moved, step["curvature"], ring, least=1 + trapezoidal)
     size = ring.product(ST, ring.variables[:n])
     return {**step, "rows": rows, "h": h, "size": ring.dot(size, size)}

@@ -80,7 +80,7 @@ def linear_form(model: StableModel) -> Linear | None:
     m = form.unknowns
     if not m:
         return Linear(F, H, UNIT)
-    E = np.array(form.E.vertices(form.E.box, None)[0], dtype=np.float64)
+    E = np.array(form.E.vertices(form.E.box)[0], dtype=np.float64)
     back = np.linalg.solve(E[:, :m], E[:, m:])
     A, C = F[:, m:] - F[:, :m] @ back, H[:, m:] - H[:, :m] @ back
     return Linear(A, C, (m + STEPS) * UNIT * float(np.linalg.cond(E[:, :m])))

@@ -110,7 +110,7 @@ def _too_large_squares(_: Json, proof: Json) -> None:
 
 
 def _other_set(_: Json, proof: Json) -> None:
-    others = {"2.11": "2.12", "2.13": "2.12", "2.19": "2.10"}
+    others = {"2.11": "2.13", "2.13": "2.19", "2.19": "2.13"}
     proof["claim"]["set"] = others[proof["claim"]["set"]]
 
 

@@ -187,7 +187,7 @@ def mode_unknown(files: Files) -> None:
 
 
 def multiplier_flipped(files: Files) -> None:
-    """τ ≤ 0 would allow V to grow in its mode."""
+    """τ ≤ 0 would allow V to grow in its mode; format 2 had a place for it."""
     piece = next(piece for piece in pieces_of(files) if piece["mode"] == [1])
     squares = piece["tau"][0]["squares"]
     squares["weights"] = [-1] * max(map(len, squares["factors"]))
@@ -205,7 +205,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (mode_missing, "not_covered"),
     (mode_renamed, "not_covered"),
     (mode_unknown, "not_covered"),
-    (multiplier_flipped, "malformed"),
+    (multiplier_flipped, "left"),
     (multiplier_changed, "not_positive"),
 ]
 

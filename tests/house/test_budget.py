@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_971,
-    ("bags",): 12_041,
+    ("nlsid_core",): 18_888,
+    ("bags",): 12_021,
     ("nlsid_ros",): 2_665,
-    ("tests",): 23_491,
+    ("tests",): 23_388,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8

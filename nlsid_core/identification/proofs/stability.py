@@ -96,7 +96,7 @@ class _Search:
         object.__setattr__(self, "m", self.F.shape[1] - len(self.F))
 
     def leaf(self, box: Box) -> Leaf:
-        return Leaf(box, np.array(self.form.E.vertices(box, None), dtype=np.float64))
+        return Leaf(box, np.array(self.form.E.vertices(box), dtype=np.float64))
 
 
 def prove_stability(model: Any) -> StabilityProof | None:

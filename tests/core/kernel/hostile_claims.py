@@ -43,7 +43,13 @@ def equal_hashes(pairs: int) -> Claim:
         },
     }
     witness = {"basis": [[0] * 83], "columns": [0], "squares": {"unit": 0, "factors": [[]]}}
-    return bound("stable_set", model, {}, {"inequalities": {"monotone": witness}})
+    M = [
+        [{"exponents": [[0] * n], "coefficients": [int(i == j)]} for i in range(n)]
+        for j in range(n)
+    ]
+    witnesses = dict.fromkeys(("monotone", "stable", "storage"), witness)
+    claim = {"set": "2.11", "delta": 1}
+    return bound("stable_set", model, claim, {"inequalities": witnesses, "M": M})
 
 
 def network(n: int) -> Claim:

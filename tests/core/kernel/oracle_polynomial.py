@@ -115,21 +115,20 @@ def dot(a: Sequence[P], b: Sequence[P], n: int) -> P:
 
 
 def squares(witness: Any, n: int) -> list[P]:
-    """Σ_i weights[i] (R_j[i] V v)² / (scale 4^unit), for each factor R_j."""
+    """Σ_i (R_j[i] V v)² / 4^unit, for each factor R_j."""
     part = witness["squares"]
-    scale = Fraction(1) / (Fraction(4) ** part["unit"] * number(part.get("scale", 1)))
+    assert set(part) == {"unit", "factors"}
     result = []
     for factor in part["factors"]:
-        weights = part.get("weights", [1] * len(factor))
         total = P(n)
-        for weight, row in zip(weights, factor, strict=True):
+        for row in factor:
             offset = len(witness["basis"]) - len(row)
             line = P(n)
             for k, entry in enumerate(row):
                 value = number(entry) * Fraction(2) ** witness["columns"][offset + k]
                 line = line + P(n, {tuple(witness["basis"][offset + k]): value})
-            total = total + line * line * number(weight)
-        result.append(total * scale)
+            total = total + line * line
+        result.append(total / 4 ** part["unit"])
     return result
 
 
@@ -217,11 +216,7 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
     n = 2 * nv + 2 * nx + nw + 2 * nx + 1
     z = [P.variable(n, i) for i in range(n)]
     v, x, w = z[:nv], z[nv : nv + nx], z[nv + nx : nv + nx + nw]
-    dv, dx, y = z[nv + nx + nw :][:nv], z[2 * nv + nx + nw :][:nx], z[2 * nv + 2 * nx + nw :]
-    vh, xh = (
-        [a - b for a, b in zip(v, dv, strict=True)],
-        [a - b for a, b in zip(x, dx, strict=True)],
-    )
+    y = z[2 * nv + 2 * nx + nw :]
 
     def stack(name: str, count: int) -> list[list[tuple[Key, Fraction]]]:
         part = model.get(name, {"exponents": [], "coefficients": []})
@@ -245,40 +240,13 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
             for a, (low, high) in zip(values, ends, strict=True)
         ]
 
-    h, shift, centre = stack("h", nv), stack("shift", nx - nv), stack("centre", nv)
+    h, shift = stack("h", nv), stack("shift", nx - nv)
     known, here, m = [*x, *w], [*v, *x, *w], number(model["monotonicity"])
-    of_x, of_w = range(nx), range(nx, nx + nw)
-    domain = inside(known, [*of_x, *of_w])
-    yv, delta = y[:nv], number(claim.get("delta", 0))
+    domain = inside(known, range(nx + nw))
+    yv, delta = y[:nv], number(claim["delta"])
     H = [along(p, here, yv) for p in h]
-    found: dict[str, tuple[P, list[P]]] = {}
-    if "centre" in model:
-        E = [along(p, v, yv) for p in centre]
-        found["centred"] = (dot(E, H, n) * 2 - dot(E, E, n), domain)
-        linear = all(sum(e) <= 1 for p in centre for e, c in p if c)
-        bijective = (
-            dot(E, E, n) - dot(yv, yv, n) * m**2
-            if linear
-            else (dot(yv, E, n) - dot(yv, yv, n) * m) * 2
-        )
-        found["centre"] = (bijective, [])
-    else:
-        found["monotone"] = ((dot(yv, H, n) - dot(yv, yv, n) * m) * 2, domain)
-    kind = claim.get("set")
-    if kind is None:
-        return found
-    gap = dot(dx, dx, n)
-    next_box = inside(v, range(nv))
-    if kind == "2.10":
-        V = stated(proof["V"])
-        moved = [put(p, here) - put(p, [*vh, *xh, *w]) for p in h]
-        a, b = [put(p, known) for p in shift], [put(p, [*xh, *w]) for p in shift]
-        after = put(V, [*v, *a, *dv, *(p - q for p, q in zip(a, b, strict=True))])
-        c = dot(dv, moved, n) * 2 + put(V, [*x, *dx]) - after - gap * delta
-        found["stable"] = (c, domain + next_box + inside(xh, of_x) + inside(vh, range(nv)))
-        found["storage"] = (put(V, [*x, *dx]), inside(x, of_x) + inside(xh, of_x))
-        return found
-    if kind == "2.11":
+    found = {"monotone": ((dot(yv, H, n) - dot(yv, yv, n) * m) * 2, domain)}
+    if claim["set"] == "2.11":
         M = [[stated(entry) for entry in row] for row in proof["M"]]
 
         def form(at: list[P], d: list[P]) -> P:
@@ -289,7 +257,7 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
         d_after = [*nu, *(along(p, known, d) for p in shift)]
         moved = [along(p, here, [*nu, *d]) for p in h]
         c = dot(nu, moved, n) * 2 + form(x, d) - dot(d, d, n) * delta - form(x_after, d_after)
-        found["stable"] = (c, domain + next_box)
+        found["stable"] = (c, domain + inside(v, range(nv)))
         found["storage"] = (form(x, y[:nx]), [])
         return found
     e = [[(k[:nx], c) for k, c in p if any(k[:nx])] for p in h]
@@ -299,19 +267,11 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
     def energy(d: list[P]) -> P:
         return dot(d, [sum((b * a for a, b in zip(row, d, strict=True)), P(n)) for row in P_], n)
 
-    if kind == "2.12":
-        y0, ys = y[0], y[1 : 1 + nx]
-        rise = [put(p, x) - put(p, xh) for p in e]
-        image = [put(p, known) - put(p, [*xh, *w]) for p in f]
-        corner = dot(dx, rise, n) * 2 - energy(dx) - gap * delta
-        c = corner * y0 * y0 + y0 * dot(ys, image, n) * 2 + energy(ys)
-        found["stable"] = (c, domain + inside(xh, of_x))
-        return found
     d, ys = y[:nx], y[nx : 2 * nx]
     risen = dot(d, [along(p, x, d) for p in e], n)
     turned = dot(ys, [along(p, known, d) for p in f], n) * 2
     lost = dot(d, d, n) * delta
-    if kind == "2.13":
+    if claim["set"] == "2.13":
         c = risen * 2 - energy(d) - lost + turned + energy(ys)
     else:
         c = risen - lost + turned + dot(ys, [along(p, x, ys) for p in e], n)
@@ -331,21 +291,19 @@ def agrees(document: Any, files: Mapping[str, Any]) -> bool:
 
 def _side_conditions(claim: Any, proof: Any, model: Any) -> bool:
     """δ and m positive, a box that is not empty, and a storage that is one."""
-    kind, n = claim.get("set"), len(model["states"])
-    if number(model["monotonicity"]) <= 0 or (kind and number(claim["delta"]) <= 0):
+    kind, n = claim["set"], len(model["states"])
+    if min(number(model["monotonicity"]), number(claim["delta"])) <= 0:
         return False
     if any(not low < high for low, high in claim.get("box", [])):
         return False
-    if kind == "2.10":
-        return all(any(e[n:]) for e, c in stated(proof["V"]) if c)
     if kind == "2.11":
         M = [[dict(stated(entry)) for entry in row] for row in proof["M"]]
         flat = all(not any(k) for row in M for entry in row for k, c in entry.items() if c)
         symmetric = all(M[i][j] == M[j][i] for i in range(n) for j in range(n))
         return symmetric and (flat or "box" not in claim)
-    if kind in ("2.12", "2.13"):
+    if kind == "2.13":
         return definite([[number(entry) for entry in row] for row in proof["P"]])
-    return True
+    return bool(kind == "2.19")
 
 
 def definite(M: list[list[Fraction]]) -> bool:

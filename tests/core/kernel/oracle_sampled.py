@@ -91,19 +91,19 @@ def monomial(point: Vector, exponents: list[int]) -> Fraction:
 
 
 def squares_at(entry: Json, basis: list[list[int]], point: Vector) -> Fraction:
-    """Σ weight (R V v)² / (scale 4^unit) of an entry {columns, squares}."""
+    """Σ (R V v)² / 4^unit of an entry {columns, squares}."""
     monomials = [
         Fraction(2) ** shift * monomial(point, row)
         for shift, row in zip(entry["columns"], basis, strict=True)
     ]
     part = entry["squares"]
     (factor,) = part["factors"]
-    weights, total = part.get("weights", [1] * len(factor)), Fraction(0)
-    for weight, row in zip(weights, factor, strict=True):
+    assert set(part) == {"unit", "factors"}
+    total = Fraction(0)
+    for row in factor:
         used = monomials[len(monomials) - len(row) :]
-        line = dot([Fraction(a) for a in row], used)
-        total = total + Fraction(weight) * line**2
-    below: Fraction = Fraction(part.get("scale", 1)) * 4 ** part["unit"]
+        total = total + dot([Fraction(a) for a in row], used) ** 2
+    below: Fraction = Fraction(4) ** part["unit"]
     return total / below
 
 
@@ -129,9 +129,8 @@ def claimed_at(documents: dict[str, Json], proof: Json, chain: str, k: int, y: V
     rate = times(fractions(step["T_next"]), w)
     after, h = implicit_next(model, policy, k, deviation, rate)
     far = Fraction(step["kappa_next"]) * Fraction(funnel["roots"][k + 1])
-    if funnel["assumption"]["form"] == "response":
-        bound = Fraction(funnel["assumption"]["bound"])
-        far += Fraction(entry["spread"]) * Fraction(step["kappa"]) * bound
+    bound = Fraction(funnel["assumption"]["bound"])
+    far += Fraction(entry["spread"]) * Fraction(step["kappa"]) * bound
     value -= squares_at(entry["roots"], proof["roots_basis"], y) * (far**2 - size2(w))
     for row, equation in zip(entry["equations"]["rows"], h, strict=True):
         nu = sum(
@@ -156,19 +155,14 @@ def refuted(documents: dict[str, Json]) -> str:
     includes the ends of the intervals, where a linear step is at its worst.
     """
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    a = funnel["assumption"]
-    form, bound = a["form"], Fraction(a["bound"])
-    widens = Fraction(0) if form == "peak" else bound
-    rate, gain = Fraction(a["rate"]), Fraction(a["gain"])
-    if not 0 <= rate <= 1 or gain < 1:
-        return "rate or gain"
+    bound = Fraction(funnel["assumption"]["bound"])
     S = [Fraction(s[0][0]) for s in funnel["S"]]
     grid = [Fraction(i, 2) for i in range(-2, 3)]
     for k, size in enumerate(S):
         for chain in ("tube", "inlet"):
             radius = Fraction(funnel[chain][k])
             for part in grid:
-                deviation = [part * (radius + widens) / abs(size)]
+                deviation = [part * (radius + bound) / abs(size)]
                 if found := _outside(model, policy, k, deviation, last=k == len(S) - 1):
                     return found
                 width = Fraction(funnel["half_widths"][k][0])
@@ -180,20 +174,13 @@ def refuted(documents: dict[str, Json]) -> str:
             for part in grid:
                 xi = part * radius / abs(size)
                 (start,) = explicit_next(model, policy, k, [xi])
-                added = bound if form == "peak" else Fraction(0)
-                if abs(S[k + 1] * start) + added > following:
+                if abs(S[k + 1] * start) > following:
                     return "reach"
                 for push in grid:
                     w = push * bound / abs(size)
                     (after,) = explicit_next(model, policy, k, [xi + w])
-                    if form == "response" and abs(S[k + 1] * (after - A * w)) > following:
+                    if abs(S[k + 1] * (after - A * w)) > following:
                         return "response"
-                    change = (S[k + 1] * (after - start)) ** 2
-                    if (
-                        form in ("energy", "fading")
-                        and gain * change > (gain - 1) * rate * (size * w) ** 2
-                    ):
-                        return "stretch"
     return ""
 
 
@@ -225,7 +212,7 @@ def agrees(document: Json, about: Mapping[str, Json]) -> bool:
         assert len(proof["steps"]) == steps
         return (
             makes_sense(model, policy, funnel)
-            and is_measured(model, funnel["assumption"])
+            and is_a_response(funnel["assumption"])
             and all(stays(model, policy, funnel, k) for k in range(steps + 1))
             and all(follows(documents, proof, k) for k in range(steps))
         )
@@ -291,24 +278,10 @@ def is_triangular(M: list[list[float]]) -> bool:
     return all(M[i][i] != 0 and not any(M[i][:i]) for i in size)
 
 
-def is_measured(model: Json, assumption: Json) -> bool:
+def is_a_response(assumption: Json) -> bool:
     """Obligation 3."""
     bound, rate, gain = (Fraction(assumption[name]) for name in ("bound", "rate", "gain"))
-    form = assumption["form"]
-    forms = ["peak", "response"] + ([] if is_implicit(model) else ["energy", "fading"])
-    return (
-        form in forms
-        and bound >= 0
-        and 0 <= rate <= 1 <= gain
-        and (form == "fading" or rate == 1)
-        and (form in ("energy", "fading") or gain == 1)
-    )
-
-
-def widened(funnel: Json) -> Fraction:
-    """What the disturbance adds to a radius."""
-    a = funnel["assumption"]
-    return Fraction(0) if a["form"] == "peak" else Fraction(a["bound"])
+    return bool(assumption["form"] == "response") and bound >= 0 and rate == gain == 1
 
 
 def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
@@ -316,9 +289,9 @@ def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
     n, S = len(model["x"]), fractions(funnel["S"][k])
     SS = [[dot([r[i] for r in S], [r[j] for r in S]) for j in range(n)] for i in range(n)]
     units = [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
-    widens = widened(funnel)
-    tube = Fraction(funnel["tube"][k]) + widens
-    both = max(tube, Fraction(funnel["inlet"][k]) + widens)
+    tube, inlet = (Fraction(funnel[chain][k]) for chain in CHAINS)
+    tube += Fraction(funnel["assumption"]["bound"])
+    both = max(tube, inlet + Fraction(funnel["assumption"]["bound"]))
     wanted = [(g, Fraction(w), tube) for g, w in zip(units, funnel["half_widths"][k], strict=True)]
     signals = [
         (g, c, box) for g, c, box in zip(units, policy["x"][k], model["x_range"], strict=True)
@@ -354,14 +327,13 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
     documents, step = json.loads(files_of), json.loads(step_of)
     proof = json.loads(bases) | {"steps": {k: step}}
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    n, implicit, form = len(model["x"]), is_implicit(model), funnel["assumption"]["form"]
+    n, implicit = len(model["x"]), is_implicit(model)
     d = n // 2 if implicit else 0
     y: Any = [P.variable(n + d, i) for i in range(n + d)]
     S, S_next = (fractions(funnel["S"][i]) for i in (k, k + 1))
     T, A = fractions(step["T"]), fractions(funnel["A"][k])
     bound = Fraction(funnel["assumption"]["bound"])
     kappa, gammas = Fraction(step["kappa"]), fractions(step["curvature"])
-    scale, decay = (Fraction(funnel["assumption"][key]) for key in ("gain", "rate"))
     if not (is_triangular(step["T"]) and min([kappa, *gammas]) >= 0):
         return False
     if not stretches_less(multiplied(S, T), kappa):
@@ -381,16 +353,14 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
             return False
     else:
         g = times(S_next, explicit_next(model, policy, k, deviation))
-        if not is_curved(plus(g, free, -1) if form == "response" else g, gammas, least=1):
+        if not is_curved(plus(g, free, -1), gammas, least=1):
             return False
     for chain in CHAINS:
         entry, radius = step[chain], Fraction(funnel[chain][k])
         reach, following = Fraction(entry["reach"]), Fraction(funnel[chain][k + 1])
         if reach < 0:
             return False
-        if form == "peak":
-            added = bound
-        elif implicit:
+        if implicit:
             far = Fraction(step["kappa_next"]) * Fraction(funnel["roots"][k + 1])
             found = added_at_roots(step, entry, radius, bound, far)
             if found is None:
@@ -398,9 +368,7 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
             added = found
         else:
             mu = kappa * stretch(gammas, kappa * radius, kappa * bound, least=1)
-            added = mu * bound if form == "response" else Fraction(0)
-            if form != "response" and scale * mu**2 > (scale - 1) * decay:
-                return False
+            added = mu * bound
         claimed: Any = claimed_at(documents, proof, chain, k, y)
         witness = {"basis": proof["basis"], "columns": entry["columns"]}
         if left_over([claimed], witness | {"squares": entry["squares"]}) is None:

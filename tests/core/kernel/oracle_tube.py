@@ -13,7 +13,6 @@ from nlsid_core import files
 from tests.core.kernel.oracle_stability import (
     Json,
     Rows,
-    between,
     cascade,
     exact,
     increments,
@@ -140,13 +139,15 @@ class Implicit:
 
 
 def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
-    """F, m, the box, whether there is a ray, and the E_i of a part of the box with its ends."""
+    """F, m, the box, whether there is a ray, and the E_i of a part of the box."""
     if model["kind"] != "implicit":
         assert given is None
         F, m, box = increments(model)
 
-        def hull(part: Box, ends: Json | None) -> list[Rows] | None:
-            return vertices(model, part) if ends is None else between(model, part, ends)
+        def hull(part: Box) -> list[Rows]:
+            found = vertices(model, part)
+            assert found is not None
+            return found
 
         ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
         return F, m, box, ray, hull
@@ -155,9 +156,9 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
     if found is not None:
         assert given is None
         E, ray = found
-        return implicit.F(), implicit.p, [], ray, lambda _, __: [E]
+        return implicit.F(), implicit.p, [], ray, lambda _: [E]
     assert given is not None
-    return implicit.F(), implicit.p, implicit.box(given), False, lambda box, _: implicit.hull(box)
+    return implicit.F(), implicit.p, implicit.box(given), False, implicit.hull
 
 
 def quadratic(rows: Rows, P: Rows) -> Rows:
@@ -217,10 +218,8 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, k
             return False
         if ray and any(N[0][0] < 0 or any(row[0] != 0 for row in N[1:]) for N in Ns):
             return False
-        found = hull(box, tree.get("ends"))
-        if found is None:
-            return False
-        for E, (M, N) in product(found, zip(forms, Ns, strict=True)):
+        assert set(tree) == {"N"}
+        for E, (M, N) in product(hull(box), zip(forms, Ns, strict=True)):
             cross, whole = zeros(size, size), zeros(size, size)
             for i, j in product(range(size), range(m + n)):
                 cross[i][j] = sum((N[i][k] * E[k][j] for k in range(m)), Fraction(0))

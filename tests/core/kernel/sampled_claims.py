@@ -35,7 +35,7 @@ class Scalar:
     inlet: list[float]
     reach: dict[str, list[float]]
     sigma: dict[str, list[Rows]]
-    form: str = "peak"
+    form: str = "response"
     bound: float = 0.0
     measured: float = 0.0
     rate: float = 1.0
@@ -80,9 +80,8 @@ class Scalar:
             "x": [[x] for x in self.x],
             "K": [[[k]] for k in self.K],
         }
-        widens = 0.0 if self.form == "peak" else self.bound
         exact = [
-            (Fraction(r) + Fraction(widens)) / Fraction(s or 1.0)
+            (Fraction(r) + Fraction(self.bound)) / Fraction(s or 1.0)
             for r, s in zip(self.tube, self.S, strict=True)
         ]
         widths = self.widths or [float(w) * (1 + 2.0**-50) for w in exact]
@@ -156,28 +155,19 @@ def _squares(rows: Rows) -> Json:
     return {"unit": 40, "factors": [[[ceil(v * 2**40) for v in row] for row in rows]]}
 
 
-def one_step(form: str, rng: random.Random, room: float) -> tuple[Scalar, bool]:
+def one_step(rng: random.Random, room: float) -> tuple[Scalar, bool]:
     """x⁺ = a x + b u, one step; and whether its claim is true, from the closed form in Fractions.
 
     room: by which part the claim is on the safe side of what is true; negative if it is false.
     """
     a, b, k, A = (rng.uniform(-1.0, 1.0) for _ in range(4))
     S, S_next = rng.uniform(1.0, 1.9), rng.uniform(0.3, 0.45)
-    s, bound, rate = rng.uniform(0.5, 2.0), rng.uniform(0.01, 0.5), 1.0
-    if form == "fading":
-        rate = rng.uniform(0.7, 0.99)
+    s, bound = rng.uniform(0.5, 2.0), rng.uniform(0.01, 0.5)
     slope, ratio = Fraction(a) - Fraction(b) * Fraction(k), Fraction(S_next) / Fraction(S)
     mu, off = abs(slope) * ratio, abs(slope - Fraction(A)) * ratio  # of |x̄|, and of |r|
-    added = {"peak": Fraction(bound), "response": off * Fraction(bound)}.get(form, Fraction(0))
+    added = off * Fraction(bound)
     needed = mu * Fraction(s) + added
-    least_gain = Fraction(rate) / (Fraction(rate) - mu**2)  # gain μ² = (gain - 1) rate
-    of_gain = form in ("energy", "fading") and rng.random() < 0.5
-    after = float(needed) * (1 + (1e-5 if of_gain else room))
-    gain = float(least_gain) * (1 + (room if of_gain else 1e-5))
-    if form not in ("energy", "fading"):
-        gain = 1.0
-    elif gain < 1:
-        return one_step(form, rng, room)
+    after = float(needed) * (1 + room)
     reach = min(float(mu) * s * UP, float(Fraction(after) - added))  # claims what it needs
     chains = ("tube", "inlet")
     claim = Scalar(
@@ -191,13 +181,8 @@ def one_step(form: str, rng: random.Random, room: float) -> tuple[Scalar, bool]:
         inlet=[s, after],
         reach={chain: [reach] for chain in chains},
         sigma={chain: [[[float(mu)]]] for chain in chains},
-        form=form,
         bound=bound,
         measured=bound,
-        rate=rate,
-        gain=gain,
     )
-    claim.curvature = [float(off if form == "response" else mu) * UP * S * claim.T(0)]
-    stays = needed <= Fraction(after)
-    forgets = form in ("peak", "response") or Fraction(gain) >= least_gain
-    return claim, stays and forgets
+    claim.curvature = [float(off) * UP * S * claim.T(0)]
+    return claim, needed <= Fraction(after)

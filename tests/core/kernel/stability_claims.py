@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -152,10 +151,6 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 @cache
 def _written(name: str) -> str:
-    if name == "ends":  # which the kernel decides, and no search makes
-        folder = Path(__file__).parent / "corpus" / "stability" / name
-        parts = [(folder / file).read_text() for file in ("model.json", "claim.proof.json")]
-        return json.dumps([json.loads(part) for part in parts])
     model = MODELS[name]()
     proof = prove_stability(model)
     assert proof is not None, name

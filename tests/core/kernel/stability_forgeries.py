@@ -31,42 +31,16 @@ CHANGES: dict[str, tuple[str, Callable[[Json, Json], None], str]] = {
         "malformed",
     ),
     "exchanged parts": ("split", lambda _, p: p["multipliers"]["parts"].reverse(), "not_definite"),
-    "a higher low end": (
-        "ends",
-        lambda _, p: p["multipliers"]["ends"].update(low=p["multipliers"]["ends"]["low"] + 1e-4),
-        "not_definite",
-    ),
-    "a lower high end": (
-        "ends",
-        lambda _, p: p["multipliers"]["ends"].update(high=p["multipliers"]["ends"]["high"] - 1e-4),
-        "not_definite",
-    ),
-    "ends of a wider box": ("ends", lambda m, _: m.update(u_range=[[-8.0, 20.0]]), "not_definite"),
-    "a negative weight": (
-        "ends",
-        lambda _, p: p["multipliers"]["ends"].update(
-            low_weights=[-1.0] * len(p["multipliers"]["ends"]["low_weights"])
-        ),
-        "not_below",
-    ),
-    "ends of moving lags": (
+    "ends": (
         "split",
         lambda _, p: p.update(multipliers={"N": [[1.0], [0.0]], "ends": {}}),
-        "malformed",
+        "left",
     ),
     "split slopes": (
         "network",
         lambda _, p: p.update(multipliers={"split": 0, "parts": [p["multipliers"]] * 2}),
         "malformed",
     ),
-    "ends of slopes": (
-        "cascade",
-        lambda _, p: p["multipliers"].update(
-            ends={"low": 0.0, "high": 1.0, "low_weights": [0.0], "high_weights": [0.0]}
-        ),
-        "malformed",
-    ),
-    "ends of nothing": ("monotone", lambda _, p: p["multipliers"].update(ends={}), "malformed"),
     "leaf and node": ("split", lambda _, p: p["multipliers"].update(N=[[1.0]]), "malformed"),
     "singular": (
         "constant",

@@ -88,8 +88,7 @@ READERS: dict[str, Callable[[Node], Any]] = {
 @example(value={"unit": True, "factors": [[[1]]]})
 @example(value={"unit": 0, "factors": [[[1.5]]]})
 @example(value={"unit": 0, "factors": [[[1, 2, 3]]]})
-@example(value={"unit": 0, "factors": [[[1]]], "weights": [-1]})
-@example(value={"unit": 0, "factors": [[[1]]], "scale": 0})
+@example(value={"unit": 0, "factors": [[[1]]], "weights": [1], "scale": 1})
 @example(value={"exponents": [[0, 0], [0, 0]], "coefficients": [1, 1]})
 @example(value={"exponents": [[1, 0], [0, 0]], "coefficients": [1]})
 @example(value={"model": {"file": "../x", "digest": "sha256:0"}})
@@ -198,7 +197,9 @@ def test_only_regular_files_beside_the_proof_are_read(tmp_path: Path) -> None:
     with refused("too_large"):
         kernel.check(tmp_path / "large")
     about = {"model": {"file": "fifo", "digest": digest(b"{}")}}
-    (tmp_path / "b.proof.json").write_bytes(proof({"kind": "stable_set", "about": about}, {}))
+    (tmp_path / "b.proof.json").write_bytes(
+        proof({"kind": "stability", "about": about, "rate": 0.5}, {})
+    )
     with refused("mismatch"):
         kernel.check(tmp_path / "b.proof.json")
 

@@ -1,15 +1,18 @@
 """The corpus of version 2: still proved, its false neighbours refused, no mutant wrongly proved."""
 
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from nlsid_core import files
+from nlsid_core import files, kernel
+from nlsid_core.kernel import Rejected
 from tests.core.kernel import mutations, oracle_composition
 from tests.core.kernel.mutations import CORPUS, ORACLES, PROOF, Case, corpus
 
 CASES = pytest.mark.parametrize("case", corpus(), ids=lambda case: f"{case.kind}/{case.name}")
+LEFT = CORPUS.parent / "left"
 FALSE = {  # a claim that is false, by one number of it: part, path, value
     "stable_set/linear": ("delta", 10.0),
     "stability/linear": ("rate", 0.6),  # the slowest pole is at 0.68
@@ -33,6 +36,14 @@ def test_a_false_neighbour_is_refused(name: str) -> None:
     forged.document["claim"][member] = value
     assert mutations.decide(forged) == "rejected"
     assert not ORACLES[forged.kind](forged.document, forged.about)
+
+
+@pytest.mark.parametrize("folder", sorted(LEFT.iterdir()), ids=lambda folder: folder.name)
+def test_a_proof_of_a_form_that_left_is_refused_by_name(folder: Path) -> None:
+    """What version 0.2 proved and nothing makes since 0.3: decision 62."""
+    with pytest.raises(Rejected, match=r"not decided since version 0\.3") as found:
+        kernel.check(folder / PROOF)
+    assert found.value.reason == "left"
 
 
 def composed() -> Case:

@@ -14,15 +14,13 @@ from nlsid_core.errors import CertificateRejected
 from tests.core.kernel import oracle_sampled as oracle
 from tests.core.kernel.refusals import refused
 from tests.core.kernel.sampled_claims import UP, Scalar, one_step
-from tests.marks import slow_among
 
 
-@pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
-def test_random_claims_are_decided_as_the_closed_form_decides(form: str) -> None:
-    rng = random.Random(form)
+def test_random_claims_are_decided_as_the_closed_form_decides() -> None:
+    rng = random.Random(0)
     decided = {True: 0, False: 0}
     for i in range(60):
-        claim, true = one_step(form, rng, 1e-5 if i % 2 else -1e-5)
+        claim, true = one_step(rng, 1e-5 if i % 2 else -1e-5)
         assert true == bool(i % 2)
         if true:
             assert claim.decide().margin >= 0
@@ -39,7 +37,7 @@ def cancelling(slope: float) -> Scalar:
     As floats are summed, 1 + 2^54 - 2^54 is 0.
     """
     s, at, both = 0.125, 2.0**54, ("tube", "inlet")
-    after = s**2 / 2 * UP + 0.01
+    after = s**2 / 2 * UP + 0.02
     return Scalar(
         {(1, 0): slope, (2, 0): 0.5, (1, 1): -1.0},
         x=[at, slope * at - 2.0**107],
@@ -96,31 +94,15 @@ def true_claim(**changes: Any) -> Scalar:
 def test_the_whole_verdict_of_a_small_claim() -> None:
     assert str(true_claim().decide()) == (
         "PROVED funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= 1, such as "
-        "xhat = x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k], at all 2 samples over "
-        "0.5 s and ends within level "
-        "0.6001 m of the nominal; one that starts with |S[0] (xhat - x[0])| <= 1 ends within level "
-        "0.6001 m of it; at the samples both stay in the box of the model's data, level in [-4, 4] "
-        "m, input in [-4, 4], margin 0.08333\n"
-        "  assuming disturbance peak |S+ d| <= 0.05 at every sample, d = xhat+ - f(xhat, u)\n"
+        "xhat = x[0], stays in the tube, |S[k] (xhat - x[k])| <= tube[k] + bound, at all 2 samples "
+        "over 0.5 s and ends within level "
+        "0.6501 m of the nominal; one that starts with |S[0] (xhat - x[0])| <= 1 ends within level "
+        "0.6501 m of it; at the samples both stay in the box of the model's data, level in [-4, 4] "
+        "m, input in [-4, 4], margin 0.1249\n"
+        "  assuming disturbance response |S r| <= 0.05, r+ = A r + d from r = 0, at every sample, "
+        "d = xhat+ - f(xhat, u)\n"
         "  assuming the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
     )
-
-
-@pytest.mark.parametrize(
-    ("form", "said"),
-    [
-        ("response", "|S r| <= 0.05, r+ = A r + d from r = 0, at every sample"),
-        ("energy", "sqrt(E) <= 0.05, E+ = E + 2 |S+ d|^2 from E = 0, at every sample"),
-        ("fading", "sqrt(E) <= 0.05, E+ = 0.875 E + 2 |S+ d|^2 from E = 0, at every sample"),
-    ],
-)
-def test_every_form_says_what_it_bounds(form: str, said: str) -> None:
-    gain, rate = (1.0 if form == "response" else 2.0), (0.875 if form == "fading" else 1.0)
-    claim = true_claim(form=form, gain=gain, rate=rate, curvature=[0.5])
-    verdict = claim.decide()
-    assert f"disturbance {form} {said}" in verdict.assumptions[0]
-    assert "tube[k] + bound, at all" in verdict.statement
-    assert "within level 0.6501 m" in verdict.statement  # 0.6 and the bound
 
 
 def test_samples_and_time_are_those_covered() -> None:
@@ -141,8 +123,8 @@ def test_samples_and_time_are_those_covered() -> None:
 
 
 FALSE: dict[str, tuple[dict[str, Any], str]] = {
-    "next radius below what is reached": ({"tube": [1.0, 0.54]}, "not_below"),
-    "inlet's goal below what is reached": ({"inlet": [1.0, 0.54]}, "not_below"),
+    "next radius below what is reached": ({"tube": [1.0, 0.52]}, "not_below"),
+    "inlet's goal below what is reached": ({"inlet": [1.0, 0.52]}, "not_below"),
     "reach below what is reached": (
         {"reach": {"tube": [0.49], "inlet": [0.5 * UP]}, "tube": [1.0, 0.55]},
         "not_positive",
@@ -154,18 +136,15 @@ FALSE: dict[str, tuple[dict[str, Any], str]] = {
     "a box that the tube leaves": ({"box": 0.9}, "not_valid"),
     "half-widths below the tube's": ({"widths": [1.0, 0.59]}, "not_valid"),
     "a negative half-width": ({"widths": [1.0, -0.6]}, "not_valid"),
-    "a gain without a form that has one": ({"gain": 2.0}, "not_below"),
-    "a rate above one": ({"form": "fading", "rate": 1.5, "gain": 2.0}, "not_below"),
-    "a rate that energy does not have": ({"form": "energy", "rate": 0.9, "gain": 2.0}, "not_below"),
+    "a gain that a response does not have": ({"gain": 2.0}, "not_below"),
+    "a rate that a response does not have": ({"rate": 0.9}, "not_below"),
+    "a form that left": ({"form": "fading", "rate": 0.9, "gain": 2.0}, "left"),
     "an unknown form": ({"form": "average"}, "malformed"),
     "a shape of zero": ({"S": [1.0, 0.0], "widths": [1.0, 9.0]}, "malformed"),
     "a name on two lines": ({"name": "level\nPROVED everything"}, "malformed"),
     "a period of zero": ({"period": 0.0}, "malformed"),
     "a whole number beyond 2^53": ({"box": 2**53 + 1}, "malformed"),
-    "curvature below the slope": (
-        {"form": "response", "curvature": [0.5], "A": [-0.5]},
-        "not_definite",
-    ),
+    "curvature below the slope": ({"curvature": [0.5], "A": [-0.5]}, "not_definite"),
 }
 
 
@@ -257,17 +236,13 @@ def signed(documents: dict[str, Any]) -> dict[str, Any]:
     return {"model": model, "policy": policy, "funnel": documents["funnel"] | bound}
 
 
-FORMS = ["peak", "response", "energy", "fading"]
-
-
-@pytest.mark.parametrize("form", slow_among(FORMS, {"peak", "energy", "fading"}))
-def test_no_mutation_of_a_claim_is_proved_that_a_grid_of_states_refutes(form: str) -> None:
-    rng = random.Random(f"mutate {form}")
+def test_no_mutation_of_a_claim_is_proved_that_a_grid_of_states_refutes() -> None:
+    rng = random.Random("mutate response")
     outcomes = {"proved": 0, "refused": 0}
     refutations: set[str] = set()
     for i in range(200):
         if i % 20 == 0:
-            claim, true = one_step(form, rng, 1e-5)
+            claim, true = one_step(rng, 1e-5)
             assert true
         documents, proof = claim.documents(), claim.proof()
         role = rng.choice(("model", "policy", "funnel", "proof"))
@@ -289,4 +264,4 @@ def test_no_mutation_of_a_claim_is_proved_that_a_grid_of_states_refutes(form: st
             assert oracle.refuted(documents) == ""
             outcomes["proved"] += 1
     assert min(outcomes.values()) > 30
-    assert refutations >= {"reach" if form == "peak" else "half-width"}
+    assert "half-width" in refutations

@@ -83,7 +83,7 @@ def test_the_kernels_matrices_are_those_of_the_specification(name: str) -> None:
     if m:
         expected = oracle.vertices(model, box)
         assert expected is not None
-        found = form.E.vertices(form.E.box, None)
+        found = form.E.vertices(form.E.box)
         # Extreme ones only, where one entry varies: each found is expected, each end is found.
         assert all(E in expected for E in found)
         for i in range(m):
@@ -196,7 +196,7 @@ def test_a_box_far_away_keeps_every_digit_of_its_ends() -> None:
     ranges = np.array([[1000000009.0, 1000000011.0]])
     far = model.document() | {"u_range": ranges.tolist(), "u_offset": [0.0], "u_scale": [1.0]}
     form = read_model(parse(files.encode(far), "model"))
-    lead = [E[0][0] for E in form.E.vertices(form.E.box, None)]
+    lead = [E[0][0] for E in form.E.vertices(form.E.box)]
     exact = (
         Fraction(9) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
         Fraction(11) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
