@@ -7,9 +7,9 @@ generated once and kept in a cache folder, which is printed; one that is in DIR 
 Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
 deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
-machine does not count; the memory is that process's. Likewise, of all of the bag or of one
-with COPIED messages: `nlsid bag info`; the cut of a tenth, as mcap's own reader and writer do it by the
-index; the copy of all messages, as rosbags does it; and a DataFrame, as rosbags-dataframe does it.
+machine does not count; the memory is that process's. Likewise `nlsid bag info` of the whole bag;
+and of one of COPIED messages the cut of a minute, as mcap's reader and writer do it by the index;
+the copy of all, as rosbags does it; and a DataFrame, as rosbags-dataframe does it.
 """
 
 import os
@@ -24,12 +24,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any, Final
 
 import numpy as np
+from rosbags.convert.converter import convert as by_rosbags
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
@@ -43,6 +45,7 @@ from benchmarks.machine import parser, peers, tell
 
 MESSAGES: Final = 2_000_000
 SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
+STRETCH: Final = What(start="120", end="180")  # s
 COPIED: Final = 300_000  # messages of the bag that is cut, copied and put into frames
 REPEATS: Final = 3
 JOINTS, ODOM, IMU = "/joint_states", "/odom", "/imu"
@@ -179,67 +182,51 @@ def _take(decoded: Iterator[tuple[str, Any]], messages: int) -> int:
     return done
 
 
-def info_ours(bag: Path, messages: int) -> int:
+def info(bag: Path, messages: int) -> int:
     """The whole command line, as a person runs it."""
-    subprocess.run([sys.executable, "-m", "bags.commands.cli", "bag", "info", bag], check=True)
+    command = [sys.executable, "-m", "bags.commands.cli", "bag", "info", "--json", bag]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return messages
 
 
-def cut_ours(bag: Path, messages: int) -> int:
-    """A tenth of the bag."""
-    return _copied(bag, What(start=f"{0.45 * messages / 1000}", end=f"{0.55 * messages / 1000}"))
-
-
-def copy_ours(bag: Path, _messages: int) -> int:
-    """All of the bag."""
-    return _copied(bag, What())
-
-
-def _copied(bag: Path, what: What) -> int:
+def copied(bag: Path, _messages: int, what: What | None = None) -> int:
+    """All of the bag, or a stretch."""
     with TemporaryDirectory() as folder, Bag(bag) as source:
         return convert([source], Path(folder) / "copy", what).messages
 
 
-def cut_mcap(bag: Path, messages: int) -> int:
-    """The same tenth with mcap's reader, which uses the index, and its writer."""
+def cut_by_mcap(bag: Path, _messages: int) -> int:
+    """The stretch with mcap's reader, which uses the index, and its writer."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
-    start, end = (START_NS + int(part * messages) * PERIOD_NS for part in (0.45, 0.55))
+    start, end = (START_NS + int(1e9 * float(s)) for s in (STRETCH.start, STRETCH.end))
     with next(bag.glob("*.mcap")).open("rb") as stream, TemporaryFile() as out:
         writer = Writer(out)
         writer.start()
-        numbers: dict[int, int] = {}
-        found = make_reader(stream).iter_messages(start_time=start, end_time=end)
-        for schema, channel, message in found:
-            if channel.id not in numbers:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[channel.id] = writer.register_channel(channel.topic, "cdr", number)
-            number, log_ns = numbers[channel.id], message.log_time
-            writer.add_message(number, log_ns, message.data, log_ns, message.sequence)
+        channel = writer.register_channel("/all", "cdr", 0)
+        found = list(make_reader(stream).iter_messages(start_time=start, end_time=end))
+        for _, _, m in found:
+            writer.add_message(channel, m.log_time, m.data, m.publish_time, m.sequence)
         writer.finish()
-    return messages
+    return len(found)
 
 
-def copy_rosbags(bag: Path, messages: int) -> int:
+def copied_by_rosbags(bag: Path, messages: int) -> int:
     """All of the bag with rosbags' converter, to MCAP."""
-    from rosbags.convert.converter import convert as by_rosbags
-
+    types, rest = standard_types(), [()] * 4
     with TemporaryDirectory() as folder:
-        out = Path(folder) / "copy"
-        none: tuple[str, ...] = ()
-        types = standard_types()
-        by_rosbags([bag], out, "mcap", 9, "zstd", "storage", types, None, none, none, none, none)
+        by_rosbags([bag], Path(folder) / "a", "mcap", 9, "zstd", "storage", types, None, *rest)
     return messages
 
 
-def frame_ours(bag: Path, _messages: int) -> int:
+def framed(bag: Path, _messages: int) -> int:
     """Every field of a topic."""
     return len(frame(bag, [ODOM]))
 
 
-def frame_rosbags(bag: Path, _messages: int) -> int:
-    """Five numbers of a topic with rosbags-dataframe."""
+def framed_by_rosbags(bag: Path, _messages: int) -> int:
+    """Some numbers of the topic with rosbags-dataframe."""
     from rosbags.dataframe import get_dataframe
     from rosbags.highlevel import AnyReader
 
@@ -274,13 +261,11 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
             if name == "ours":
                 peaks.append(peak)
     small = generated_bag(None, COPIED)
-    jobs: dict[str, list[float]] = {}
-    for _ in range(REPEATS):
-        for job in (cut_ours, cut_mcap, copy_ours, copy_rosbags, frame_ours, frame_rosbags):
-            rate, _ = timed(job, small, COPIED)
-            jobs.setdefault(job.__name__, []).append(rate)
-    speed = {name: statistics.median(found) for name, found in jobs.items()}
-    infos = [messages / timed(info_ours, bag, messages)[0] for _ in range(REPEATS)]
+    pairs = ((partial(copied, what=STRETCH), cut_by_mcap), (copied, copied_by_rosbags))
+    cut, copy, frames = (
+        timed(ours, small, COPIED)[0] / timed(theirs, small, COPIED)[0]
+        for ours, theirs in (*pairs, (framed, framed_by_rosbags))
+    )
     median = {name: statistics.median(found) for name, found in rates.items()}
     return {
         "messages_per_s": median["ours"],
@@ -289,10 +274,10 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
         "ratio_mcap_ros2": median["ours"] / median["mcap_ros2"],
         "ratio_rosbags": median["ours"] / median["rosbags"],
         "peak_mb": max(peaks),
-        "info_s": statistics.median(infos),
-        "cut_ratio_mcap": speed["cut_mcap"] / (10 * speed["cut_ours"]),
-        "convert_ratio_rosbags": speed["copy_ours"] / speed["copy_rosbags"],
-        "frame_ratio_rosbags_dataframe": speed["frame_ours"] / speed["frame_rosbags"],
+        "info_s": messages / timed(info, bag, messages)[0],
+        "cut_ratio_mcap": 1 / cut,
+        "convert_ratio_rosbags": copy,
+        "frame_ratio_rosbags_dataframe": frames,
         "bag_mb": sum(file.stat().st_size for file in bag.iterdir()) / 1e6,
     }
 

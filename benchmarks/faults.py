@@ -47,7 +47,7 @@ from bags.designs.documents import FUNNEL, MODEL
 from bags.monitoring.announcement import UNANNOUNCED, WAITING
 from bags.samples import f1tenth
 from benchmarks.machine import describe, parser
-from benchmarks.processes import isolate, node, python
+from benchmarks.processes import busy, isolate, node, python
 from nlsid_core import files
 from nlsid_core.design import ContinuousTracking, design, integrate_nominal
 from nlsid_core.dynamics import VectorField
@@ -105,7 +105,7 @@ class Rig:
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            said = self.said.setdefault(status.name, Said())
+            said = self.said.setdefault(status.name.partition(":")[0], Said())
             said.level, said.text = status.level, status.message
             said.lines.append((time.monotonic(), status.level, status.message))
 
@@ -344,45 +344,6 @@ def _judged(rig: Rig, name: str, expected: str, since: float) -> Seen:
     return Seen(name, expected, text, at - since, at >= since, silent_inside=silent, hung=hung)
 
 
-def _fields(text: str) -> list[str]:
-    return ["-p", f"others:='{text}'"]
-
-
-ARGUMENTS: list[tuple[str, list[str], str]] = [
-    ("others: NaN", _fields('{"twist": {"angular": {"z": NaN}}}'), "NaN is not a number"),
-    ("others: Infinity", _fields('{"twist": {"angular": {"z": Infinity}}}'), "Infinity is not"),
-    ("others: 1e400", _fields('{"twist": {"angular": {"z": 1e400}}}'), "1e400 does not fit"),
-    ("others: true", _fields('{"twist": {"angular": {"z": true}}}'), "z is True; it should be"),
-    ("others: a number too few", _fields('{"twist": {"angular": 1}}'), "1 should be an object"),
-    ("others: a list", _fields('{"twist": [0, 1]}'), "[0, 1] should be an object"),
-    ("others: text for a number", _fields('{"twist": {"angular": {"z": "1"}}}'), "z is '1'"),
-    ("others: a number for text", _fields('{"header": {"frame_id": 1}}'), "frame_id is 1"),
-    ("others: not a field", _fields('{"twist": {"turn": 1}}'), "there is no 'turn'"),
-    ("others: no topic", _fields("/a b"), "others is no topic"),
-    ("namespace without a slash", ["-r", "__ns:=robot1"], "begins with a slash"),
-    ("a name that is none", ["-r", "__node:=a-b"], "ROS refuses"),
-    ("a source that is no name", ["-p", "source:=a-b"], "Invalid topic name"),
-]
-
-
-def argument_faults(only: str) -> Iterator[Seen]:
-    """What a controller is told wrongly when it is configured: it ends, and says why in a line."""
-    for name, arguments, expected in ARGUMENTS:
-        if only not in name:
-            continue
-        command = [sys.executable, "-m", *node(CONTROLLER, highest=0.4), *arguments]
-        since = time.monotonic()
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            yield Seen(name, expected, "it does not end", math.nan, False, hung=True)
-            continue
-        said = done.stderr + done.stdout
-        named = done.returncode == 1 and expected in said and "Traceback" not in said
-        seconds = time.monotonic() - since
-        yield Seen(name, expected, said.strip().splitlines()[-1], seconds, named)
-
-
 def verdict_faults(rig: Rig, good: Bundle, other: Bundle, only: str) -> Iterator[Seen]:
     """Verdicts of another funnel, of no run or of two nodes, to a controller that requires them."""
     digest = good.digest
@@ -533,27 +494,20 @@ def machine_faults(rig: Rig, folder: Path, only: str) -> Iterator[Seen]:
             monitor = stack.enter_context(python(*node(MONITOR, **patient)))
             rig.need("the monitor", lambda: rig.odom.get_subscription_count() >= 1)
             rig.need("its commands", lambda: rig.command.get_subscription_count() >= 2)
-            burners: list[subprocess.Popen[bytes]] = []
 
-            def starve(rig: Rig, _k: int, stamp_ns: int) -> None:
-                while len(burners) < BURNERS:
-                    burners.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
-                    os.sched_setaffinity(burners[-1].pid, {0})
+            def starve(rig: Rig, k: int, stamp_ns: int) -> None:
+                if k == GOOD:
+                    stack.enter_context(busy(BURNERS, {0}))
                 rig.sample(stamp_ns, speed=1.0)
 
             os.sched_setaffinity(monitor.pid, {0})
             os.setpriority(os.PRIO_PROCESS, monitor.pid, 10)
-            try:
-                yield _fed(rig, name, starve, "^(outside|unknown)")
-            finally:
-                for burner in burners:
-                    burner.kill()
-                    burner.wait()
+            yield _fed(rig, name, starve, "^(outside|unknown)")
     name = "full disk"
     if only in name:
         rig.said.clear()
         recorder, grown = "trajectory_recorder", 200_000
-        to = {"topics": ["/odom"], "bag": folder / "full", "compression": "none"}
+        to = {"topics": ["/odom"], "bag": folder / "full"}
         with python(*node(recorder, **to)) as running:
             rig.need("the recorder", lambda: rig.odom.get_subscription_count() >= 1)
             resource.prlimit(running.pid, resource.RLIMIT_FSIZE, (grown, grown))
@@ -786,7 +740,6 @@ def run(folder: Path, only: str = "") -> Iterator[Seen]:
         yield from machine_faults(rig, folder, only)
         yield from design_faults(rig, good, other, only)
         yield from verdict_faults(rig, good, other, only)
-    yield from argument_faults(only)
     yield from hold_faults(folder / "held", only)
     yield from loop_faults(made[0], only)
 

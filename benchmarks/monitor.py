@@ -1,12 +1,14 @@
 """The monitor: time of an update alone, and margins at 1 kHz over DDS between processes.
 
-python -m benchmarks.monitor [--seconds 60] [--rate 1000] [--json]
+python -m benchmarks.monitor [--seconds 60] [--rate 1000] [--load 8] [--json]
 
 Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival at
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
 the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
-the priority that a robot gives them. The monitor runs on a funnel made for timing. `grown_mb` is
+the priority that a robot gives them. `--load` starts so many processes that only compute.
+`first_verdict_s` is from the start of `nlsid run monitor DIR`, of a proof that this machine has
+decided before, to its first verdict. The monitor runs on a funnel made for timing. `grown_mb` is
 by how much its memory grew from the first second of the samples to the last.
 """
 
@@ -33,6 +35,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -42,7 +45,7 @@ from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from bags.signals.sampling import Grid
 from benchmarks.machine import parser, peers, tell
-from benchmarks.processes import cpu_seconds, isolate, node, python, resident_mb
+from benchmarks.processes import busy, cpu_seconds, isolate, node, python, resident_mb
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
@@ -51,7 +54,7 @@ from nlsid_core.identification import Polynomial, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
-from nlsid_ros.messages import stamp_ns_of
+from nlsid_ros.messages import stamp_ns_of, stamp_of
 
 LAGS, ROUNDS = 6, 40
 SOURCE, MARGIN, ECHO = "/benchmark", "/funnel_monitor/margin", "/benchmark/echo"
@@ -64,6 +67,9 @@ ASKED = {
     "latency_ms_p99": 1.0,
     "error_ms": 5.0,
     "grown_mb": 1.0,
+    "processor_ratio_rclpy": 1.25,
+    "p99_ratio_rclpy": 1.3,
+    "first_verdict_s": 3.0,
 }
 
 
@@ -127,7 +133,7 @@ class Ear(Node):
         self.margins: dict[int, int] = {}
         self.echoes: dict[int, int] = {}
         self.error_ns, self.error = 0, ""
-        self.ready = False
+        self.ready = self.verdict = False
         publisher = self.create_publisher(String, f"{SOURCE}/design", qos.DOCUMENT)
         publisher.publish(String(data=bundle_of(design).text()))
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
@@ -136,22 +142,28 @@ class Ear(Node):
 
     def _hear(self, arrivals: dict[int, int], message: JointState) -> None:
         arrivals[stamp_ns_of(message)] = time.time_ns()
+        self.verdict |= message.position[0] >= 0.0
 
     def _status(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name != "funnel_monitor":
+            if status.name.partition(":")[0] != "funnel_monitor":
                 continue
             self.ready = True
             if status.level == DiagnosticStatus.ERROR and not self.error_ns:
                 self.error_ns, self.error = time.time_ns(), status.message
 
 
+def robot(node: Node) -> list[Publisher]:
+    """Publishers of state and command."""
+    topics = [path.partition(":")[0] for path in (STATE, COMMAND)]
+    return [node.create_publisher(JointState, topic, qos.STREAM) for topic in topics]
+
+
 def send(seconds: float, rate: int) -> None:
     """Publish command and response at `rate` Hz, the last OUT responses outside; print stamps."""
     rclpy.init()
     sender = Node("sender")
-    state = sender.create_publisher(JointState, STATE.partition(":")[0], qos.STREAM)
-    command = sender.create_publisher(JointState, COMMAND.partition(":")[0], qos.STREAM)
+    state, command = robot(sender)
     while state.get_subscription_count() < 1:
         time.sleep(0.01)
     time.sleep(0.5)
@@ -228,7 +240,38 @@ def live(seconds: float, rate: int) -> dict[str, float]:
     result["grown_mb"] = resident[-1] - resident[min(2, len(resident) - 1)]
     result["cpu_us_per_sample"] = 1e6 * cpu / len(sent)
     result["rclpy_alone_cpu_us_per_sample"] = 1e6 * cpu_alone / len(sent_alone)
+    result["processor_ratio_rclpy"] = cpu / len(sent) / (cpu_alone / len(sent_alone))
+    result["p99_ratio_rclpy"] = result["ratio_p99"]
     return result
+
+
+def first_verdict(rate: int) -> float:
+    """s from the start of `nlsid run monitor DIR` to its first verdict, the second time it runs."""
+    isolate()
+    rclpy.init()
+    design, executor = timing_funnel(rate), EventsExecutor()
+    ear = Ear(design)
+    executor.add_node(ear)
+    state, command = robot(ear)
+    message, seconds = JointState(position=[0.0]), 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        design.save(folder)
+        for _ in range(2):
+            quiet = time.monotonic() + 1.0  # what the last one said has come
+            while time.monotonic() < quiet:
+                executor.spin_once(timeout_sec=0.1)
+            started, ear.verdict, sent = time.monotonic(), False, 0
+            with python("bags.commands.cli", "run", "monitor", folder):
+                while not ear.verdict:
+                    executor.spin_once(timeout_sec=0.5 / rate)
+                    if (k := int(time.time() * rate)) > sent:
+                        sent, message.header.stamp = k, stamp_of(k * 10**9 // rate)
+                        command.publish(message)
+                        state.publish(message)
+                seconds = time.monotonic() - started
+    ear.destroy_node()
+    rclpy.shutdown()
+    return seconds
 
 
 def _until_there(ear: Ear, executor: Executor) -> None:
@@ -274,6 +317,7 @@ def main() -> None:
     taken = parser(__doc__)
     taken.add_argument("--seconds", type=float, default=60.0)
     taken.add_argument("--rate", type=int, default=1000, help="Hz")
+    taken.add_argument("--load", type=int, default=0, help="processes beside it that only compute")
     taken.add_argument("--send", type=float, help=argparse.SUPPRESS)
     taken.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
     options = taken.parse_args()
@@ -283,7 +327,9 @@ def main() -> None:
     if options.echo:
         echo()
         return
-    result = updates() | live(options.seconds, options.rate)
+    with busy(options.load, os.sched_getaffinity(0)):
+        result = updates() | live(options.seconds, options.rate)
+        result["first_verdict_s"] = first_verdict(options.rate)
     tell(result | peers("ros-jazzy-rclpy"), ASKED, as_json=options.json, what="asked")
 
 

@@ -2,13 +2,15 @@
 
 import os
 import subprocess
-from contextlib import AbstractContextManager
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 from nlsid_ros import processes
 from nlsid_ros.processes import isolate
 
-__all__ = ["cpu_seconds", "isolate", "node", "python", "resident_mb"]
+__all__ = ["busy", "cpu_seconds", "isolate", "node", "python", "resident_mb"]
 
 
 def python(module: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
@@ -19,6 +21,18 @@ def python(module: str, *arguments: str) -> AbstractContextManager[subprocess.Po
 def node(module: str, **parameters: object) -> list[str]:
     """Arguments for `python` that start a node quietly with parameters."""
     return [f"nlsid_ros.{module}", *processes.settings(parameters)]
+
+
+@contextmanager
+def busy(count: int, cores: set[int]) -> Iterator[None]:
+    """So many processes that only compute, on these cores."""
+    with ExitStack() as stack:
+        for _ in range(count):
+            burner = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            stack.callback(burner.wait)
+            stack.callback(burner.kill)
+            os.sched_setaffinity(burner.pid, cores)
+        yield
 
 
 def cpu_seconds(pid: int) -> float:

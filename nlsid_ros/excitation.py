@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 from bags.chain.config import load_config
 from bags.signals.expressions import Expression, factors
 from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError
@@ -50,6 +51,7 @@ class Excitation(ManagedNode):
     """Plays one signal `repeats` times, resting in between."""
 
     name = "excitation"
+    task = "excitation"
     parameters = (
         Parameter("kind", "multisine", "one of " + ", ".join(KINDS)),
         Parameter("command", "", f"signal published; empty: that of config, else {COMMAND}"),
@@ -77,7 +79,9 @@ class Excitation(ManagedNode):
     def read_parameters(self) -> None:
         """Find the signal and the limits; DataError if there are none."""
         values = self.values
-        self._command = SignalMessage(self._signal(), values.command_type, values.others)
+        self._command = SignalMessage(
+            SignalVector((self._signal(),)), values.command_type, values.others
+        )
         self._period: float = values.period
         self._recorder: str = values.recorder.rstrip("/")
         self._shape = Shape(

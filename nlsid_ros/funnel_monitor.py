@@ -5,9 +5,11 @@ may be several, by the model's own field paths, on message stamps. Publishes ~/m
 (sensor_msgs/JointState: stamped, named numbers; frame_id says of which funnel and run) for every
 sample, ~/forecast if asked for (the same
 type: `low` and `high` of each output `ahead` s after the newest sample, at that stamp, while the
-command is held), ~/events when the state changes, and /diagnostics at once when it does, otherwise
+command is held), and /diagnostics at once when the state changes, otherwise
 once a second. Leaving the funnel calls
-`stop_service` and `snapshot_service`. Missing, stale or NaN state is unknown (STALE), never inside.
+`stop_service` and `snapshot_service`. Missing, stale or NaN state is unknown, never inside. Two
+latched std_msgs/Bool are for those who only want to stop: ~/inside, whether the newest sample was
+judged inside, and ~/alarm, whether there was one that was not since ~/restart.
 What is outside, or violates the assumption, stays so until `~/restart`, which begins a new run.
 """
 
@@ -16,11 +18,10 @@ from collections import deque
 from collections.abc import Iterable
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 
 from bags.monitoring.announcement import UNANNOUNCED, Run
 from bags.monitoring.announcement import WAITING as RUN_WAITING
@@ -32,14 +33,14 @@ from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
+from nlsid_core.running.alarm import SEVERITY, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import graph, qos
 from nlsid_ros.documents import DESIGN, DesignSubscription, expected_of, wiring_of
 from nlsid_ros.helping import Help
 from nlsid_ros.message_classes import installed_types
-from nlsid_ros.messages import numbers_at, off_clock, patience, stamp_ns_of
+from nlsid_ros.messages import numbers_at, off_clock, patience
 from nlsid_ros.running import REPORT, ManagedNode, Parameter, arm
 from nlsid_ros.starting import entry_point
 from nlsid_ros.subscribing import Topic
@@ -49,13 +50,14 @@ LATEST_COMMAND = (
     1.0  # s from a command's stamp to this node's clock; one is stamped when it is sent
 )
 LOOK_AHEAD = 0.1  # s between forecasts
+MOST_NUMBERS = 6  # of a reading that a status has: with the rest at most 20 values
 MOST_STEPS = 100  # samples ahead: each takes about as long as judging one
 LEVELS = {
     State.INSIDE: DiagnosticStatus.OK,
     State.WARNING: DiagnosticStatus.WARN,
     State.ASSUMPTION_VIOLATED: DiagnosticStatus.ERROR,
     State.OUTSIDE: DiagnosticStatus.ERROR,
-    State.UNKNOWN: DiagnosticStatus.STALE,
+    State.UNKNOWN: DiagnosticStatus.WARN,
 }
 
 
@@ -63,6 +65,7 @@ class FunnelMonitor(ManagedNode):
     """Reads stamped signals, asks the core's Monitor, publishes what it says."""
 
     name = "funnel_monitor"
+    task = "verdict"
     is_watched = True
     parameters = (
         *DESIGN,
@@ -84,19 +87,6 @@ class FunnelMonitor(ManagedNode):
             "command_wait", 0.02, "s a response waits for its command", (1e-4, 1.0), tunable=True
         ),
         Parameter("warning_margin", 0.2, "warn below", (0.0, 1.0), tunable=True),
-        Parameter(
-            "warning_time", 0.0, "s: warn if exit is predicted sooner", (0.0, 60.0), tunable=True
-        ),
-        Parameter(
-            "hysteresis", 0.0, "margin above a threshold to come back", (0.0, 1.0), tunable=True
-        ),
-        Parameter(
-            "clear_after",
-            0.0,
-            "s a better state lasts before it is said",
-            (0.0, 60.0),
-            tunable=True,
-        ),
         Parameter(
             "forecast", 0.0, "s ahead of the newest sample; 0: none", (0.0, 60.0), tunable=True
         ),
@@ -123,11 +113,8 @@ class FunnelMonitor(ManagedNode):
 
     def tune(self, values: SimpleNamespace) -> None:
         """Take patience and warnings, also in the middle of a run."""
-        self._options = AlarmOptions(
-            values.warning_margin, values.warning_time, values.hysteresis, values.clear_after
-        )
         if self._watch is not None:
-            self._watch.warn(self._options)
+            self._watch.warning_margin = values.warning_margin
 
     @property
     def _patient_for(self) -> float:
@@ -154,7 +141,12 @@ class FunnelMonitor(ManagedNode):
         self.keep_reporting(self._on_heartbeat)
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._ahead = self.create_publisher(JointState, "~/forecast", qos.STREAM)
-        self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
+        self._flags: dict[str, bool] = {}
+        self._bools = {
+            name: self.create_publisher(Bool, f"~/{name}", qos.DOCUMENT)
+            for name in ("inside", "alarm")
+        }
+        self._flag()
         self._funnel = DesignSubscription(self, self._on_design, self._on_news)
         if controller := self.values.controller:
             self.create_subscription(String, f"{controller}/run", self._on_run, qos.DOCUMENT)
@@ -175,7 +167,8 @@ class FunnelMonitor(ManagedNode):
         """A proved design came, or another one: watch its signals from scratch."""
         announced = bool(self.values.controller)
         centre = Centre(self.values.nominal)
-        watch = Watch(design, centre=centre, options=self._options, announced=announced)
+        margin = self.values.warning_margin
+        watch = Watch(design, centre=centre, warning_margin=margin, announced=announced)
         for topic in self._topics.values():
             topic.drop()
         self._topics = {
@@ -295,26 +288,28 @@ class FunnelMonitor(ManagedNode):
         assert self._watch is not None
         return "" if topic in self._watch.pairing.shared_topics else self._topics[topic].several
 
-    def _on_signal(self, topic: str, message: Any, info: dict[str, int]) -> None:
-        """Decode stamp and values, and judge whatever samples are complete."""
+    def _on_signal(self, topic: str, data: bytes, info: dict[str, int]) -> None:
+        """Read stamp and values, and judge whatever samples are complete."""
         watch, heard = self._watch, self._topics[topic]
         assert watch is not None
         logged = watch.pairing.clock == "log"
-        stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
+        stamp_ns = self.get_clock().now().nanoseconds
         heard.silence.end(1)
-        if watch.pairing.measures(topic, message):
-            heard.numbers.update(info["publication_sequence_number"])
-        responds = topic in watch.pairing.response_topics
-        if not responds:
-            unfit = self._unfit_commands[topic] = "" if logged else self._off_clock(topic, stamp_ns)
-            if unfit:  # nor does a stamp far ahead say that no other command is still to come
-                self._publish(watch.missing(unfit, doubted=True))
-                return
-        elif reason := self._distrust(topic, message, logged=logged):
-            self._publish(watch.refuse(stamp_ns, reason))
-            return
         try:
-            judged = watch.message(topic, stamp_ns, message)
+            stamp_ns = watch.pairing.stamp(data, stamp_ns)
+            if watch.pairing.measures(topic, data):
+                heard.numbers.update(info["publication_sequence_number"])
+            responds = topic in watch.pairing.response_topics
+            if not responds:
+                unfit = "" if logged else self._off_clock(topic, stamp_ns)
+                self._unfit_commands[topic] = unfit
+                if unfit:  # nor does a stamp far ahead say that no other command is still to come
+                    self._publish(watch.missing(unfit, doubted=True))
+                    return
+            elif reason := self._distrust(topic, data, logged=logged):
+                self._publish(watch.refuse(stamp_ns, reason))
+                return
+            judged = watch.message(topic, stamp_ns, data)
         except BagError as error:
             self._publish(watch.unreadable(topic, stamp_ns, str(error)))
             return
@@ -340,7 +335,7 @@ class FunnelMonitor(ManagedNode):
         if self._release.is_canceled():
             arm(self._release, wait_ns)
 
-    def _distrust(self, topic: str, message: Any, *, logged: bool) -> str:
+    def _distrust(self, topic: str, data: bytes, *, logged: bool) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
         said = self._doubt(topic)
         for each in self._topics.values():
@@ -348,7 +343,7 @@ class FunnelMonitor(ManagedNode):
         if said or logged:
             return said
         most = math.inf if self.values.allow_old_stamps else self._patient_for
-        said = self._topics[topic].distrust(message, most)
+        said = self._topics[topic].distrust(data, most)
         return said or next(filter(None, self._unfit_commands.values()), "")
 
     def _off_clock(self, topic: str, stamp_ns: int) -> str:
@@ -427,7 +422,7 @@ class FunnelMonitor(ManagedNode):
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN, at_once=True)
 
     def _say(self, reading: Reading, state: State, *, at_once: bool = False) -> None:
-        """Publish diagnostics, and an event, if the state changed; remember what to repeat.
+        """Publish diagnostics if the state changed; remember what to repeat.
 
         An alarm is repeated until ~/restart, whatever comes after it.
         """
@@ -442,10 +437,21 @@ class FunnelMonitor(ManagedNode):
                 self._latched = state, reading.reason
             if not self._help.is_awaited:
                 self._help.call()
+        self._flag()
         message = self._report()
-        self._events.publish(message)
         if news and state is not before:
             self._log(message.status[0])
+
+    def _flag(self) -> None:
+        """Publish whether the newest sample is inside, and whether an alarm is on, as they change.
+
+        `inside` is false while the state is unknown.
+        """
+        inside = self._said[1] in (State.INSIDE, State.WARNING)
+        for name, flag in (("inside", inside), ("alarm", self._latched is not None)):
+            if self._flags.get(name) is not flag:
+                self._flags[name] = flag
+                self._bools[name].publish(Bool(data=flag))
 
     def _log(self, said: DiagnosticStatus) -> None:
         """Into the terminal, for whoever sees nothing else."""
@@ -494,8 +500,9 @@ class FunnelMonitor(ManagedNode):
     def _numbers(self) -> dict[str, str]:
         """The reading's numbers, and counts, as diagnostics have them."""
         (reading, state), watch = self._said, self._watch
+        numbers = list(reading.numbers.items())  # ~/margin has all
         return {
-            **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
+            **{name.replace("_", " "): f"{n:.6g}" for name, n in numbers[:MOST_NUMBERS]},
             "now": state.value,
             "worst axis": reading.worst_axis,
             "assuming": reading.assuming,

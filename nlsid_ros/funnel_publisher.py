@@ -27,6 +27,7 @@ class FunnelPublisher(ManagedNode):
     """Publishes one proved funnel for as long as it runs."""
 
     name = "funnel_publisher"
+    task = "design"
     parameters = (
         *CHECK,
         Parameter(

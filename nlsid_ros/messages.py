@@ -2,21 +2,24 @@
 
 import math
 import re
+import struct
 import time
 from array import array
 from collections.abc import Mapping
 from copy import deepcopy
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock
 from rclpy.exceptions import InvalidTopicNameException
+from rclpy.serialization import serialize_message
 from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import JointState
 
-from bags.recordings.message_types import is_stamped
+from bags.recordings.cdr import ENCAPSULATION, Gatherer
+from bags.recordings.message_types import is_stamped, standard_types
 from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
 from nlsid_core import files
@@ -26,6 +29,8 @@ from nlsid_ros import qos
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.running import ManagedNode
 
+_STAMP: Final = struct.Struct("<iI")
+_NUMBERS: Final = "sensor_msgs/msg/JointState"
 ZERO: Final = "zero"
 REFUSED: Final = "refused"
 OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
@@ -53,14 +58,13 @@ class SignalMessage:
     if the type has no header stamp or no number there, or `others` does not fit it.
     """
 
-    def __init__(self, path: SignalPath | SignalVector, msgtype: str, others: str = ZERO) -> None:
+    def __init__(self, path: SignalVector, msgtype: str, others: str = ZERO) -> None:
         types = installed_types(msgtype)
         path.check(msgtype, types)
         if not is_stamped(msgtype, types):
             raise BagError(f"{msgtype} has no header stamp, so {path} could not be paired")
         self.path, self.kind = path, message_class(msgtype)
-        self._paths = path.paths if isinstance(path, SignalVector) else (path,)
-        mine = {_plain(p) for p in self._paths}
+        mine = {_plain(p) for p in path.paths}
         self.rest = [
             name
             for name, *_ in numeric_paths(msgtype, types)
@@ -116,9 +120,8 @@ class SignalMessage:
         """A message stamped `stamp_ns`; all that is not the signal is as `others` says."""
         message = self.kind() if self._base is None else deepcopy(self._base)
         message.header.stamp = stamp_of(stamp_ns)
-        for path, value in zip(
-            self._paths, np.broadcast_to(values, len(self._paths)).tolist(), strict=True
-        ):
+        numbers = np.broadcast_to(values, len(self.path.paths)).tolist()
+        for path, value in zip(self.path.paths, numbers, strict=True):
             _make_room(path, message)
             path.assign(message, value)
         return message
@@ -200,12 +203,6 @@ def _make_room(path: SignalPath, message: Any) -> None:
         owner = part
 
 
-def frame_of(message: Any) -> str:
-    """The frame that a message is in, and the one that moves if it names it."""
-    child = getattr(message, "child_frame_id", "")
-    return f"{message.header.frame_id}, {child}" if child else str(message.header.frame_id)
-
-
 def patience(stale_after: float, period: float) -> float:
     """s to wait for a response: as given, or where that is 0 some periods (s), not too few."""
     return stale_after or max(LEAST_PATIENCE, PATIENT_PERIODS * period)
@@ -235,11 +232,24 @@ def stamp_of(stamp_ns: int) -> Time:
     return Time(sec=sec, nanosec=nanosec)
 
 
-def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> JointState:
-    """Named numbers at a stamp."""
-    message = JointState(name=list(numbers), position=array("d", numbers.values()))
-    message.header.stamp, message.header.frame_id = stamp_of(stamp_ns), frame
-    return message
+def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> bytes:
+    """A serialised JointState of named numbers at a stamp, as a publisher takes it."""
+    blank, at = _blank(tuple(numbers), frame)
+    data = bytearray(blank)
+    _STAMP.pack_into(data, ENCAPSULATION, *divmod(stamp_ns, 10**9))
+    struct.pack_into(f"<{len(numbers)}d", data, at, *numbers.values())
+    return bytes(data)
+
+
+@lru_cache(maxsize=16)
+def _blank(names: tuple[str, ...], frame: str) -> tuple[bytes, int]:
+    """A serialised JointState of these names, and where its positions are."""
+    message = JointState(name=list(names), position=array("d", [0.0] * len(names)))
+    message.header.frame_id = frame
+    data = serialize_message(message)
+    first = SignalPath.parse("/numbers:position[0]").steps
+    (group,) = Gatherer(_NUMBERS, standard_types(), [first]).layout(data).groups
+    return data, int(group.offsets[0])
 
 
 def stamp_ns_of(message: Any) -> int:

@@ -28,6 +28,7 @@ class ModelIdentifier(ManagedNode):
     """One identification at a time; callbacks only start, look at and end the worker."""
 
     name = "model_identifier"
+    task = "identification"
     parameters = (
         Parameter("bags", [""], "bags or folders of bags, read when ~/identify is called"),
         Parameter("last", 0, "only the last so many of the bags; 0: all", (0, 10_000)),

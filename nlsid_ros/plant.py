@@ -146,7 +146,7 @@ class PlantNode(ManagedNode):
 
     def _on_command(self, message: Any) -> None:
         try:
-            values = np.atleast_1d(self._command.path.value(message))
+            values = np.array([path.value(message) for path in self._command.path.paths])
         except BagError as error:
             self.get_logger().error(str(error))
             return

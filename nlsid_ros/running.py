@@ -92,6 +92,7 @@ class Parameter(NamedTuple):
 
 
 AUTOSTART = Parameter("autostart", True, "start at once; false: wait for a lifecycle manager")
+HARDWARE = Parameter("hardware_id", "", "of the status on /diagnostics; empty: the host's name")
 
 
 class ManagedNode(LifecycleNode):
@@ -102,12 +103,14 @@ class ManagedNode(LifecycleNode):
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
     those instead of the process's.
 
-    name: the node's. parameters: what it declares; their values are in `values`, read anew when it
-    is configured. is_watched: it ends if its executor stands still (`nlsid_ros.watchdog`); so it
-    must not sleep for long. is_over: it has nothing left to do, and its process ends.
+    name: the node's. task: what its status is about. parameters: what it declares; their values are
+    in `values`, read anew when it is configured. is_watched: it ends if its executor stands still
+    (`nlsid_ros.watchdog`); so it must not sleep for long. is_over: it has nothing left to do, and
+    its process ends.
     """
 
     name: ClassVar[str]
+    task: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     is_watched: ClassVar[bool] = False
 
@@ -125,6 +128,7 @@ class ManagedNode(LifecycleNode):
         manager = next(each for each in self.services if each.srv_type is ChangeState)
         self._change_state, manager.callback = manager.callback, self._on_change_state
         self.autostart = bool(self._declared(AUTOSTART))
+        self._hardware = str(self._declared(HARDWARE)) or socket.gethostname()
         try:
             self._read()
         except NlsidError as error:
@@ -181,10 +185,10 @@ class ManagedNode(LifecycleNode):
     def report(self, level: bytes, text: str, values: Mapping[str, str]) -> DiagnosticArray:
         """Say how the node is; level: a constant of DiagnosticStatus. Return what was published.
 
-        The status has the node's name with its namespace, so that two robots' are told apart.
+        The status is called `namespace/node: task`, so that two robots' are told apart.
         """
-        status = DiagnosticStatus(level=level, message=text, hardware_id=socket.gethostname())
-        status.name = self.get_fully_qualified_name().removeprefix("/")
+        status = DiagnosticStatus(level=level, message=text, hardware_id=self._hardware)
+        status.name = f"{self.get_fully_qualified_name().removeprefix('/')}: {self.task}"
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
@@ -291,7 +295,7 @@ class ManagedNode(LifecycleNode):
         return parameter.meant(self.get_parameter(parameter.name).value)
 
     def _on_parameters(self, changed: list[Given]) -> SetParametersResult:
-        rows = {each.name: each for each in (AUTOSTART, *self.parameters)}
+        rows = {each.name: each for each in (AUTOSTART, HARDWARE, *self.parameters)}
         try:
             asked = {
                 each.name: rows[each.name].meant(each.value)

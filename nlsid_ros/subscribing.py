@@ -14,12 +14,13 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from bags.recordings.definitions import Definition
+from bags.recordings.message_types import header_frames, header_stamp_ns
 from bags.recordings.quality import Profile, profile_of
 from bags.signals.arrivals import Sequence
 from nlsid_core.errors import NlsidError
 from nlsid_ros import graph, qos
-from nlsid_ros.message_classes import message_class
-from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
+from nlsid_ros.message_classes import installed_types, message_class
+from nlsid_ros.messages import off_clock
 from nlsid_ros.type_descriptions import TypeDescriptions
 
 Received = Callable[[Any, dict[str, int]], None]
@@ -98,6 +99,8 @@ class Silence:
 class Topic:
     """A topic's subscription, as its publishers offer it, and what is known of what comes.
 
+    `callback` gets serialised messages: what a node needs of them is read where it is.
+
     publishers: those of the type that is subscribed to. silence, numbers: of its messages, noted by
     whoever hears them. frame: the one that its messages have to be in; None: that of the next.
     anew: which publisher made it be subscribed to anew.
@@ -109,14 +112,12 @@ class Topic:
         name: str,
         callback: Received,
         profile: QoSProfile = qos.STREAM,
-        *,
-        raw: bool = False,
     ) -> None:
         self.name, self.profile, self.kind, self.anew = name, profile, "", ""
         self.publishers: list[TopicEndpointInfo] = []
         self.silence, self.numbers = Silence(), Sequence()
         self.frame: str | None = None
-        self._node, self._raw, self._callback = node, raw, Informed(callback)
+        self._node, self._callback = node, Informed(callback)
         self._subscription: Subscription | None = None
 
     def look(self, kind: str, found: list[TopicEndpointInfo] | None = None) -> None:
@@ -136,7 +137,7 @@ class Topic:
         else:
             self.silence = Silence()
         self._subscription = self._node.create_subscription(
-            message_class(kind), self.name, self._callback, wanted, raw=self._raw
+            message_class(kind), self.name, self._callback, wanted, raw=True
         )
         self.kind, self.profile = kind, wanted
 
@@ -161,17 +162,17 @@ class Topic:
         turns = self.numbers.alternates
         return f"messages of several publishers come in turn on {self.name}" if turns else ""
 
-    def distrust(self, message: Any, most: float) -> str:
+    def distrust(self, data: bytes, most: float) -> str:
         """Why a response is not to be trusted though its number could be; empty if it is.
 
-        most: s that its stamp may be off this node's clock.
+        most: s that its stamp may be off this node's clock. Raises BagError if it has no header.
         """
-        frame = frame_of(message)
+        frame = header_frames(data, self.kind, installed_types(self.kind))
         if self.frame is None:
             self.frame = frame
         if frame != self.frame:
             return f"the response is in frame '{frame}', not in '{self.frame}'"
-        return off_clock(stamp_ns_of(message), self._node.get_clock(), most)
+        return off_clock(header_stamp_ns(data), self._node.get_clock(), most)
 
     def _say_anew(self) -> None:
         self.anew = "; ".join(
@@ -213,7 +214,7 @@ class Source:
     def __init__(
         self, node: Node, name: str, msgtype: str, publishers: list[TopicEndpointInfo]
     ) -> None:
-        self.topic = Topic(node, name, self._keep, qos.RECORDED, raw=True)
+        self.topic = Topic(node, name, self._keep, qos.RECORDED)
         self.topic.look(msgtype, publishers)
         self.type_hash = str(publishers[0].topic_type_hash)
         self.offered = tuple(profile_of(publisher.qos_profile) for publisher in publishers)

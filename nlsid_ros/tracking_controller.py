@@ -27,6 +27,7 @@ from std_srvs.srv import Trigger
 from bags.designs.documents import load_unproved
 from bags.designs.wiring import read_at, written_at
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
+from bags.recordings.message_types import header_stamp_ns
 from bags.signals.arrivals import Sequence
 from bags.signals.grid import seconds
 from nlsid_core import files
@@ -68,6 +69,7 @@ class TrackingController(ManagedNode):
     """Samples in, inputs out; between runs it is silent, so that others may drive."""
 
     name = "tracking_controller"
+    task = "tracking"
     parameters = (
         *DESIGN,
         Parameter("response_type", "nav_msgs/msg/Odometry", "type of the response's topic"),
@@ -232,13 +234,15 @@ class TrackingController(ManagedNode):
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """Take a design, but never in the middle of a run: stop that first."""
         values, response, command = self.values, read_at(design), written_at(design)
-        response.check(values.response_type, installed_types(values.response_type))
+        types = installed_types(values.response_type)
+        response.check(values.response_type, types)
         message = SignalMessage(command, values.command_type, values.others)
         if self._is_on:
             self._halt("the design was replaced")
         if self._design is None:
             self._command = message
             message.listen(self)
+            self._reader = response.reader(values.response_type, types)
             self._commands = self.create_publisher(
                 message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
@@ -282,19 +286,23 @@ class TrackingController(ManagedNode):
         self._tell("waiting for the response")
         return ""
 
-    def _on_response(self, message: Any, info: dict[str, int]) -> None:
-        """Decode, ask the core for the next input, and set it down for when it is due."""
+    def _on_response(self, data: bytes, info: dict[str, int]) -> None:
+        """Read it, ask the core for the next input, and set it down for when it is due."""
         controller, design = self._controller, self._design
         if controller is None:
             return
         assert design is not None
-        stamp_ns = stamp_ns_of(message)
         self._heard = time.monotonic()
         if not self._hears:
             self._hears, self._judged, self._sent = True, self._heard, self._heard
         self._responses.silence.end(1)
         self._responses.numbers.update(info["publication_sequence_number"])
-        distrust = self._responses.distrust(message, self._patient_for)
+        try:
+            stamp_ns, numbers = header_stamp_ns(data), self._reader.numbers(data)
+            distrust = self._responses.distrust(data, self._patient_for)
+        except BagError as error:
+            self._halt(str(error))
+            return
         if reason := self._responses.alternating or distrust:
             self._halt(reason)
             return
@@ -309,11 +317,7 @@ class TrackingController(ManagedNode):
             self._first_ns = stamp_ns  # its input is not ours; the next sample's is
         else:
             waiting = controller.k < 1
-            try:
-                value = read_at(design).value(message)
-            except BagError as error:
-                self._halt(str(error))
-                return
+            value = numbers[0] if design.is_single else np.array(numbers)
             controller.update(seconds(stamp_ns, self._first_ns), value)
             if controller.lead or not controller.ended:
                 self._last_ns = stamp_ns

@@ -37,6 +37,7 @@ from nlsid_ros.type_descriptions import TypeDescriptions
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
+MOST_TOPICS = 12  # that a status names: with the rest it has at most 20 values
 SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
 EXPERIMENT = "experiment"  # and the custom datum that holds it
 
@@ -45,6 +46,7 @@ class TrajectoryRecorder(ManagedNode):
     """Records topics into one new bag after another."""
 
     name = "trajectory_recorder"
+    task = "recording"
     is_watched = True
     parameters = (
         Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
@@ -179,17 +181,17 @@ class TrajectoryRecorder(ManagedNode):
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
     ) -> None:
         arrival_ns = self._clock_of_log.at(info["received_timestamp"])
-        publish_ns = arrival_ns
+        stamp_ns = arrival_ns
         if stamped:
             with suppress(BagError):  # serialised by rules whose header we do not know
                 stamp_ns = header_stamp_ns(data)
-                publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
+        publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
         number = info["publication_sequence_number"]
         arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns, number)
         if self._recent is not None:
             self._recent.add(arrival)
         if self._recording is not None:
-            self._recording.add(arrival)
+            self._recording.add(arrival, stamp_ns)
 
     def lose(self, topic: str, count: int) -> None:
         """Count messages that could not wait."""
@@ -253,11 +255,11 @@ class TrajectoryRecorder(ManagedNode):
         return True, f"{count} messages in {path}"
 
     def _report(self) -> None:
-        """Counts per topic; a warning while a topic is missing, silent or losing messages."""
+        """Counts; a warning while a topic is missing, silent or losing messages."""
         recording = self._recording
         level, text, values = DiagnosticStatus.OK, "waiting for ~/start", {}
         if recording is not None:
-            values = {"bag": str(recording.bag.path)} | recording.counts()
+            values = {"bag": str(recording.bag.path)} | recording.summary(MOST_TOPICS)
             text = "recording"
             self._topics.follow()
             if warnings := [*recording.warnings(), *self._topics.warnings.values()]:

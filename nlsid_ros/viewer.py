@@ -60,7 +60,7 @@ class Viewer(ManagedNode):
             names = [pair.value for pair in status.values if pair.key == NAMES]
             self._scene.say(
                 stamp_ns_of(message),
-                status.name,
+                status.name.partition(":")[0],
                 status.level[0],
                 status.message,
                 names=names[0].splitlines() if names else (),

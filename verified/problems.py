@@ -172,6 +172,9 @@ class Increments:
         planned = type(about) is dict and "policy" in about and not stable
         roles = "model" if stable else "model policy funnel" if planned else "model funnel"
         (self.model, *others), digests = _bound(about, folder, roles, self.files)
+        given = others[-1].get("tubes") if others else None
+        if type(given) is list and any("direct" in tube for tube in given if type(tube) is dict):
+            raise NotCovered("a part of an innovation that is direct")
         strict.held(self.files)
         if any(entry["model"] != digests["model"] for entry in others):
             raise Refused("a file names another model")

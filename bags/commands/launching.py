@@ -1,18 +1,17 @@
 """A shipped launch file without ROS launch: its nodes as processes, started and ended together.
 
 `launch/*.launch.xml` is what `ros2 launch` reads, so that each workflow is written down once. Of
-its language this knows what those files use: arg, node, param, remap, `$(var NAME)` and `if`.
+its language this knows what those files use: arg, node, param, remap, `$(var NAME)`, `$(dirname)`
+and `if`.
 """
 
 import ctypes
-import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from nlsid_core.errors import DataError
 
 WORKFLOWS = ("monitor", "record", "control", "excite", "identify")  # that `nlsid run` lists
 LOOK = 0.2  # s between looks at whether all still run
+RESPAWN_DELAY = 1.0  # s, as in the launch files
 PATIENCE = 20.0  # s for a node to end when asked to
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
@@ -58,11 +58,18 @@ class LaunchFile:
     def commands(self, given: Sequence[str]) -> list[list[str]]:
         """A command line per node, for arguments written NAME:=VALUE.
 
-        Raises DataError if one is not known or a necessary one is missing.
+        /TOPIC:=NAME renames a topic for every node, as <set_remap> does. Raises DataError if an
+        argument is not known or a necessary one is missing.
         """
-        values = self._values(given)
+        renamed = [text for text in given if text.startswith("/") and ":=" in text]
+        values = self._values([text for text in given if text not in renamed])
         wanted = (n for n in self._nodes if _filled(n.get("if", "true"), values).lower() == "true")
-        return [_command(node, values) for node in wanted]
+        settings = [part for text in renamed for part in ("-r", text)]
+        return [[*_command(node, values), *settings] for node in wanted]
+
+    def respawns(self, given: Sequence[str]) -> bool:
+        """Whether a node that fails is to be started again."""
+        return "respawn:=true" in (text.lower() for text in given)
 
     def _values(self, given: Sequence[str]) -> dict[str, str]:
         values = {a.name: a.default for a in self.arguments}
@@ -72,6 +79,7 @@ class LaunchFile:
                 raise DataError(f"'{text}' is not one of the arguments of {self}")
             values[name] = value
         found = {name: value for name, value in values.items() if value is not None}
+        found = {n: v.replace("$(dirname)", str(self.path.parent)) for n, v in found.items()}
         missing = values.keys() - found.keys()
         if missing:
             raise DataError(f"{', '.join(sorted(missing))} missing; the arguments of {self}")
@@ -90,16 +98,11 @@ def launch_file(workflow: str) -> LaunchFile:
     return LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
 
 
-def in_one_process(commands: Sequence[Sequence[str]]) -> list[str]:
-    """The command of one process that holds the nodes of all these commands."""
-    nodes = [[module.rpartition(".")[2], *given] for _, _, module, *given in commands]
-    return [sys.executable, "-m", "nlsid_ros.together", json.dumps(nodes)]
-
-
-def run_together(commands: Sequence[Sequence[str]]) -> int:
+def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) -> int:
     """Run until a stop signal or until one ends, then end all; the worst of their exit statuses.
 
-    On Linux they also end when this process is killed, by SIGTERM as if each had been asked to.
+    respawn: one that fails is started again, RESPAWN_DELAY later. On Linux they also end when this
+    process is killed, by SIGTERM as if each had been asked to.
     """
     asked = threading.Event()
     before = {
@@ -109,11 +112,15 @@ def run_together(commands: Sequence[Sequence[str]]) -> int:
     }
     running: list[subprocess.Popen[bytes]] = []
     try:
-        for command in commands:
-            process = subprocess.Popen(command, preexec_fn=_end_with(os.getpid()))
-            running.append(process)
-        while not asked.is_set() and all(process.poll() is None for process in running):
-            time.sleep(LOOK)
+        ending = _end_with(os.getpid())
+        running += [subprocess.Popen(command, preexec_fn=ending) for command in commands]
+        while not asked.is_set():
+            ended = [k for k, process in enumerate(running) if process.poll() is not None]
+            if ended and not (respawn and all(running[k].returncode for k in ended)):
+                break
+            asked.wait(RESPAWN_DELAY if ended else LOOK)
+            for k in () if asked.is_set() else ended:
+                running[k] = subprocess.Popen(commands[k], preexec_fn=ending)
     finally:
         for process in running:
             if process.poll() is None:
@@ -149,9 +156,13 @@ def _command(node: Element, values: Mapping[str, str]) -> list[str]:
     namespace = "/" + filled(node, "namespace").lstrip("/")  # as ROS launch takes `robot1`
     renamed = [("__node", filled(node, "name")), ("__ns", namespace)]
     renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
-    settings = [part for old, new in renamed for part in ("-r", f"{old}:={new}")]
+    settings = filled(node, "ros_args").split()
+    settings += [part for old, new in renamed for part in ("-r", f"{old}:={new}")]
     for each in node.iter("param"):
-        settings += ["-p", f"{filled(each, 'name')}:={filled(each, 'value')}"]
+        if "from" in each.attrib:
+            settings += ["--params-file", filled(each, "from")]
+        else:
+            settings += ["-p", f"{filled(each, 'name')}:={filled(each, 'value')}"]
     return [sys.executable, "-m", f"nlsid_ros.{filled(node, 'exec')}", "--ros-args", *settings]
 
 

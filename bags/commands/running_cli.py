@@ -100,12 +100,9 @@ def run(
             help="A design's folder for monitor and control; the rest as for `ros2 launch`.",
         ),
     ] = None,
-    one_process: Annotated[
-        bool, typer.Option("--one-process", help="All nodes in one process, on one executor.")
-    ] = False,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
-    from bags.commands.launching import WORKFLOWS, in_one_process, launch_file, run_together
+    from bags.commands.launching import WORKFLOWS, launch_file, run_together
 
     _refuse_without_rclpy()
     if not workflow:
@@ -114,8 +111,8 @@ def run(
         raise typer.Exit(2)
     if workflow not in WORKFLOWS:
         raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
-    commands = launch_file(workflow).commands(_launch_arguments(arguments or []))
-    raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
+    file, given = launch_file(workflow), _launch_arguments(arguments or [])
+    raise typer.Exit(run_together(file.commands(given), respawn=file.respawns(given)))
 
 
 def _launch_arguments(given: list[str]) -> list[str]:

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Sequence
 
 from bags.signals.expressions import Expression
 from bags.signals.sampling import Sampler
-from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.dynamics import VectorField
@@ -27,29 +26,25 @@ def wiring_of(
 
 def sampler_of(design: AnyDesign) -> Sampler:
     """What makes samples of messages, by the rule that the model was identified with."""
+    y, u = _texts(design)
     if isinstance(design.model, VectorField):
-        y, u = (
-            [str(Expression.parse(text).path) for text in part]
-            for part in (design.wired.response, design.wired.command)
-        )
-    else:
-        y, u = ([signal.path for signal in part] for part in design.signals)
+        y, u = ([str(Expression.parse(text).path) for text in part] for part in (y, u))
     return Sampler(y, u, period=design.period)
 
 
-def read_at(design: AnyDesign) -> SignalPath | SignalVector:
+def read_at(design: AnyDesign) -> SignalVector:
     """Where a policy reads outputs or state; BagError if they are not on one topic."""
-    if isinstance(design.model, VectorField):
-        return SignalVector.parse(design.wired.response)
-    return _place([signal.path for signal in design.signals[0]], single=design.is_single)
+    return SignalVector.parse(_texts(design)[0])
 
 
-def written_at(design: AnyDesign) -> SignalPath | SignalVector:
+def written_at(design: AnyDesign) -> SignalVector:
     """Where a policy writes the inputs; BagError if they are not on one topic."""
+    return SignalVector.parse(_texts(design)[1])
+
+
+def _texts(design: AnyDesign) -> tuple[Sequence[str], Sequence[str]]:
+    """The signals of outputs or state, and those of inputs."""
     if isinstance(design.model, VectorField):
-        return SignalVector.parse(design.wired.command)
-    return _place([signal.path for signal in design.signals[1]], single=design.is_single)
-
-
-def _place(texts: Sequence[str], *, single: bool) -> SignalPath | SignalVector:
-    return Expression.parse(texts[0]).path if single else SignalVector.parse(texts)
+        return design.wired.response, design.wired.command
+    responses, commands = design.signals
+    return [signal.path for signal in responses], [signal.path for signal in commands]

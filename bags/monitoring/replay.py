@@ -441,8 +441,7 @@ def _fed(
             if doubt and message.topic in watch.pairing.response_topics:
                 yield watch.refuse(stamp_ns, doubt)
                 continue
-            decoded = decode(message.data, *source.types_on(message.topic))
-            yield watch.message(message.topic, stamp_ns, decoded)
+            yield watch.message(message.topic, stamp_ns, message.data)
 
 
 def _doubt(sampler: Sampler, source: Bag) -> str:

@@ -11,7 +11,7 @@ from bags.designs.wiring import sampler_of
 from bags.signals.grid import seconds
 from bags.signals.sampling import LOST, NOT_FINITE, Sample
 from nlsid_core.designs import AnyDesign
-from nlsid_core.running.alarm import Alarm, AlarmOptions, State
+from nlsid_core.running.alarm import State, state_of
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.forecast import Forecast
 from nlsid_core.running.reading import Reading, Status
@@ -39,7 +39,8 @@ class Watch:
     the readings is s since the run's first sample or announced start. samples: since then; lost,
     filled: those of them that nobody measured, and so not judged (`LOST`, `Sample.filled`); judged:
     since a run began, which may have been by itself. `pairing.check` says whether messages have the
-    signals, `pairing.stamp` which of their times is the stamp.
+    signals, `pairing.stamp` which of their times is the stamp. warning_margin: below which a
+    sample that is inside is warned of.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class Watch:
         design: AnyDesign,
         *,
         centre: Centre = Centre.COMMAND,
-        options: AlarmOptions | None = None,
+        warning_margin: float = 0.0,
         announced: bool = False,
     ) -> None:
         self.design = design
@@ -56,19 +57,14 @@ class Watch:
         self._single = design.is_single
         self._count = len(self.pairing.responses)
         self._framed = any(signal.path.framed for signal in self.pairing.responses)
-        self._alarm = Alarm(options)
+        self.warning_margin = warning_margin
         self._announced = announced
         self.restart()
-
-    def warn(self, options: AlarmOptions) -> None:
-        """Warn as `options` say from the next sample on."""
-        self._alarm.options = options
 
     def restart(self) -> None:
         """Begin a new run: forget stamps, lags and budget."""
         self.pairing.restart()
         self.monitor.restart()
-        self._alarm.restart()
         self.origin_ns: int | None = None
         self.samples = self.lost = self.filled = self.judged = 0
         self._newest_ns = 0
@@ -106,12 +102,13 @@ class Watch:
         if not self.monitor.goes_on:
             self._over = last_ns, reason
 
-    def message(self, topic: str, stamp_ns: int, message: Any) -> list[Stamped]:
-        """Feed a decoded message of a checked topic; the readings that can be given now, in order.
+    def message(self, topic: str, stamp_ns: int, data: bytes) -> list[Stamped]:
+        """Feed a serialised message of a checked topic; the readings that can be given now, in
+        order.
 
-        Raises BagError if it lacks an element that a signal names.
+        Raises BagError if it cannot be read, or lacks an element that a signal names.
         """
-        return self._take(topic, stamp_ns, self.pairing.numbers(topic, message))
+        return self._take(topic, stamp_ns, self.pairing.numbers(topic, data))
 
     def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
         """Feed every response as one message; the readings that can be given now, in order."""
@@ -157,7 +154,7 @@ class Watch:
         t = seconds(stamp_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
         reason = f"no {self.design.name} in the last {silent_ns * 1e-9:.3g} s of the commands"
         reading = self.monitor.missing(t, reason)
-        return [*said, Stamped(stamp_ns, reading, self._alarm.update(reading))]
+        return [*said, self._stamped(stamp_ns, reading)]
 
     def missing(self, reason: str, *, doubted: bool = False) -> list[Stamped]:
         """The state is missing or stale, or its last sample is doubted: unknown from here on."""
@@ -165,7 +162,7 @@ class Watch:
             return []
         t = seconds(self._newest_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
         reading = self.monitor.missing(t, reason, doubted=doubted)
-        return [Stamped(self._newest_ns, reading, self._alarm.update(reading))]
+        return [self._stamped(self._newest_ns, reading)]
 
     def refuse(self, stamp_ns: int, reason: str) -> list[Stamped]:
         """A response that is not to be judged: unknown from here on."""
@@ -190,7 +187,6 @@ class Watch:
             if self._start_ns is not None and sample.stamp_ns >= self._start_ns:
                 self.origin_ns, self._start_ns = self._start_ns, None
                 self._over = math.inf, ""
-                self._alarm.restart()
                 self._give_lags()
             t = seconds(sample.stamp_ns, self.origin_ns)
             self._recent.append(sample)
@@ -217,8 +213,11 @@ class Watch:
                 judged_now = reading.status is not Status.UNKNOWN
                 self.judged = 0 if reading.waits else self.judged + judged_now
                 self._held = sample.stamp_ns, u
-            judged.append(Stamped(sample.stamp_ns, reading, self._alarm.update(reading)))
+            judged.append(self._stamped(sample.stamp_ns, reading))
         return judged
+
+    def _stamped(self, stamp_ns: int, reading: Reading) -> Stamped:
+        return Stamped(stamp_ns, reading, state_of(reading, self.warning_margin))
 
     def forecast(self, steps: int) -> tuple[int, Forecast] | None:
         """The newest judged sample's stamp (ns), and the forecast while its command is held.

@@ -25,6 +25,7 @@ from rosbags.typesys.store import Typestore
 from nlsid_core.errors import BagError
 
 HEADER: Final = "std_msgs/msg/Header"
+CHILD_FRAME: Final = ("child_frame_id", (Nodetype.BASE, ("string", 0)))  # after the header
 JAZZY: Final = "ros2_jazzy"
 NOETIC: Final = "ros1_noetic"
 IDL_SEPARATOR: Final = "=" * 80 + "\n"
@@ -74,6 +75,27 @@ def header_stamp_ns(data: bytes) -> int:
     layout = _LITTLE_ENDIAN_STAMP if data[1] else _BIG_ENDIAN_STAMP
     seconds, nanoseconds = layout.unpack_from(data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def header_frames(data: bytes, msgtype: str, types: Typestore) -> str:
+    """The frame that a CDR message with a header is in, and the one that moves if it names it.
+
+    Raises BagError if `data` is too short.
+    """
+    frame, end = _string(data, 12)
+    if types.fielddefs[msgtype][1][1:2] != [CHILD_FRAME]:
+        return frame
+    child, _ = _string(data, end + -end % 4)
+    return f"{frame}, {child}" if child else frame
+
+
+def _string(data: bytes, at: int) -> tuple[str, int]:
+    """The string at an offset of a CDR message, and where it ends."""
+    length = int.from_bytes(data[at : at + 4], "little" if data[1] else "big")
+    end = at + 4 + length
+    if end > len(data):
+        raise BagError(f"not a CDR message with a header: it has only {len(data)} bytes")
+    return data[at + 4 : end].rstrip(b"\0").decode("utf-8", "replace"), end
 
 
 def decode(data: bytes, msgtype: str, types: Typestore) -> object:

@@ -5,7 +5,7 @@ they come; the samples are equal bit for bit. What to call for a model's signals
 
     sampler = Sampler([y.path for y in ...], [u.path for u in ...], period=model.period)
     sampler.check(topic, msgtype, types)  # once for each of sampler.topics
-    for sample in sampler.message(topic, sampler.stamp(data, log_ns), decoded): ...
+    for sample in sampler.message(topic, sampler.stamp(data, log_ns), data): ...
     for sample in sampler.flush(until_ns): ...  # stop waiting for other topics
 
 The paths are expressions (`bags.signals.expressions`) and carry the whole rule, so that nothing
@@ -37,7 +37,7 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rosbags.typesys.store import Typestore
 
@@ -50,6 +50,7 @@ from bags.signals.expressions import (
     parse_factors,
     product,
 )
+from bags.signals.message_reader import MessageReader
 from bags.signals.reader import Samples
 from nlsid_core.errors import BagError, apart
 from nlsid_core.running.grid import TOLERANCE
@@ -155,6 +156,7 @@ class Sampler:
         self._single = all(len(part) == 1 for part in self.excitations)
         self.response_topics = tuple(dict.fromkeys(s.path.topic for s in self.responses))
         self.shared_topics = {s.path.topic for s in signals if s.path.framed}
+        self._readers: dict[str, MessageReader] = {}  # of each checked topic
         self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
         self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
         for k, signal in enumerate(signals):
@@ -195,27 +197,29 @@ class Sampler:
             signal.unit(msgtype, types)
             self._recorded[k] = signal.recorded_unit(msgtype, types)
             self._running[k] = signal.numbers.running(self._recorded[k])
+        paths = [self._signals[k].path for k in self._on[topic]]
+        self._readers[topic] = MessageReader(paths, msgtype, types)
 
     def stamp(self, data: bytes, log_ns: int) -> int:
         """The stamp (ns) of a serialised message that was logged, or live arrived, at `log_ns`."""
         return log_ns if self.clock == "log" else header_stamp_ns(data)
 
-    def message(self, topic: str, stamp_ns: int, message: Any) -> list[Sample]:
-        """Take a decoded message of a checked topic; the samples that are certain now."""
-        return self.take(stamp_ns, self.numbers(topic, message))
+    def message(self, topic: str, stamp_ns: int, data: bytes) -> list[Sample]:
+        """Take a serialised message of a checked topic; the samples that are certain now."""
+        return self.take(stamp_ns, self.numbers(topic, data))
 
-    def numbers(self, topic: str, message: Any) -> dict[int, float]:
-        """The numbers of a decoded message by their signals; BagError as `SignalPath.value`.
+    def numbers(self, topic: str, data: bytes) -> dict[int, float]:
+        """The numbers of a serialised message by their signals; BagError if it has not all.
 
         Signals are counted through responses first, then every factor of the excitations.
         """
-        return {k: self._signals[k].path.value(message) for k in self._on[topic]}
+        return dict(zip(self._on[topic], self._readers[topic].numbers(data), strict=True))
 
-    def measures(self, topic: str, message: Any) -> bool:
+    def measures(self, topic: str, data: bytes) -> bool:
         """Whether a message has any of its topic's signals; one of other transforms has none."""
         if not all(self._signals[k].path.framed for k in self._on[topic]):
             return True
-        return any(map(math.isfinite, self.numbers(topic, message).values()))
+        return any(map(math.isfinite, self.numbers(topic, data).values()))
 
     def unknown(self, topic: str) -> dict[int, float]:
         """What `numbers` gives for a message that cannot be read: NaN of each of its signals."""

@@ -2,14 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 from rosbags.typesys.store import Typestore
 
 from bags.signals.expressions import Expression
+from bags.signals.message_reader import MessageReader
 from bags.signals.signal import SignalPath
-from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
 
 
@@ -45,6 +43,6 @@ class SignalVector:
         for path in self.paths:
             path.check(msgtype, types)
 
-    def value(self, message: Any) -> FloatArray:
-        """The numbers in a decoded message; BagError as `SignalPath.value`."""
-        return np.array([path.value(message) for path in self.paths])
+    def reader(self, msgtype: str, types: Typestore) -> MessageReader:
+        """What reads the numbers in serialised messages of this type."""
+        return MessageReader(self.paths, msgtype, types)

@@ -188,8 +188,8 @@ class Scene:
             return Verdict("stale", STALE, what)
         word = next((word for word in WORDS if said.text.startswith(word)), "unknown")
         text = said.text.removeprefix(word).lstrip(":; ")
-        if word == "outside" or said.level == STALE:
-            return Verdict(word if said.level != STALE else "unknown", said.level, text)
+        if word == "unknown" or said.level == STALE:
+            return Verdict("unknown", STALE, text)
         if word not in ("inside", "warning"):
             return Verdict(word, said.level, text)
         if newest is None or now - newest.came > LATE:

@@ -3,15 +3,34 @@
 python -m docs.site.nodes        writes them into the page
 """
 
+import importlib
 import json
 import re
 from pathlib import Path
 
-from nlsid_ros.running import AUTOSTART
-from nlsid_ros.together import NODES, node_class
+from nlsid_ros.running import AUTOSTART, HARDWARE, ManagedNode
 
 PAGE = Path(__file__).parents[1] / "nodes.md"
 TABLE = re.compile(r"^\| parameter \|.*\n(\|.*\n)+", re.MULTILINE)
+
+
+NODES = {
+    "tracking_controller": "TrackingController",
+    "excitation": "Excitation",
+    "funnel_monitor": "FunnelMonitor",
+    "trajectory_recorder": "TrajectoryRecorder",
+    "plant": "PlantNode",
+    "viewer": "Viewer",
+    "model_identifier": "ModelIdentifier",
+    "funnel_publisher": "FunnelPublisher",
+    "bag_player": "BagPlayer",
+}
+
+
+def node_class(name: str) -> type[ManagedNode]:
+    """The class of a node of NODES."""
+    found: type[ManagedNode] = getattr(importlib.import_module(f"nlsid_ros.{name}"), NODES[name])
+    return found
 
 
 def filled(page: str) -> str:
@@ -25,7 +44,9 @@ def filled(page: str) -> str:
 def table(name: str) -> str:
     """The parameters of a node, in Markdown."""
     lines = ["| parameter | default | range | what |", "|---|---|---|---|"]
-    for row in sorted((AUTOSTART, *node_class(name).parameters), key=lambda row: row.name):
+    for row in sorted(
+        (AUTOSTART, HARDWARE, *node_class(name).parameters), key=lambda row: row.name
+    ):
         marked = " •" if row.tunable else ""
         between = "" if row.between is None else "{:g} to {:g}".format(*row.between)
         default = json.dumps(row.default)

@@ -64,8 +64,7 @@ def check(path: str | os.PathLike[str]) -> Verdict:
     Raises Rejected with the reason.
     OSError if `path` itself cannot be read.
     """
-    folder = Path(path).parent
-    return decide(read_regular(Path(path)), lambda name: read_regular(folder / name))
+    return decide(read_regular(Path(path)), lambda name: read_regular(Path(path).parent / name))
 
 
 def read_regular(path: Path) -> bytes:
@@ -104,14 +103,20 @@ def decide(content: bytes, read: Read) -> Verdict:
 
 
 def _decided(document: Node, read: Read) -> Verdict:
-    former = document.value.get("version") == 1
-    refuse_if(former, "version 1 left; make the proof again, by what wrote it", "left")
+    refuse_if(
+        document.value.get("version") == 1,
+        "version 1 left; make the proof again, by what wrote it",
+        "left",
+    )
     parts = document.document("proof", {"claim": itself, "proof": itself})
     kind = parts["claim"].kind()
     refuse_if(kind in LEFT, f"kind {kind} left with version 0.3", "left")
     refuse_if(kind not in KINDS, f"claim {kind!r} is unknown; known: {', '.join(KINDS)}", "unknown")
-    former = kind == "continuous_funnel" and "decay" in parts["claim"].value
-    refuse_if(former, f"decay, of a {kind}, left with version 0.3", "left")
+    refuse_if(
+        kind == "continuous_funnel" and "decay" in parts["claim"].value,
+        f"decay, of a {kind}, left with version 0.3",
+        "left",
+    )
     decide_claim: Any = import_module(f".{kind}", __package__).decide
     verdict: Verdict = decide_claim(parts["claim"], parts["proof"], read)
     return replace(verdict, kind=kind)

@@ -13,11 +13,21 @@ from itertools import product
 from typing import Any
 
 from . import text
-from .closed_loop import ClosedLoop, decide_pieces, decide_rates, read_hold, read_multiplier
+from .closed_loop import (
+    MAX_PIECES,
+    Case,
+    ClosedLoop,
+    Motion,
+    decide_pieces,
+    decide_rates,
+    pushed,
+    read_hold,
+    read_motion,
+    read_multiplier,
+)
 from .exact import Rows, at_most, dot, identity, inverse_forms, scaled, semidefinite, unit
 from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
 from .polynomials import Polynomial
-from .trajectory import MAX_PIECES, Case, Motion, pushed, read_motion
 
 SENTENCE = (
     "funnel: every solution that {whose} in it at a time from {start:exact} to {end:exact} s, such "
@@ -85,8 +95,7 @@ def inside(
         [*(multiplier * p - q for p, q in zip(left, right, strict=True)), -e]
         for left, right, e in zip(A, B, Bd, strict=True)
     ]
-    corner = 1 - multiplier - dot(d, Bd)
-    semidefinite([*rows, [*(-e for e in Bd), corner]], what)
+    semidefinite([*rows, [*(-e for e in Bd), 1 - multiplier - dot(d, Bd)]], what)
 
 
 def _decide_goal(node: Node, multiplier: Fraction, motion: Motion) -> str:
@@ -120,7 +129,10 @@ def _decide_valid(motion: Motion) -> None:
                 least, most = motion.limits[i]
                 beyond = (least < low and most < low + off) or (most > high and least > high - off)
                 refuse_if(beyond, f"the limits of u{i} lie where f is not valid", "not_valid")
-                room = room[least >= low : 2 - (most <= high)]
+                if most <= high:
+                    room.pop()
+                if least >= low:
+                    room.pop(0)
             kept += [(j, row, min(room)) for row in rows if room]
         for knot in (k, k + 1):
             forms = inverse_forms(motion.P[knot], [g for _, g, _ in kept], "P")
@@ -142,9 +154,8 @@ def _decide_decrease(motion: Motion, stated: dict[str, Any]) -> int:
         stated["kappa"].require({"should be positive": above}, "not_below")
         pushing = motion.pushing.issuperset(range(first, first + len(box)))
         stated["kappa"].require({"w does more than add constants": pushing}, "not_valid")
-    most = 1 if kappa else 2 ** len(box)
-    most *= count * len(motion.corners) * len(motion.modes)
-    limit(most, MAX_PIECES, "intervals, vertices and modes")
+    most = len(motion.corners) * (1 if kappa else 2 ** len(box)) * len(motion.modes)
+    limit(count * most, MAX_PIECES, "intervals, vertices and modes")
     values = [middle] if kappa else product(*box)
     multiplier = stated["multiplier"].monomials(motion.n)
 

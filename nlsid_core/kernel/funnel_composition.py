@@ -9,10 +9,10 @@ from fractions import Fraction
 from itertools import pairwise
 
 from . import text
+from .closed_loop import Motion
 from .continuous_funnel import decide_funnel, inside
 from .exact import scaled
 from .files import Node, Read, Rejected, bound_files, itself, limit, refuse_if
-from .trajectory import Motion
 
 MAX_STAGES = 100
 SENTENCE = (

@@ -134,8 +134,7 @@ def _read_monotone(node: Node) -> Model:
     _require_window(given["window"], len(u), None, node)
     fits = len(given["b"]) == len(given["window"]), len(given["u_offset"]) == len(u)
     node.require({"one b an entry of the window": fits[0], "one u_offset an input": fits[1]})
-    increases = e[2] > 0 or e[1] == e[2] == 0
-    node.require({"e should increase everywhere": increases}, "not_valid")
+    node.require({"e should increase everywhere": e[2] > 0 or e[1] == e[2] == 0}, "not_valid")
     slope = [(bytes([k]), (k + 1) * c) for k, c in enumerate(e) if c]
     E = [[slope, *([(bytes(1), -entry)] for entry in given["a"])]]
     F, H = identity(n + 1)[:n], [unit(0, n + 1)]
@@ -177,8 +176,7 @@ def _read_recorded_implicit(node: Node, bounds: Node | None) -> Model:
         states = [[(unit(i, n + len(window)), 1)] for i in range(n - p)]
         past = [[(list(e), c) for e, c in row] for row in shift] == states
         bounds.require({"on a box the states should be the past outputs": past})
-        box = _read_box(bounds, p, n, window, len(u))
-        hull = Hull(E, box, whole=p + n if p > 1 else 0)
+        hull = Hull(E, _read_box(bounds, p, n, window, len(u)), whole=p + n if p > 1 else 0)
         where = "while signals stay in the box"
     return Model(model["period"], y, u, F, identity(p + n)[:p], hull, where)
 
@@ -199,8 +197,7 @@ def _pointed(E: Entries) -> Hull | None:
     other = any(e[0] > 2 or any(e[1:]) for e, _ in slope)
     if len(E) > 1 or c <= 0 or other or any(any(e) for lag in lags for e, _ in lag):
         return None
-    least = a - b**2 / (4 * c)
-    return Hull([[[(bytes(len(slope[0][0])), least)], *lags]], ray=True)
+    return Hull([[[(bytes(len(slope[0][0])), a - b**2 / (4 * c))], *lags]], ray=True)
 
 
 def _require_window(window: Any, inputs: int, delays: int | None, node: Node) -> None:
@@ -253,8 +250,7 @@ def _read_cascade(node: Node) -> Model:
     # x_j = b1_j0 v(t) + … with v(t) = u + a1·past gives C_j; the same way behind f gives g_j.
     C = [[row[0] * a + b for a, b in zip(a1, _padded(row[1:], n1), strict=True)] for row in b1]
     g = [[row[0] * a + b for a, b in zip(a2, _padded(row[1:], n2), strict=True)] for row in b2]
-    first = [ZERO] * M + a1 + [ZERO] * n2
-    F = [first, *(unit(M + k, M + n) for k in range(n1 - 1))][:n1]
+    F = [[ZERO] * M + a1 + [ZERO] * n2, *(unit(M + k, M + n) for k in range(n1 - 1))][:n1]
     for i in range(n2):
         row = [g[j][i] for j in range(M)] + [ZERO] * n1 + unit(i + 1, n2 + 1)[:n2]
         row[M + n1] += a2[i]

@@ -29,11 +29,7 @@ Case = TypeVar("Case")
 
 
 class TooNarrow(Exception):  # noqa: N818 - a signal to try again
-    """The width of a ring does not hold a result; the width that does."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.width = width
+    """The width of a ring does not hold a result; its argument is the width that does."""
 
 
 @dataclass(frozen=True)
@@ -225,5 +221,5 @@ def at_width(count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], N
                 decide(ring, case)
                 break
             except TooNarrow as found:
-                limit(found.width, MAX_WIDTH, "bits of a coefficient")
-                ring = Ring(count, found.width)
+                (width,) = found.args
+                ring = Ring(count, limit(width, MAX_WIDTH, "bits of a coefficient"))

@@ -63,8 +63,7 @@ def expanded(parts: Mapping[str, Node], ring: Ring) -> Polynomial:
     squares = read_squares(parts, ring)
     summands, J = [], len(squares.grams) - 1
     for j, gram in enumerate(squares.grams):
-        norm = sum(map(abs, gram.values()))
-        constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, norm)
+        constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, sum(map(abs, gram.values())))
         basis = ring.bernstein([Fraction(i == j) for i in range(J + 1)])
         summands.append((squares.weight, basis * constants))
     return ring.weighted(summands)
@@ -73,27 +72,22 @@ def expanded(parts: Mapping[str, Node], ring: Ring) -> Polynomial:
 def positive(
     c: Polynomial, squares: Squares, ring: Ring, what: str, *, strict: bool = True
 ) -> None:
-    """Raise Rejected unless c > 0 (strict) or c >= 0 everywhere."""
-    left = remainder(c, squares, ring, what)
-    some = min(left.get(0, (0,))) > 0
-    refuse_if(strict and not some, f"{what}: not positive, only nonnegative", "not_positive")
+    """Raise Rejected unless c > 0 (strict) or c >= 0, for every s in [0, 1] and every x.
 
-
-def remainder(c: Polynomial, squares: Squares, ring: Ring, what: str) -> dict[int, tuple[int, ...]]:
-    """What r leaves on the diagonal by monomial, for each Bernstein coefficient: c >= Σ left v².
-
-    Raises Rejected if r is not diagonally dominant; TooNarrow if the ring is.
+    Raises TooNarrow if the ring is.
     """
     try:  # with c rounded down to few bits, which is nearly always enough
-        return _left(c, squares, ring, what, rounded=True)
+        left = _left(c, squares, ring, what, rounded=True)
     except Rejected:
-        return _left(c, squares, ring, what, rounded=False)
+        left = _left(c, squares, ring, what, rounded=False)
+    some = min(left.get(0, (0,))) > 0
+    refuse_if(strict and not some, f"{what}: not positive, only nonnegative", "not_positive")
 
 
 def _left(
     c: Polynomial, squares: Squares, ring: Ring, what: str, *, rounded: bool
 ) -> dict[int, tuple[int, ...]]:
-    """The same, in a unit of its own.
+    """What r leaves on the diagonal by monomial, for each Bernstein coefficient, in some unit.
 
     What is cut off a coefficient of c, from 0 to 1 in the last place, only adds to a square; where
     it is one of a product, all of it is charged. So c is as stated where something is left then.
@@ -161,8 +155,7 @@ def _gram(keys: list[int], shifts: list[int], rows: list[list[int]]) -> dict[int
     Rows are packed into one integer each, so that a row of R'R is a few products.
     """
     size, most = len(keys), max((abs(entry) for row in rows for entry in row), default=0)
-    largest = most * most * (len(rows) + 1)
-    width = largest.bit_length() // 8 + 1
+    width = (most * most * (len(rows) + 1)).bit_length() // 8 + 1
     lines = [(packed(row, width) << 8 * width * (size - len(row)), row) for row in rows]
     gram: dict[int, int] = {}
     for i, left in enumerate(keys):  # a row's last entry belongs to the last monomial

@@ -71,8 +71,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     steps, rooms = bases["steps"].items(len(u), len(u)), []
 
     def prove(ring: Ring, k: int) -> None:
-        after = {"x_next": x[k + 1], "S_next": S[k + 1]}
-        at = Sample(x=x[k], u=u[k], K=K[k], S=S[k], A=A[k], **after)
+        at = Sample(x=x[k], u=u[k], K=K[k], S=S[k], A=A[k], x_next=x[k + 1], S_next=S[k + 1])
         step = read_step(steps[k], model, at, ring)
         rooms.extend([_prove_chain(step, bases, funnel, chain, k) for chain in CHAINS])
 
@@ -128,24 +127,21 @@ def _implicit_addition(
     step: Members, stated: dict[str, Node], bound: Fraction, radius: Fraction, far: Fraction
 ) -> tuple[Fraction, Fraction]:
     """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
-    z, r, spread = step["kappa"] * radius, step["kappa"] * bound, nonnegative(stated["spread"])
+    z, rho, D = step["kappa"] * radius, step["kappa"] * bound, nonnegative(stated["spread"])
     wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
-    # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
-    far += spread * r
+    # The root of ξ: Δ, with |Δ| <= D|r|, is mapped to at most (state + ...) |r|.
+    far += D * rho
     at_most(z**2 + far**2, wide**2, f"{stated['extents'].where}: the first is too small")
-    mu = stretch(step["curvature"], wide, (1 + spread) * r, least=2)
-    mapped_to = step["state"] + step["rates"] * spread + mu * (1 + spread)
-    within = step["rates"] < 1 and mapped_to <= spread
+    mu = stretch(step["curvature"], wide, (1 + D) * rho, least=2)
+    within = step["rates"] < 1 and step["state"] + step["rates"] * D + mu * (1 + D) <= D
     stated["spread"].require({"two roots may differ by more": within}, "not_below")
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
     own = step["kappa_next"] * stated["reach"].number()
     at_most(z**2 + own**2, near**2, f"{stated['extents'].where}: the second is too small")
-    mu = stretch(step["curvature"], near, (1 + spread) * r, least=2)
-    shrink = 1 - step["rates"] - mu
-    if shrink > 0:
-        spread = min(spread, (step["state"] + mu) / shrink)
-    turned = step["rates"] * spread + mu * (1 + spread)
-    return far, (step["direct"] + step["through"] * turned) * r
+    m = stretch(step["curvature"], near, (1 + D) * rho, least=2)
+    if 1 - step["rates"] - m > 0:
+        D = min(D, (step["state"] + m) / (1 - step["rates"] - m))
+    return far, (step["direct"] + step["through"] * (step["rates"] * D + m * (1 + D))) * rho
 
 
 def _prove_box(
@@ -198,9 +194,15 @@ def _read_model(node: Node) -> Members:
 
 def _read_policy(node: Node, model: Members, made_for: str) -> Members:
     n, p = len(model["x"]), len(model["u"])
-    table: Table = {"law": itself, "period": (), "L": (n, n), "u": (None, p), "x": (None, n)}
-    made = {"model": made_for}
-    policy = node.document("policy", {**table, "K": (None, p, n)}, "sampled", made)
+    table: Table = {
+        "law": itself,
+        "period": (),
+        "L": (n, n),
+        "u": (None, p),
+        "x": (None, n),
+        "K": (None, p, n),
+    }
+    policy = node.document("policy", table, "sampled", {"model": made_for})
     steps = limit(len(policy["u"]), MAX_SAMPLES // n**3, f"steps of {n} states", least=1)
     node.require(
         {

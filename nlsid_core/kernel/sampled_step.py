@@ -41,7 +41,7 @@ def read_step(node: Node, model: Members, at: Sample, ring: Ring) -> Members:
         direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
         norm = {"state": B, "rates": combined(C, identity(d), -1), "through": L_w}
         for name, M in {**norm, "direct": direct}.items():
-            prove_norm(M, step[name], f"{where}: the bound {name}")
+            _at_most_square(product(M, transposed(M)), step[name], f"{where}: the bound {name}")
     else:
         rows = explicit_step(model["map"], at, T, ring)
         turned = ring.product(unit, ring.variables[:n])
@@ -78,8 +78,7 @@ def implicit_step(
 
 def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
     """x + T z and u - K T z."""
-    feedback = scaled(product(at.K, T), -1)
-    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
+    moved = ring.product([*T, *scaled(product(at.K, T), -1)], ring.variables[: len(T)])
     return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
 
 
@@ -120,11 +119,6 @@ def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: i
     )
 
 
-def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
-    """Raise Rejected unless |M v| <= bound |v| for every v."""
-    _at_most_square(product(M, transposed(M)), bound, what)
-
-
 def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
     """Raise Rejected unless |z| <= bound |M z| for every z."""
     MM = product(transposed(M), M)
@@ -132,6 +126,7 @@ def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
 
 
 def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
+    """Raise Rejected unless |M'v| <= bound |v| for every v."""
     semidefinite(combined(scaled(identity(len(MM)), bound**2), MM, -1), what)
 
 

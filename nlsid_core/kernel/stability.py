@@ -29,8 +29,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     P = given["P"]
     definite(P, "P")
     form = gap(model, rate**2, P, [], model.F, P)
-    what = "the decrease of V = x'Px at the stated rate"
-    positive(model, given["multipliers"], [(what, form)])
+    positive(model, given["multipliers"], [("the decrease of V = x'Px at the stated rate", form)])
     said = text.say(SENTENCE, rate=_shown(rate), period=model.period, where=model.where)
     return text.Verdict(said, 1 - rate, (), digests)
 

@@ -17,7 +17,7 @@ from .exact import definite
 from .files import Node, Read, Table, Terms, bound_files, itself, limit, one_of, refuse_if
 from .implicit_models import Implicit, derivative, read_implicit
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import WITNESS, expanded, read_squares, remainder
+from .positivity import WITNESS, expanded, positive, read_squares
 
 MAX_VARIABLES = 100
 STORAGE = {"2.11": " M", "2.13": " P", "2.19": ""}  # what a proof states of it, by set
@@ -35,8 +35,11 @@ Inequality = tuple[Polynomial, Vector]  # >= 0 where each of the domain is >= 0
 
 def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Rebuild the inequalities of the set from the model's numbers; each has its own witness."""
-    former = "set" not in claim.value
-    refuse_if(former, "a claim without a set is not decided since version 0.3", "left")
+    refuse_if(
+        "set" not in claim.value,
+        "a claim without a set is not decided since version 0.3",
+        "left",
+    )
     table: Table = {
         "kind": itself,
         "about": itself,
@@ -75,8 +78,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
 def _where(box: list[Any], n: int) -> str:
     shown = [text.PRINTED["exact_range"](ends) for ends in box]
     inputs = f" and every input in {' x '.join(shown[n:])}" if shown[n:] else ""
-    states = f"every state in {' x '.join(shown[:n])}{inputs}"
-    return states if box else "every state and input"
+    return f"every state in {' x '.join(shown[:n])}{inputs}" if box else "every state and input"
 
 
 def _positive_on(c: Polynomial, domain: Vector, parts: Mapping[str, Node], what: str) -> None:
@@ -90,7 +92,7 @@ def _positive_on(c: Polynomial, domain: Vector, parts: Mapping[str, Node], what:
         members = entry.members(f"of {WITNESS}")
         last = members["of"].whole(last + 1, len(domain) - 1)
         terms.append(-1 * (expanded(members, c.ring) * domain[last]))
-    remainder(c.ring.sum(terms), read_squares(parts, c.ring), c.ring, what)
+    positive(c.ring.sum(terms), read_squares(parts, c.ring), c.ring, what, strict=False)
 
 
 def _inequalities(

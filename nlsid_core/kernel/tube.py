@@ -4,7 +4,8 @@ The model runs twice under the same inputs: the simulation x, and the observer x
 after each step, e the innovation. Of x̄ = x̂ - x, x̄⁺ = F ζ + L e, o = y - y° = H ζ + e, ζ = (ν, x̄),
 the inequality of `increments` has to hold, with the funnel's ρ, P, R,
     for G = [F L], Q = P: V = x̄'Px̄ grows by no more than the innovation's energy,
-    for G = [H_j 1_j], Q = τ_j: V bounds output j.
+    for G = [H_j (1 - c_j) 1_j], Q = τ_j: V bounds what output j has beside the part c_j of e_j that
+    reaches it directly; |e_j| <= peak_j bounds that one. c_j = 0 if nothing is stated.
 Where a policy acts, F is F - κBK and H is H - κDK, κ in [0, 1], and its ends decide all between.
 A level may follow the commands, E <= level g(k) at every sample, g(k) = Σ_i w_i G_i(k) with
     G(k) = fading G(k-1) + v(k)²,   G = 0 before the run,
@@ -20,7 +21,19 @@ from fractions import Fraction
 
 from . import text
 from .exact import Matrix, at_most, combined, definite, unit
-from .files import Members, Node, Read, Table, bound_files, each, itself, limit, one_of, whole
+from .files import (
+    Members,
+    Node,
+    Read,
+    Table,
+    bound_files,
+    each,
+    itself,
+    limit,
+    one_of,
+    refuse_if,
+    whole,
+)
 from .increments import Model, gap, positive
 from .models import read_model
 from .signals import Signal, apart, ranges
@@ -62,6 +75,9 @@ START = "after {settling} samples ({span:up} s) the simulation starts at {whose}
 INLET = ", or where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
 SUM = "sum of {energy} <= {level} over {samples} samples"
 FADING = "E <= {level}{g} after every sample, E+ = {rho:exact} E + {energy} from 0{sum}"
+PEAK = "; the innovation of {name} at most {peak} in size at every sample"
+NEARLY = "nearly what was measured, carried to every command"
+LITTLE = Fraction(1, 5)  # of a half-width, below which this is said
 PAST = ", sums over the run's samples, each i samples ago"
 INSIDE = (
     "the inputs, and the outputs and states of simulation and observer, stay in {ranges}; that any "
@@ -110,9 +126,12 @@ def _decide_tube(tube: Members, tree: Node | None, modes: Sequence[tuple[str, Mo
     for mode, model in modes:
         positive(model, tree, _gaps(model, tube, mode))
     used, shares = tube["level"] + tube["rho"] * tube["inlet"], []
-    for tau, width, signal in zip(tube["tau"], tube["half_widths"], modes[0][1].y, strict=True):
-        shares.append(Fraction(used / (tau * width**2)))
-        at_most(shares[-1], 1, f"{signal.name} can leave the stated half-width {text.above(width)}")
+    rows = zip(tube["tau"], tube["half_widths"], tube["direct"], modes[0][1].y, strict=True)
+    for tau, width, (part, peak), signal in rows:
+        away = f"{signal.name} can leave the stated half-width {text.above(width)}"
+        refuse_if(part * peak >= width, away, "not_below")
+        shares.append(Fraction(used / (tau * (width - part * peak) ** 2)))
+        at_most(shares[-1], 1, away)
     return 1 - max(shares)
 
 
@@ -132,9 +151,12 @@ def _gaps(model: Model, tube: Members, mode: str) -> list[tuple[str, Matrix]]:
     F = [row + gain for row, gain in zip(model.F, tube["L"], strict=True)]
     what = f"the decrease of V up to the innovation's energy{mode}"
     found = [(what, gap(model, rho, P, R, F, P))]
-    for j, (row, tau) in enumerate(zip(model.H, tube["tau"], strict=True)):
+    for j, (row, tau, (part, _)) in enumerate(
+        zip(model.H, tube["tau"], tube["direct"], strict=True)
+    ):
         what = f"the bound on {model.y[j].name} by V{mode}"
-        found.append((what, gap(model, rho, P, R, [row + unit(j, p)], [[tau]])))
+        beside = [(1 - part) * entry for entry in unit(j, p)]
+        found.append((what, gap(model, rho, P, R, [row + beside], [[tau]])))
     return found
 
 
@@ -148,9 +170,16 @@ def _read_tube(node: Node, model: Model, policy: Members | None) -> Members:
         **dict.fromkeys(("tau", "half_widths"), (p,)),
         "assumption": lambda entry: entry.read(ASSUMPTION),
         "follows?": lambda entry: read_level(entry, len(model.u)),
-        "peak?": itself,
+        "direct?": (p,),
+        "peak?": itself,  # alone it is no part of the claim
     }
     tube = node.read(table)
+    direct = tube["direct"] or [Fraction(0)] * p
+    peaks = direct
+    if tube["direct"]:
+        node.require({"what is direct needs a peak": tube["peak"]})
+        peaks = tube["peak"].read({"at_most": (p,), "measured": itself})["at_most"]
+    tube["direct"] = list(zip(direct, peaks, strict=True))
     rho, energy = tube["rho"], tube["assumption"]["kind"] == "energy"
     ends = tube["assumption"]["samples"] is not None
     free = not tube["follows"] or (rho < 1 and not tube["inlet"])
@@ -160,6 +189,9 @@ def _read_tube(node: Node, model: Model, policy: Members | None) -> Members:
             "a level that follows the commands is for fading, without an inlet": free,
             "the observer should be the policy's": policy is None or tube["L"] == policy["L"],
             "with a policy no level follows the commands": not (policy and tube["follows"]),
+            "with a policy, or a level that follows commands, nothing is direct": not (
+                any(direct) and (policy or tube["follows"])
+            ),
         }
     )
     node.require(
@@ -168,6 +200,8 @@ def _read_tube(node: Node, model: Model, policy: Members | None) -> Members:
             and energy == (rho == 1),
             "tau and half_widths should be positive": min(tube["tau"] + tube["half_widths"]) > 0,
             "inlet and level should be 0 or more": min(tube["inlet"], tube["level"]) >= 0,
+            "peaks should be 0 or more, direct at most 1": min(direct + peaks) >= 0
+            and max(direct) <= 1,
         },
         "not_below",
     )
@@ -194,7 +228,22 @@ def _shown(model: Model, tube: Members) -> str:
         f"{signal.name} within {signal.quantity(text.above(width))}{root}"
         for signal, width in zip(model.y, tube["half_widths"], strict=True)
     )
-    return f"{widths} for {_samples(model, samples) if samples else 'ever'}"
+    lasting = _samples(model, samples) if samples else "ever"
+    return f"{widths} for {lasting}{_inferred(model, tube)}"
+
+
+def _inferred(model: Model, tube: Members) -> str:
+    """What of the half-widths is not the stated peak of an innovation; nothing if none is."""
+    rows = list(zip(model.y, tube["half_widths"], tube["direct"], strict=True))
+    if not any(part for _, _, (part, _) in rows):
+        return ""
+    shares = [1 - part * peak / width for _, width, (part, peak) in rows]
+    shown = " and ".join(
+        f"{signal.name} {text.above(share, 2)}"
+        for (signal, _, _), share in zip(rows, shares, strict=True)
+    )
+    nearly = f", {NEARLY}" if max(shares) < LITTLE else ""
+    return f" (inferred share {shown}{nearly})"
 
 
 def _samples(model: Model, count: int) -> str:
@@ -238,7 +287,7 @@ def _energy(model: Model, tube: Members) -> str:
     if len(model.y) == 1:
         energy = "e^2" if R == [[1]] else f"{text.exact(R[0][0])} e^2"
         squared = f"({model.y[0].unit})^2" if R == [[1]] and model.y[0].unit else ""
-    return text.say(
+    said = text.say(
         SUM if samples else FADING,
         energy=energy,
         level=Signal("", squared).quantity(text.below(tube["level"])),
@@ -247,6 +296,12 @@ def _energy(model: Model, tube: Members) -> str:
         g=" g" if follows else "",
         sum=f", g = {formula(follows, model.u)}" if follows else "",
     )
+    peaks = (
+        text.say(PEAK, name=signal.name, peak=signal.quantity(text.below(peak)))
+        for signal, (part, peak) in zip(model.y, tube["direct"], strict=True)
+        if part
+    )
+    return said + "".join(peaks)
 
 
 def read_level(node: Node, inputs: int) -> CommandLevel:
@@ -288,8 +343,7 @@ def _summand(term: Members, u: Sequence[Signal]) -> str:
     elif term["centre"]:
         product = f"({product} - {centre})"
     square = "" if product == scale == "1" else f"({product} / {scale})^2"
-    fading = text.exact(term["fading"])
-    return f"(sum {fading}^i {square or '1'})" if term["fading"] else square
+    return f"(sum {text.exact(term['fading'])}^i {square or '1'})" if term["fading"] else square
 
 
 def _plain(word: str, operators: str) -> str:

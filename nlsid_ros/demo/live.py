@@ -139,7 +139,7 @@ def alarmed(recording: Path, topic: str, bad: Replay) -> Outcome:
     came_ns = {header_stamp_ns(data): log_ns for log_ns, data, _ in _decoded(recording, topic)}
     for log_ns, _, message in _decoded(recording, DIAGNOSTICS):
         [status] = message.status
-        if status.name == "funnel_monitor" and status.level == ERROR:
+        if status.name.partition(":")[0] == "funnel_monitor" and status.level == ERROR:
             ms = (log_ns - came_ns[stamp_ns]) / 1e6
             said = f"ERROR {ms:.1f} ms after the first bad sample ({status.message})"
             return Outcome(bad.reason in status.message, f"sensor {FAULT}: {said}")

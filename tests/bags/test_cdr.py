@@ -2,6 +2,7 @@
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from bags.recordings.batch import Batch, joined
 from bags.recordings.cdr import MAX_LAYOUTS, Gatherer, UnreadableMessageError
 from bags.recordings.message_types import decode, standard_types, types_in_bag
+from bags.signals.message_reader import MessageReader
 from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError
 from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, header, odometry
@@ -112,7 +114,9 @@ def test_any_mixture_of_layouts_gives_what_the_decoder_gives(
     paths = [SignalPath.parse(f"/x:{path}") for path in PATHS]
     gatherer = Gatherer("pkg/msg/Mixed", TYPES, [path.steps for path in paths])
     found = np.array([column.astype(float) for column in gatherer.gather(batch_of(serialised))])
+    one_by_one = MessageReader(paths, "pkg/msg/Mixed", TYPES)
     for column, data in enumerate(serialised):
+        assert np.array(one_by_one.numbers(data)).tobytes() == found[:, column].tobytes()
         decoded = decode(data, "pkg/msg/Mixed", TYPES)
         expected = np.array([path.value(decoded) for path in paths])
         np.testing.assert_array_equal(found[:, column].view(np.uint64), expected.view(np.uint64))
@@ -201,6 +205,8 @@ def test_random_bytes_are_refused_or_read_as_the_decoder_does(tail: bytes) -> No
         decoded = decode(data, JOINT_TYPE, standard_types())
         expected = path.value(decoded)
     except BagError:
+        with suppress(BagError):
+            MessageReader([path], JOINT_TYPE, standard_types()).numbers(data)
         return  # the gatherer stops at the number and may read what a full decoder refuses
     found = Gatherer(JOINT_TYPE, standard_types(), [path.steps]).gather(batch_of([data]))
     np.testing.assert_array_equal(found[0][0], expected)

@@ -15,7 +15,7 @@ from bags.commands.launching import WORKFLOWS, LaunchFile
 from nlsid_core.errors import DataError
 
 ROOT = Path(__file__).resolve().parents[2]
-FILES = sorted((ROOT / "launch").iterdir())
+FILES = sorted((ROOT / "launch").glob("*.xml"))
 
 
 def flags(command: list[str], flag: str) -> dict[str, str]:
@@ -40,8 +40,9 @@ def test_every_node_and_parameter_in_a_launch_file_exists(path: Path) -> None:
         assert name in scripts
         assert node.attrib["pkg"] == "nlsid"
         section = page.split(f"## {name}\n")[1].split("\n## ")[0]
-        for parameter in node.iter("param"):
-            assert re.search(rf"^\| `{parameter.attrib['name']}`", section, re.MULTILINE)
+        named = {each.attrib["name"] for each in node.iter("param") if "name" in each.attrib}
+        for parameter in named - {"use_sim_time"}:  # which every node of ROS has
+            assert re.search(rf"^\| `{parameter}`", section, re.MULTILINE)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -63,6 +64,12 @@ def test_arguments_fill_parameters_names_and_remappings_and_conditions_choose_no
     assert renamed["__ns"] == "/a"
     assert renamed["odom"] == "/a/odom"
     assert renamed["cmd_vel"] == "cmd_vel"
+    all_alike = commands("monitor", "funnel:=f.json", "/imu:=/a/imu", "use_sim_time:=true")
+    for command in all_alike.values():
+        assert flags(command, "-r")["/imu"] == "/a/imu"
+        assert flags(command, "-p")["use_sim_time"] == "true"
+        assert "--params-file" in command
+        assert "--log-level" in command
 
 
 @pytest.mark.parametrize(

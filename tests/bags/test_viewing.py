@@ -89,7 +89,7 @@ def test_inside_ends_when_the_monitor_is_silent_though_samples_come(
         (STALE, "unknown: no speed for 0.1 s", "unknown", STALE),
         (STALE, "inside", "unknown", STALE),
         (ERROR, "inside; design refused: forged", "error", ERROR),
-        (OK, "whatever", "unknown", OK),
+        (OK, "whatever", "unknown", STALE),
     ],
 )
 def test_only_the_monitors_own_word_at_its_own_level_counts(

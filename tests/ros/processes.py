@@ -173,8 +173,10 @@ class Bench:
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self.said.setdefault(status.name, []).append((status.message, values))
-            self.levels[status.name] = status.level
+            assert len(values) <= 20
+            name = status.name.partition(":")[0]
+            self.said.setdefault(name, []).append((status.message, values))
+            self.levels[name] = status.level
 
     def start(self, name: str, **parameters: object) -> subprocess.Popen[str]:
         """Start a node of nlsid."""

@@ -8,21 +8,29 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from geometry_msgs.msg import TwistStamped
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
 
-from bags.recordings.message_types import is_stamped, standard_types
+from bags.recordings.message_types import (
+    header_frames,
+    header_stamp_ns,
+    is_stamped,
+    standard_types,
+)
 from bags.signals.sampling import Sampler
 from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
 from nlsid_core.errors import BagError
 from nlsid_ros.message_classes import _describe, installed_types, message_class
-from nlsid_ros.messages import SignalMessage
+from nlsid_ros.messages import SignalMessage, numbers_at
 from tests.ros.processes import ros_test
 
 pytestmark = ros_test
+JOINTS = "sensor_msgs/msg/JointState"
 GOALS = "nav_msgs/msg/Goals"  # a header and poses
 
 TWIST = "geometry_msgs/msg/TwistStamped"
-SPEED = SignalPath.parse("/cmd_vel:twist.linear.x")
+SPEED = SignalVector.parse(["/cmd_vel:twist.linear.x"])
 
 
 def test_the_other_fields_are_as_the_template_says() -> None:
@@ -69,7 +77,7 @@ def test_others_that_do_not_fit_are_refused_by_name(others: str, said: str) -> N
     ],
 )
 def test_others_in_lists_are_held_to_their_type_too(others: str, said: str) -> None:
-    wheel, kind = SignalPath.parse("/wheels:effort[0]"), "sensor_msgs/msg/JointState"
+    wheel, kind = SignalVector.parse(["/wheels:effort[0]"]), "sensor_msgs/msg/JointState"
     with pytest.raises(BagError, match=re.escape(said)):
         SignalMessage(wheel, kind, others)
     made = SignalMessage(wheel, kind, '{"name": ["a"], "velocity": [1, 2.5]}').make(0, 0.5)
@@ -82,6 +90,15 @@ def test_fields_on_a_topic_that_are_not_finite_are_not_passed_on() -> None:
         message.twist.angular.z = z
         made._on_other(message)
         assert made.lacking() == lacking
+
+
+def test_numbers_of_a_node_are_a_message_like_any_other() -> None:
+    for numbers, frame in (({"margin": 0.5, "latency": math.inf}, "of a run"), ({"low": -1.0}, "")):
+        data = numbers_at(1_500_000_007, numbers, frame)
+        message = deserialize_message(data, JointState)
+        assert dict(zip(message.name, message.position, strict=True)) == numbers
+        assert header_stamp_ns(data) == 1_500_000_007
+        assert header_frames(data, JOINTS, standard_types()) == message.header.frame_id == frame
 
 
 def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:
@@ -101,7 +118,7 @@ def test_an_installed_type_is_read_and_written_as_a_standard_one_is() -> None:
     )
     with pytest.raises(BagError, match="Field 'goal' does not exist"):
         SignalPath.parse("/goals:goal[0].x").check(GOALS, types)
-    header_only = SignalMessage(SignalPath.parse("/goals:header.stamp.sec"), GOALS)
+    header_only = SignalMessage(SignalVector.parse(["/goals:header.stamp.sec"]), GOALS)
     assert header_only.kind is message_class(GOALS)
 
 

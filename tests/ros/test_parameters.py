@@ -13,8 +13,8 @@ import rclpy
 from bags.chain.shipped import config_file
 from bags.samples import f1tenth
 from docs.site import nodes as page
+from docs.site.nodes import NODES, node_class
 from nlsid_core.errors import NlsidError
-from nlsid_ros.together import NODES, makers, node_class
 from tests.ros.processes import Bench, refusal, ros_test
 
 pytestmark = ros_test
@@ -91,9 +91,8 @@ def test_a_parameter_that_makes_no_sense_is_refused_by_name(
     arguments = ["--ros-args"]
     for key, value in parameters.items():
         arguments += ["-r" if key.startswith("__") else "-p", f"{key}:={value}"]
-    [make] = makers([[name, *arguments]])
     with pytest.raises((NlsidError, OSError), match=re.escape(message)):
-        make().start_itself()
+        node_class(name)(arguments).start_itself()
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM, Signals
 
@@ -207,44 +207,6 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
     assert not {"/odom", "/cmd_vel"} & names, "nothing is outside the namespaces"
 
 
-def test_all_nodes_in_one_process_hold_the_loop_while_a_proof_is_decided(
-    bench: Bench, margins: dict[int, dict[str, float]], funnel: Path, tmp_path: Path
-) -> None:
-    """Every sample is judged and has its command: nobody starves. Then a push, and an alarm."""
-    for file in funnel.parent.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    given = [
-        f"funnel:={tmp_path / funnel.name}",
-        f"model:={funnel.with_name(documents.MODEL)}",
-        "plant:=true",
-        "highest:=0.4",
-        "push:=0.6",
-        *PATIENT,
-    ]
-
-    def inside() -> list[int]:
-        return sorted(stamp for stamp, numbers in margins.items() if numbers["margin"] >= 0.0)
-
-    with live("control", *given, "--one-process"):
-        bench.hears("idle", "tracking_controller")
-        bench.hears("waiting for the controller", "funnel_monitor")
-        assert bench.call("/tracking_controller/start").success
-        bench.hears("inside", "funnel_monitor")
-        bench.said.clear()
-        proof = tmp_path / documents.FUNNEL_PROOF
-        proof.write_text(proof.read_text().replace('"proof":', " " * 10**6 + '"proof":'))
-        bench.hears("idle; stopped: the p", "tracking_controller")
-        stamps = inside()
-        assert len(stamps) == 117
-        assert {round((b - a) / 25e6) for a, b in pairwise(stamps)} == {1}
-        assert bench.call("/funnel_monitor/restart").success
-        bench.spin_until(lambda: bench.call("/tracking_controller/start").success)
-        bench.spin_until(lambda: len(inside()) > 140)
-        assert bench.call("/plant/push").success
-        bench.hears("outside the tube", "funnel_monitor")
-        bench.hears("idle; stopped: ", "tracking_controller")
-
-
 def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
     bench: Bench, funnel: Path, tmp_path: Path
 ) -> None:
@@ -345,7 +307,7 @@ def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     assert "stale_after:=0.0" in done.stderr
 
 
-TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
+TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/diagnostics']"
 
 
 @pytest.mark.parametrize(
@@ -423,7 +385,7 @@ def test_the_loop_is_closed_and_judged_as_in_replay_whether_pushed_gently_or_too
     assert bench.has_said("outside the tube")
     assert least < 0.0
     with Bag(bag) as source:
-        events = b"".join(m.data for m in source.messages(["/funnel_monitor/events"]))
+        events = b"".join(m.data for m in source.messages(["/diagnostics"]))
     assert b"above the level" in events
     with Bag(snapshot) as source:
         assert source.count("/odom") > 40, "what led there was kept"

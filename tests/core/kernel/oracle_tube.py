@@ -174,6 +174,16 @@ def quadratic(rows: Rows, P: Rows) -> Rows:
     ]
 
 
+def direct(tube: Json, j: int) -> tuple[Fraction, Fraction]:
+    """c_j and the peak of e_j."""
+    if "direct" not in tube:
+        return Fraction(0), Fraction(0)
+    peaks = tube["peak"]["at_most"]
+    assert set(tube["peak"]) == {"at_most", "measured"}
+    assert len(tube["direct"]) == len(peaks) == len(tube["tau"])
+    return exact(tube["direct"][j]), exact(peaks[j])
+
+
 def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, kept: int) -> bool:
     """(D) and every (O_j); the first `kept` entries of the box are not split."""
     box, ray, hull = shape
@@ -193,7 +203,7 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, k
         [[a - b for a, b in zip(x, y, strict=True)] for x, y in zip(supply, moved, strict=True)]
     ]
     for j in range(p):
-        h = H[j] + [Fraction(int(i == j)) for i in range(p)]
+        h = H[j] + [(1 - direct(tube, j)[0]) * int(i == j) for i in range(p)]
         forms.append(
             [[supply[a][b] - tau[j] * h[a] * h[b] for b in range(size)] for a in range(size)]
         )
@@ -304,8 +314,12 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
         kept = m + len(F) if model["kind"] == "implicit" and m > 1 and box else 0
         if not all(holds(F, H, m, tube, tree, (box, ray, hull), kept) for F, H in modes):
             return False
-        for tau, width in zip(tube["tau"], tube["half_widths"], strict=True):
-            if not width > 0 or level + rho * inlet > exact(tau) * exact(width) ** 2:
+        for j, (tau, width) in enumerate(zip(tube["tau"], tube["half_widths"], strict=True)):
+            c, peak = direct(tube, j)
+            if not 0 <= c <= 1 or peak < 0 or (c and ("follows" in tube or policy)):
+                return False
+            left = exact(width) - c * peak
+            if not (width > 0 and left > 0) or level + rho * inlet > exact(tau) * left**2:
                 return False
     return True
 

@@ -18,14 +18,14 @@ def test_the_kernels_polynomials_are_the_oracles_exactly(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: dict[str, oracle.P] = {}
-    decided = positivity.remainder
+    decided = positivity.positive
 
-    def watched(c: Any, squares: Any, ring: Any, what: str) -> Any:
+    def watched(c: Any, squares: Any, ring: Any, what: str, *, strict: bool) -> None:
         terms = {bytes(ring.exponents(k)): Fraction(v, c.denominator) for k, v in c.terms.items()}
         seen[what] = oracle.P(ring.count, {tuple(e): c for e, c in terms.items()})
-        return decided(c, squares, ring, what)
+        decided(c, squares, ring, what, strict=strict)
 
-    monkeypatch.setattr(stable_set, "remainder", watched)
+    monkeypatch.setattr(stable_set, "positive", watched)
     assert mutations.decide(case) == "proved"
     claim, proof = case.document["claim"], case.document["proof"]
     model = case.about[claim["about"]["model"]["file"]]

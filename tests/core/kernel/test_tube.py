@@ -174,6 +174,61 @@ def test_tau_is_proved_up_to_the_oracles_limit_and_refused_a_tenth_of_a_percent_
         decide(model, funnel, proof)
 
 
+def with_a_direct_part(c: float = 0.6, peak: float = 0.02) -> tuple[Json, Json, Json]:
+    """The linear model's tube with this part of every innovation bounded by its peak alone."""
+    model, funnel, proof = claim("linear")
+    tube = tubes(funnel)
+    share = np.linalg.inv(tube["P"])[0, 0] / tube["rho"] + (1.0 - c) ** 2 / tube["R"][0][0]
+    tau = 0.999 / share
+    width = 1.001 * np.sqrt(tube["level"] / tau) + c * peak
+    stated = {"at_most": [peak], "measured": [peak / 1.5]}
+    tube |= {"direct": [c], "peak": stated, "tau": [tau], "half_widths": [width]}
+    return model, funnel, proof
+
+
+def test_a_direct_part_of_an_innovation_narrows_a_tube_and_is_said() -> None:
+    model, funnel, proof = with_a_direct_part()
+    plain = claim("linear")[1]["tubes"][0]
+    assert tubes(funnel)["half_widths"][0] < plain["half_widths"][0]
+    said = decide(model, funnel, proof)
+    assert oracle.is_proved(model, funnel, proof)
+    assert "; the innovation of speed at most 0.02 m/s in size at every sample" in str(said)
+    assert "(inferred share speed 0." in said.statement
+    assert "nearly what was measured" not in said.statement
+    assert "nearly what was measured" in decide(*with_a_direct_part(1.0, 10.0)).statement
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda f: tubes(f).update(direct=[0.55]), "not_definite"),
+        (lambda f: tubes(f).update(direct=[0.7]), "not_below"),
+        (lambda f: tubes(f)["peak"].update(at_most=[0.022]), "not_below"),
+        (lambda f: tubes(f)["peak"].update(at_most=[10.0]), "not_below"),
+        (lambda f: tubes(f)["peak"].update(at_most=[-0.02]), "not_below"),
+        (lambda f: tubes(f).update(direct=[-0.1]), "not_below"),
+        (lambda f: tubes(f).update(direct=[1.01], half_widths=[1e3]), "not_below"),
+        (lambda f: tubes(f).update(direct=[0.6, 0.6]), "malformed"),
+        (lambda f: tubes(f).pop("peak"), "malformed"),
+        (lambda f: tubes(f)["peak"].update(level=1.0), "malformed"),
+        (
+            lambda f: tubes(f).update(follows=claim("following")[1]["tubes"][0]["follows"]),
+            "malformed",
+        ),
+        (lambda f: tubes(f).pop("direct"), "not_definite"),
+    ],
+)
+def test_a_forged_direct_part_is_refused(change: Callable[[Json], Any], reason: str) -> None:
+    model, funnel, proof = with_a_direct_part()
+    change(funnel)
+    with refused(reason):
+        decide(model, funnel, proof)
+    about = {MODEL: model, FUNNEL: funnel}
+    bindings = {"model": proofs.binding(MODEL, model), "funnel": proofs.binding(FUNNEL, funnel)}
+    document = proofs.proof_document({"kind": "tube", "about": bindings}, proof)
+    assert not oracle.agrees(document, about)
+
+
 def term(funnel: Json, i: int = 0) -> Json:
     return tubes(funnel)["follows"]["terms"][i]  # type: ignore[no-any-return]
 

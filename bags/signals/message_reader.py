@@ -1,0 +1,78 @@
+"""Read signals from the serialised messages of one topic, one after another as they come.
+
+A node decodes no messages: where the lengths in them stay as they were, the numbers are where they
+were. The values are those of `bags.signals.reader`, bit for bit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from bags.recordings.cdr import PADDING, Gatherer, Layout
+from bags.recordings.message_types import decode
+from bags.signals.signal import SignalPath
+
+
+class MessageReader:
+    """Reads the numbers at `paths`, all on one topic, whose messages are of the type `msgtype`."""
+
+    def __init__(self, paths: Sequence[SignalPath], msgtype: str, types: Typestore) -> None:
+        self._paths, self._kind = paths, (msgtype, types)
+        self._framed = any(path.framed for path in paths)
+        self._targets = [path.targets(msgtype, types) for path in paths]
+        targets = [target for group in self._targets for target in group]
+        self._gatherer = Gatherer(msgtype, types, targets)
+        self._layout: _Laid | None = None
+
+    def numbers(self, data: bytes) -> list[float]:
+        """The numbers in a serialised message, in the order of the paths.
+
+        A number is NaN if no message in an array has the name. Raises BagError if the message
+        cannot be read, a dynamic array is too short, or it lacks the element that is named.
+        """
+        if self._framed:  # which message of an array is meant differs from message to message
+            message = decode(data, *self._kind)
+            return [path.value(message) for path in self._paths]
+        if self._layout is None or not self._layout.fits(data):
+            self._layout = _Laid(self._gatherer.layout(data))
+        found = self._layout.numbers(data)
+        if len(found) == len(self._paths):
+            return found
+        values, at = [], 0
+        for path, group in zip(self._paths, self._targets, strict=True):
+            parts = [np.array([number]) for number in found[at : at + len(group)]]
+            values.append(float(path.combine(parts)[0]))
+            at += len(group)
+        return values
+
+
+class _Laid:
+    """A layout as one message is compared with it and read by it."""
+
+    def __init__(self, layout: Layout) -> None:
+        words = zip(layout.words.tolist(), layout.expected, strict=True)
+        fixed = [*layout.spans, *((at, word.tobytes()) for at, word in words)]
+        self._fixed = [(at, at + len(wanted), wanted) for at, wanted in fixed]
+        self._least = layout.end
+        self._most = layout.end + PADDING if layout.whole else np.inf
+        leaves = [
+            (target, at, np.dtype(group.kind.of), group.kind.is_bool)
+            for group in layout.groups
+            for target, at in zip(group.targets.tolist(), group.offsets.tolist(), strict=True)
+        ]
+        self._leaves = [leaf[1:] for leaf in sorted(leaves, key=lambda leaf: leaf[0])]
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a message has this layout."""
+        if not self._least <= len(data) <= self._most:
+            return False
+        return all(data[start:end] == wanted for start, end, wanted in self._fixed)
+
+    def numbers(self, data: bytes) -> list[float]:
+        """The numbers of a message that fits, in the order of the gatherer's targets."""
+        found = []
+        for at, kind, is_bool in self._leaves:
+            number = np.frombuffer(data, kind, 1, at).item()
+            found.append(float(bool(number) if is_bool else number))
+        return found
