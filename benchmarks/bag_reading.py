@@ -1,4 +1,4 @@
-"""Reading, cutting and converting a large bag: messages per second and memory, beside peers.
+"""Reading a large bag: messages per second and memory, beside peers.
 
 python -m benchmarks.bag_reading [--json] [--messages 2000000] [--data DIR]
 
@@ -8,8 +8,7 @@ Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
 deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
 machine does not count; the memory is that process's. Likewise `nlsid bag info` of the whole bag;
-and of one of COPIED messages the cut of a minute, as mcap's reader and writer do it by the index;
-the copy of all, as rosbags does it; and a DataFrame, as rosbags-dataframe does it.
+and of one of FRAMED messages a DataFrame, as rosbags-dataframe makes it.
 """
 
 import os
@@ -24,29 +23,22 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any, Final
 
 import numpy as np
-from rosbags.convert.converter import convert as by_rosbags
 
-from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
-from bags.tools.convert import convert
-from bags.tools.copies import What
 from bags.tools.tables import frame
 from benchmarks.cache import cache_folder
 from benchmarks.machine import parser, peers, tell
 
 MESSAGES: Final = 2_000_000
 SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
-STRETCH: Final = What(start="120", end="180")  # s
-COPIED: Final = 300_000  # messages of the bag that is cut, copied and put into frames
+FRAMED: Final = 300_000  # messages of the bag that is put into frames
 REPEATS: Final = 3
 JOINTS, ODOM, IMU = "/joint_states", "/odom", "/imu"
 TYPES: Final = {
@@ -189,37 +181,6 @@ def info(bag: Path, messages: int) -> int:
     return messages
 
 
-def copied(bag: Path, _messages: int, what: What | None = None) -> int:
-    """All of the bag, or a stretch."""
-    with TemporaryDirectory() as folder, Bag(bag) as source:
-        return convert([source], Path(folder) / "copy", what).messages
-
-
-def cut_by_mcap(bag: Path, _messages: int) -> int:
-    """The stretch with mcap's reader, which uses the index, and its writer."""
-    from mcap.reader import make_reader
-    from mcap.writer import Writer
-
-    start, end = (START_NS + int(1e9 * float(s)) for s in (STRETCH.start, STRETCH.end))
-    with next(bag.glob("*.mcap")).open("rb") as stream, TemporaryFile() as out:
-        writer = Writer(out)
-        writer.start()
-        channel = writer.register_channel("/all", "cdr", 0)
-        found = list(make_reader(stream).iter_messages(start_time=start, end_time=end))
-        for _, _, m in found:
-            writer.add_message(channel, m.log_time, m.data, m.publish_time, m.sequence)
-        writer.finish()
-    return len(found)
-
-
-def copied_by_rosbags(bag: Path, messages: int) -> int:
-    """All of the bag with rosbags' converter, to MCAP."""
-    types, rest = standard_types(), [()] * 4
-    with TemporaryDirectory() as folder:
-        by_rosbags([bag], Path(folder) / "a", "mcap", 9, "zstd", "storage", types, None, *rest)
-    return messages
-
-
 def framed(bag: Path, _messages: int) -> int:
     """Every field of a topic."""
     return len(frame(bag, [ODOM]))
@@ -260,12 +221,8 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
             rates[name].append(rate)
             if name == "ours":
                 peaks.append(peak)
-    small = generated_bag(None, COPIED)
-    pairs = ((partial(copied, what=STRETCH), cut_by_mcap), (copied, copied_by_rosbags))
-    cut, copy, frames = (
-        timed(ours, small, COPIED)[0] / timed(theirs, small, COPIED)[0]
-        for ours, theirs in (*pairs, (framed, framed_by_rosbags))
-    )
+    small = generated_bag(None, FRAMED)
+    frames = [timed(make, small, FRAMED)[0] for make in (framed, framed_by_rosbags)]
     median = {name: statistics.median(found) for name, found in rates.items()}
     return {
         "messages_per_s": median["ours"],
@@ -275,9 +232,7 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
         "ratio_rosbags": median["ours"] / median["rosbags"],
         "peak_mb": max(peaks),
         "info_s": messages / timed(info, bag, messages)[0],
-        "cut_ratio_mcap": 1 / cut,
-        "convert_ratio_rosbags": copy,
-        "frame_ratio_rosbags_dataframe": frames,
+        "frame_ratio_rosbags_dataframe": frames[0] / frames[1],
         "bag_mb": sum(file.stat().st_size for file in bag.iterdir()) / 1e6,
     }
 

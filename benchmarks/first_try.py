@@ -1,4 +1,4 @@
-"""Eleven problems written as a user writes them from the docs: default settings, no tuning.
+"""Twenty-three problems written as a user writes them from the docs: default settings, no tuning.
 
     python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N] [--limit S] [--out FILE]
 
@@ -108,11 +108,8 @@ def dubins(wind: float) -> Written:
             u[1],
         ]
 
-    def still(x: Any, u: Any) -> Any:
-        return rate(x, u, np.zeros(3))
-
     start, end = [0, 0, 0, 0, 0], [35, 15, 3, np.pi / 4, 0]
-    motion = plan_motion(still, start=start, end=end, seconds=4, u=[0, 0])
+    motion = plan_motion(calm(rate, 3), start=start, end=end, seconds=4, u=[0, 0])
     box = wind * np.array([[-1, 1], [-1, 1], [-1, 1]])
     return rate, ContinuousTracking(rate, motion, goal=[4, 3, 3, 0.3, 0.3], uncertain=box)
 
@@ -196,6 +193,172 @@ def quadrotor_16() -> Written:
     return rate, ContinuousTracking(rate, motion, goal=goal)
 
 
+def docking() -> Written:
+    """A spacecraft in a circular orbit comes to rest at a port; three limited thrusts."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # radial, along, across the orbit in m, their rates
+        n, a = 1.1e-3, u + w
+        radial, along = 3 * n**2 * x[0] + 2 * n * x[4] + a[0], a[1] - 2 * n * x[3]
+        return [*x[3:], radial, along, a[2] - n**2 * x[2]]
+
+    start, end = [10, -20, 5, 0, 0, 0], np.zeros(6)
+    motion = plan_motion(calm(rate, 3), start=start, end=end, seconds=60, u=[0, 0, 0])
+    goal, push, limits = 3 * [0.5] + 3 * [0.05], 3 * [[-1e-3, 1e-3]], 3 * [[-0.05, 0.05]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=push)
+
+
+def crane() -> Written:
+    """A trolley with a hoist; wind pushes the load."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # trolley and rope in m, sway in rad, their rates
+        turn = u[0] * np.cos(x[2]) + 9.81 * np.sin(x[2]) + 2 * x[4] * x[5] + w[0]
+        return [*x[3:], u[0], u[1], -turn / x[1]]
+
+    start, end = [0, 5, 0, 0, 0, 0], [4, 3, 0, 0, 0, 0]
+    motion = plan_motion(calm(rate, 1), start=start, end=end, seconds=6, u=[0, 0])
+    goal, limits = [0.3, 0.2, 0.1, 0.3, 0.2, 0.15], [[-2, 2], [-1, 1]]
+    gust = [[-0.05, 0.05]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=gust)
+
+
+def differential_drive() -> Written:
+    """Two driven wheels that slip sideways and turn too far."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # position in m, heading in rad, speed, turn rate
+        c, s = np.cos(x[2]), np.sin(x[2])
+        return [x[3] * c - w[0] * s, x[3] * s + w[0] * c, x[4] + w[1], u[0], u[1]]
+
+    start, end = [0, 0, 0, 1, 0], [4, 1.5, 0.5, 1, 0]
+    motion = plan_motion(calm(rate, 2), start=start, end=end, seconds=4, u=[0, 0])
+    goal, limits, slip = [0.3, 0.3, 0.2, 0.3, 0.3], [[-1, 1], [-2, 2]], 2 * [[-0.03, 0.03]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=slip)
+
+
+def two_link_arm() -> Written:
+    """Two links in a plane, a limited torque at each joint."""
+
+    def rate(x: Any, u: Any) -> Any:  # angles in rad, their rates
+        c, s = 0.4 * np.cos(x[1]), 0.4 * np.sin(x[1])
+        torque = [u[0] + s * x[3] * (2 * x[2] + x[3]), u[1] - s * x[2] ** 2]
+        a = solve([[1.6 + 2 * c, 0.5 + c], [0.5 + c, 0.5]], torque)
+        return [x[2], x[3], a[0], a[1]]
+
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[1, 0.8, 0, 0], seconds=2, u=[0, 0])
+    goal, limits = [0.1, 0.1, 0.3, 0.3], [[-10, 10], [-6, 6]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits)
+
+
+def climb() -> Written:
+    """An airplane climbs 60 m in gusts; thrust that lags and lift, both limited."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # along, height in m, speed, path angle, thrust
+        c, s = np.cos(x[3]), np.sin(x[3])
+        slows = 9.81 * s + 1e-3 * x[2] ** 2
+        turns = (u[1] - 9.81 * c) / x[2]
+        return [x[2] * c + w[0], x[2] * s + w[1], x[4] - slows, turns, 2 * (u[0] - x[4])]
+
+    start, end = [0, 0, 40, 0, 1.6], [400, 60, 40, 0, 1.6]
+    motion = plan_motion(calm(rate, 2), start=start, end=end, seconds=10, u=[1.6, 9.81])
+    goal, limits, gust = [8, 5, 3, 0.15, 1.5], [[-2, 8], [0, 20]], 2 * [[-0.5, 0.5]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=gust)
+
+
+def vtol() -> Written:
+    """A planar aircraft on its thrust, in gusts; thrust and turning acceleration are limited."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # position in m, tilt in rad, their rates
+        side, up = w[0] - u[0] * np.sin(x[2]), u[0] * np.cos(x[2]) - 9.81 + w[1]
+        return [*x[3:], side, up, u[1]]
+
+    end, limits = [3, 1, 0, 0, 0, 0], [[2, 18], [-8, 8]]
+    options: Any = {"start": np.zeros(6), "end": end, "seconds": 3, "u": [9.81, 0]}
+    motion = plan_motion(calm(rate, 2), limits=limits, **options)
+    goal, gust = [0.4, 0.4, 0.2, 0.6, 0.6, 0.6], 2 * [[-0.2, 0.2]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=gust)
+
+
+def lane_change() -> Written:
+    """A lane change at 20 m/s on tyres that saturate, in a side wind; the steering's rate."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # across, heading, sideways speed, turn rate, steering
+        front, rear = x[4] - (x[2] + 1.2 * x[3]) / 20, (1.4 * x[3] - x[2]) / 20
+        f, r = (9 * np.sin(1.4 * np.arctan(10 * slip)) for slip in (front, rear))
+        side, turn = (1.4 * f + 1.2 * r) / 2.6, 0.38 * (f - r)
+        across = 20 * np.sin(x[1]) + x[2] * np.cos(x[1])
+        return [across, x[3], side - 20 * x[3] + w[0], turn, u[0]]
+
+    motion = plan_motion(calm(rate, 1), start=np.zeros(5), end=[3, 0, 0, 0, 0], seconds=3, u=[0])
+    goal, limits, wind = [0.4, 0.08, 0.6, 0.3, 0.05], [[-0.6, 0.6]], [[-0.3, 0.3]]
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=limits, uncertain=wind)
+
+
+def segway() -> Written:
+    """A pendulum on wheels with dry friction; the force is limited."""
+
+    def rate(x: Any, u: Any) -> Any:  # position in m, tilt in rad, their rates
+        c, s = 0.5 * np.cos(x[1]), np.sin(x[1])
+        push = u[0] - 0.5 * np.tanh(x[2] / 0.1) + 0.5 * s * x[3] ** 2
+        a = solve([[1.5, c], [c, 0.35]], [push, 4.9 * s - 0.5 * u[0]])
+        return [x[2], x[3], a[0], a[1]]
+
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[1, 0, 0, 0], seconds=3, u=[0])
+    return rate, ContinuousTracking(rate, motion, goal=[0.2, 0.1, 0.4, 0.4], limits=[[-8, 8]])
+
+
+def bearing() -> Written:
+    """A magnetic bearing, unstable and stiffening, held for 20 ms; the force is limited."""
+
+    def rate(x: Any, u: Any) -> Any:  # displacement in mm, its rate
+        return [x[1], 20 * x[0] + 40 * x[0] ** 3 + u[0]]
+
+    motion = plan_motion(rate, start=[0.1, 0], end=[0, 0], seconds=1, u=[0])
+    options: Any = {"limits": [[-20, 20]], "hold": 0.02}
+    return rate, ContinuousTracking(rate, motion, goal=[0.05, 0.4], **options)
+
+
+def ball_and_beam() -> Written:
+    """A ball rolls on a beam whose turning acceleration is the input, limited."""
+
+    def rate(x: Any, u: Any) -> Any:  # ball in m, beam in rad, their rates
+        return [x[1], 5 / 7 * (x[0] * x[3] ** 2 - 9.81 * np.sin(x[2])), x[3], u[0]]
+
+    motion = plan_motion(rate, start=[0.4, 0, 0, 0], end=[-0.2, 0, 0, 0], seconds=2, u=[0])
+    return rate, ContinuousTracking(rate, motion, goal=[0.1, 0.2, 0.1, 0.4], limits=[[-15, 15]])
+
+
+def maglev() -> Written:
+    """A ball below a magnet, moved 4 mm up; the current follows a limited command with a lag."""
+
+    def rate(x: Any, u: Any) -> Any:  # gap in m, its rate, current in A
+        return [x[1], 9.81 - 9.81e-4 * (x[2] / x[0]) ** 2, 50 * (u[0] - x[2])]
+
+    motion = plan_motion(rate, start=[0.012, 0, 1.2], end=[0.008, 0, 0.8], seconds=1, u=[1])
+    return rate, ContinuousTracking(rate, motion, goal=[0.001, 0.02, 0.1], limits=[[0, 3]])
+
+
+def quadrotor_12() -> Written:
+    """A quadrotor flies a bend of 2 m and turns with it; thrust and turning accelerations."""
+
+    def rate(x: Any, u: Any) -> Any:  # position, velocity, Euler angles, body rates
+        (f, p, y), (a, b, c) = x[6:9], x[9:]
+        sf, cf, sp, cp, sy, cy = np.sin(f), np.cos(f), np.sin(p), np.cos(p), np.sin(y), np.cos(y)
+        push = [u[0] * (cf * sp * cy + sf * sy), u[0] * (cf * sp * sy - sf * cy)]
+        angles = [a + (b * sf + c * cf) * sp / cp, b * cf - c * sf, (b * sf + c * cf) / cp]
+        turn = [u[1] - 0.7 * b * c, u[2] + 0.7 * a * c, u[3]]
+        return [*x[3:6], *push, u[0] * cf * cp - 9.81, *angles, *turn]
+
+    start, end = np.zeros(12), np.zeros(12)
+    start[3], end[:3], end[4], end[8] = 1, [2, 2, 0.5], 1, np.pi / 2
+    motion = plan_motion(rate, start=start, end=end, seconds=4, u=[9.81, 0, 0, 0])
+    goal = [0.2] * 3 + [0.4] * 3 + [0.2] * 3 + [1.0] * 3
+    return rate, ContinuousTracking(rate, motion, goal=goal)
+
+
+def calm(rate: Callable[..., Any], count: int) -> Callable[..., Any]:
+    """The equations without their `count` disturbances, to plan with."""
+    return lambda x, u: rate(x, u, np.zeros(count))
+
+
 PROBLEMS: dict[str, Callable[[], Written]] = {
     "car": car,
     "bicycle": bicycle,
@@ -208,6 +371,18 @@ PROBLEMS: dict[str, Callable[[], Written]] = {
     "flexible_arm": flexible_arm,
     "quadrotor_9": quadrotor_9,
     "quadrotor_16": quadrotor_16,
+    "docking": docking,
+    "crane": crane,
+    "differential_drive": differential_drive,
+    "two_link_arm": two_link_arm,
+    "climb": climb,
+    "vtol": vtol,
+    "lane_change": lane_change,
+    "segway": segway,
+    "bearing": bearing,
+    "ball_and_beam": ball_and_beam,
+    "maglev": maglev,
+    "quadrotor_12": quadrotor_12,
 }
 
 
@@ -295,8 +470,8 @@ def judged(
     for knot, count in ((0, starts), (len(found.funnel.t) // 2, starts // 4)):
         at: dict[str, Any] = {"starts": count, "rng": rng, "knot": knot}
         if "hold" in found.claim:
-            error = np.asarray(found.claim["error"])
-            runs.append(simulate_held(*parts, hold=found.claim["hold"], error=error, **at))
+            at["error"] = np.asarray(found.claim.get("error", np.zeros(found.model.n)))
+            runs.append(simulate_held(*parts, hold=found.claim["hold"], **at))
         else:
             runs.append(simulate_boundary(*parts, substeps=SUBSTEPS, **at))
     return {key: found.claim[key] for key in ("hold", "error") if key in found.claim} | {

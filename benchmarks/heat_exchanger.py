@@ -11,13 +11,13 @@ from pathlib import Path
 
 from benchmarks.machine import parser, spending, tell
 from benchmarks.recorded import heat_exchanger, percent, proved, single
+from benchmarks.thesis.rie import robust_identification_error
 from nlsid_core.identification import Degrees, Polynomial, prove_stability
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.polynomial.certified import (
     certified_simulation_error,
     descend_certified,
 )
-from nlsid_core.identification.polynomial.rie import robust_identification_error
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.models import StateAffineModel
 

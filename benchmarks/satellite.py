@@ -61,7 +61,6 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     result["proof_mb"] = proof.stat().st_size / 1e6
     result |= _attacks(design, goal, arguments.starts)
     start = exponential_start(LSteps(field), design.policy, design.funnel.P)
-    result["initial_volume"] = design.found.first.volume_integral()
     result["start_volume"] = start.volume_integral()
     with spending() as spent:
         alternated = alternate_rho(LSteps(field), design.policy, start)

@@ -39,7 +39,15 @@ from nlsid_core.design.levels import followed
 from nlsid_core.design.tube import design_output_tube, energy, innovations, scaled_to
 from nlsid_core.errors import NlsidError
 from nlsid_core.funnels.tube import Tube
-from nlsid_core.identification import Degrees, FilterMapFilter, Network, Polynomial, Rse, identify
+from nlsid_core.identification import (
+    Degrees,
+    FilterMapFilter,
+    Method,
+    Network,
+    Polynomial,
+    Rse,
+    identify,
+)
 from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -64,17 +72,14 @@ PUBLISHED = {
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Trials to identify on, to scale on, and to judge; horizon: samples of the energy beside it.
-
-    options: of `identify`.
-    """
+    """Trials to identify on, to scale on, and to judge; horizon: samples of the energy."""
 
     model_class: Any
     train: Dataset
     calibration: Dataset
     judged: Dataset
     horizon: int
-    options: dict[str, Any] | None = None
+    method: Method | None = None
 
 
 def f1tenth_case(model_class: Any) -> Case:
@@ -133,7 +138,7 @@ def exchanger_case(data: Path) -> Case:
     trials = in_parts(u, y, 1.0, 250, "exchanger")
     model_class = Polynomial(4, (0, 1, 2), Degrees(inputs=3, leading=2), input_range=((0.1, 0.7),))
     train, calibration, judged = map(named, (trials[:6], trials[6:11], trials[11:]))
-    return Case(model_class, train, calibration, judged, 240, {"method": Rse(certified=True)})
+    return Case(model_class, train, calibration, judged, 240, Rse(certified=True))
 
 
 def wh2009_case(data: Path) -> Case:
@@ -141,11 +146,9 @@ def wh2009_case(data: Path) -> Case:
     u, y = recorded.wiener_hammerstein(data / "wh2009")
     whole = in_parts(u[5000:25000], y[5000:25000], 1 / 51200, 20000, "train")
     later = in_parts(u[30000:60000], y[30000:60000], 1 / 51200, 2000, "later")
-    validation = named(in_parts(u[80000:90000], y[80000:90000], 1 / 51200, 10000, "val"))
     train, calibration, judged = map(named, (whole, later[:10], later[10:]))
-    options = {"validation": validation}
-    model_class = Network(FilterMapFilter(phases=(2,), intervals=(24,), starts=6, begin="rest"))
-    return Case(model_class, train, calibration, judged, 1700, options)
+    model_class = Network(FilterMapFilter(phases=2, intervals=24, starts=6, begin="rest"))
+    return Case(model_class, train, calibration, judged, 1700)
 
 
 def schunk_case(data: Path) -> Case:
@@ -231,7 +234,7 @@ def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[st
 def measure(case: Case) -> dict[str, float | int]:
     """The promised keys of one case."""
     started = time.process_time()
-    model = identify(case.train, case.model_class, **(case.options or {})).model
+    model = identify(case.train, case.model_class, method=case.method).model
     keys: dict[str, float | int] = {"identify_s": time.process_time() - started}
     started = time.process_time()
     horizon = case.horizon * model.period
@@ -296,7 +299,7 @@ def lasting(samples: int) -> dict[str, float]:
     over trials), and by how much the process grew between them.
     """
     case = f1tenth_case(Polynomial(4))
-    model = identify(case.train, case.model_class).model
+    model = identify(case.train, case.model_class, method=case.method).model
     made = design_output_tube(OutputTube(model, case.train, case.calibration))
     monitor, k = Monitor([Stage(model, None, made.funnel)]), 0
     tenths: list[list[float]] = [[] for _ in range(10)]

@@ -17,7 +17,7 @@ MIMO = (
     np.array([[-0.4, 0.0], [0.0, -0.3]]),
     np.array([[0.5, 0.1], [0.2, -0.4]]),
 )
-SPLIT = {"test": ["run_5"], "validation": ["run_4"]}
+SPLIT = {"test": ["run_5"]}
 FUNNEL: dict[str, Any] = {"funnel": {"safety_factor": 1.5}}
 # identification sections, of bags with one output and with two
 ONE: dict[str, dict[str, Any]] = {
@@ -25,8 +25,7 @@ ONE: dict[str, dict[str, Any]] = {
     "block_cascade": {
         "model": "block_cascade",
         "orders": [2, 1],
-        "phases": [1],
-        "intervals": [8],
+        "intervals": 8,
         "starts": 4,
         "transient": 60,
     },

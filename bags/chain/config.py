@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from bags.chain.identification_config import Identification
+from bags.chain.identification_config import ONE_BY_ONE, Identification
 from bags.chain.sections import (
     Corner,
     Key,
@@ -24,8 +24,6 @@ from bags.signals.sampling import Grid, Sampler
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.running.comparison import Centre
 
-ONE_BY_ONE = ("linear", "block_cascade")  # models of one response and one excitation
-
 
 def _listed(value: object) -> object:
     """One signal is a list of one."""
@@ -37,7 +35,6 @@ Signals = Annotated[
 ]
 Clock = Literal["header", "log"]
 Files = Annotated[tuple[Annotated[Path, Field(strict=False)], ...], Field(strict=False)]
-Values = Annotated[tuple[object, ...], Field(min_length=1, strict=False)]
 
 
 class SignalsConfig(Section):
@@ -101,9 +98,6 @@ class SplitConfig(Section):
     """What the model is not fitted to: bags by name."""
 
     test: Annotated[Names, Key("bags that only score the models", example=["trial_05"])] = ()
-    validation: Annotated[
-        Names, Key("bags by which orders, knots and bases are chosen", example=["trial_06"])
-    ] = ()
     calibration: Annotated[
         Names,
         Key(
@@ -266,21 +260,6 @@ class Config(Section):
     identification: Annotated[
         Identification, Key("the class of models and the method", example={"lags": 4})
     ]
-    select: Annotated[
-        dict[str, Values] | None,
-        Key(
-            "values of the identification's options for `nlsid identify --select` to try",
-            example={"lags": [1, 2, 3, 4]},
-        ),
-    ] = None
-    compare: Annotated[
-        tuple[Identification, ...],
-        Field(strict=False),
-        Key(
-            "sections like `identification` that `nlsid identify --compare` scores (default: it)",
-            example=[{"lags": 2}, {"model": "monotone", "lags": 2}],
-        ),
-    ] = ()
     funnel: Annotated[FunnelConfig | None, Key("the tube, for `nlsid funnel`")] = None
     monitor: Annotated[MonitorConfig, Key("how a robot is held against it")] = MonitorConfig()
 
@@ -403,7 +382,3 @@ def _model_refusals(config: Config) -> Iterator[str]:
                 f"identification.{key}: {len(given)} pairs [low, high] for {said}; it needs "
                 f"{needed}"
             )
-    try:
-        config.identification.each(config.select or {})
-    except DataError as error:
-        yield str(error)

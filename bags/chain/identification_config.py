@@ -14,27 +14,27 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import product
 from typing import Annotated, Any, get_type_hints
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from bags.chain.sections import UNKNOWN_KEY, problems
+from bags.chain.sections import UNKNOWN_KEY
 from bags.chain.templates import TEMPLATES
 from bags.recordings.names import did_you_mean
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
+    Attempt,
     Fit,
     Method,
     Model,
     ModelClass,
-    alike,
     identify,
     methods_of,
 )
+from nlsid_core.identification.rates import rate_of_memory
 from nlsid_core.progress import Progress, silent
 
 DEFAULT = "linear"  # the model of a section that names none
@@ -42,6 +42,7 @@ RANGES = (
     "input_range",
     "output_range",
 )  # options of which one [low, high] is the range of one signal
+ONE_BY_ONE = ("linear", "block_cascade")  # models of one response and one excitation
 OWN = {  # of every section
     "transient": Annotated[int, Field(ge=0)],
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
@@ -70,7 +71,6 @@ class IdentificationConfig:
         self,
         train: Dataset,
         *,
-        validation: Dataset | None = None,
         test: Dataset | None = None,
         progress: Progress = silent,
     ) -> Fit[Model]:
@@ -79,7 +79,6 @@ class IdentificationConfig:
             train,
             self.model_class,
             method=self.method,
-            validation=validation,
             test=test,
             transient=self.transient,
             max_rate=self.max_rate,
@@ -92,32 +91,23 @@ class IdentificationConfig:
         """What the section calls the class."""
         return str(self.given.get("model", DEFAULT))
 
-    def every_method(self) -> tuple[Method, ...]:
-        """This method, then every other one of the class, with the options that they share."""
-        others = [one for one in methods_of(self.model_class) if one.name != self.method.name]
-        return (self.method, *(alike(one, self.method) for one in others))
 
-    def each(self, options: Mapping[str, Sequence[object]]) -> "list[IdentificationConfig]":
-        """This section with every combination of the options' values; DataError names a wrong one.
+def section_of(attempt: Attempt, train: Dataset) -> dict[str, Any]:
+    """The section that asks for this attempt with these training trials."""
+    first = train.trajectories[0]
+    single = first.y.shape[1] == first.u.shape[1] == 1
+    names = [name for name in TEMPLATES if single or name not in ONE_BY_ONE]
+    found = ((name, TEMPLATES[name].values(attempt.model_class)) for name in names)
+    name, values = next((name, values) for name, values in found if values is not None)
+    method = {f.name: getattr(attempt.method, f.name) for f in fields(attempt.method)}
+    section = {"model": name, **values, "method": attempt.method.word, **method}
+    if attempt.memory != 1.0:
+        section["max_rate"] = rate_of_memory(train, attempt.memory)
+    return {key: _as_yaml(value) for key, value in section.items()}
 
-        The last option varies fastest.
-        """
-        own = list(TEMPLATES[self.model].keys)
-        for key in options:
-            if key not in own:
-                raise DataError(
-                    f"select.{key}: no option of `model: {self.model}`, "
-                    f"whose options this section tries; remove select.{key}, or try: "
-                    f"{', '.join(own)}"
-                )
-        made = []
-        for values in product(*options.values()):
-            changed = dict(zip(options, values, strict=True))
-            try:
-                made.append(_read({**self.given, **changed}))
-            except ValidationError as error:
-                raise DataError(problems(error, prefix=["select"]).strip()) from error
-        return made
+
+def _as_yaml(value: Any) -> Any:
+    return [_as_yaml(part) for part in value] if isinstance(value, tuple) else value
 
 
 def _read(section: object) -> IdentificationConfig:

@@ -32,7 +32,7 @@ from nlsid_core.models import StableModel
 from nlsid_core.models.signal import Signal, signals_of
 from nlsid_core.progress import Progress, part, silent
 
-USES: Final = ("test", "validation", "calibration")  # that the split names bags for
+USES: Final = ("test", "calibration")  # that the split names bags for
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
 LARGER: Final = 20.0  # times the largest value of most trials: hardly the same unit
 
@@ -46,7 +46,6 @@ class Trials:
 
     train: Dataset
     test: Dataset
-    validation: Dataset | None = None
     calibration: Dataset | None = None
     skipped: int = 0
     filled: int = 0
@@ -56,7 +55,6 @@ class Trials:
         """Those there are, by what they are for."""
         parts = {
             "training": self.train,
-            "validation": self.validation,
             "calibration": self.calibration,
             "test": self.test,
         }
@@ -131,7 +129,6 @@ def identify_trials(trials: Trials, config: Config, out: Path, *, progress: Prog
     """The same of trials that were read already."""
     fit = config.identification.identify(
         trials.train,
-        validation=trials.validation,
         test=trials.test,
         progress=part(progress, 0.5, 0.9),
     )
@@ -218,8 +215,7 @@ def by_use(labelled: Dataset, config: Config, *, left_out: Sequence[str] = ()) -
     refuse_absent([*labelled.names, *with_parts(left_out, config)], config)
     trials = split(labelled, config.split)
     if trials.calibration is not None:
-        fitted = (*trials.train, *(trials.validation or ()))
-        check_apart(fitted, trials.calibration)
+        check_apart(trials.train, trials.calibration)
     skipped, filled = skipped_samples(labelled), filled_samples(labelled)
     return replace(trials, skipped=skipped, filled=filled)
 
@@ -246,10 +242,8 @@ def split(dataset: Dataset, named: SplitConfig) -> Trials:
         test = dataset.select(chosen["test"])
     else:
         train, test = _cut(train, named.share)
-    validation, calibration = (
-        dataset.select(chosen[use]) if chosen[use] else None for use in USES[1:]
-    )
-    return Trials(train, test, validation, calibration)
+    scales = chosen["calibration"]
+    return Trials(train, test, dataset.select(scales) if scales else None)
 
 
 def _cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:

@@ -55,6 +55,20 @@ class Template:
         made: ModelClass = self.family(**{place: self.part(**inner)}, **outer)
         return made
 
+    def values(self, model_class: ModelClass) -> dict[str, object] | None:
+        """The keys that make this class, those that are the default left out; None if none do."""
+        parts: list[Any] = [getattr(model_class, "degrees", None)]
+        parts += [getattr(model_class, "structure", None), model_class]
+        given = {
+            key: getattr(next(part for part in parts if hasattr(part, option)), option)
+            for key, option in self.keys.items()
+            if any(hasattr(part, option) for part in parts)
+        }
+        if self.family is not type(model_class) or self.make(given) != model_class:
+            return None
+        kept = (key for key in given if key in self.needed or given[key] != self.default(key))
+        return {key: given[key] for key in kept}
+
     def texts(self) -> dict[str, str]:
         """What the docstrings of the family and of the structure say of each key's option."""
         known = option_texts(self.family) | option_texts(self.part)

@@ -80,7 +80,7 @@ def run_demo(out: Path, console: Console, robot: str) -> bool:
     settings = load_config(out / CONFIG)
     bags = shown.bags[0].parent
     _step(console, "1  identify a model from the recordings", f"identify {out} {bags}")
-    models_cli.identify_here(shown.bags, settings, out, select=False)
+    models_cli.identify_here(shown.bags, settings, out)
     _step(console, "2  design a tube, and see what it would catch", f"funnel {out}")
     designs_cli.tube(out, settings)
     _step(console, "3  check both proofs, exactly and without a solver", f"check {out}")

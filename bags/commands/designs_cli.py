@@ -242,6 +242,7 @@ def report(
     from bags.commands.page import folder_page, recorded
     from bags.designs import documents
     from bags.designs.wiring import sampler_of
+    from bags.monitoring.replay import to_judge
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
     from nlsid_core import files
@@ -257,7 +258,7 @@ def report(
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
                 recordings.append(bag_info(bag, topics=topics, messages=True))
-        chosen = show.chosen_bags(design, folders, settings)
+        chosen = to_judge(design, folders)
         replays = show.replayed(design, chosen.judged, settings)
         held = recorded(recordings, replays, chosen.said)
         out.print(show.replay_table(replays))

@@ -11,6 +11,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
+from bags.commands.progress import progress_bar
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
@@ -58,7 +59,9 @@ def run_init(
         excitations=tuple(chosen_u),
         named=(*responses, *excitations),
     )
-    proposal = propose(folders, found, chosen, widen=not excitations, alone=not responses)
+    with progress_bar("trying models") as progress:
+        widen, alone = not excitations, not responses
+        proposal = propose(folders, found, chosen, widen=widen, alone=alone, progress=progress)
     if asked:
         drives, answers = (_paths(proposal, role) for role in ROLES)
         _show_others(console, found, {*drives, *answers})

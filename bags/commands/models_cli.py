@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from bags.commands.options import (
     CONFIG,
@@ -30,7 +29,6 @@ from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from concurrent.futures import Executor
 
     from bags.chain.config import Config
     from bags.chain.steps import Trials
@@ -69,28 +67,6 @@ def init(
 
 
 @dataclass(frozen=True)
-class Instead:
-    """What `identify` does in the place of one model as configured."""
-
-    only_check: Annotated[
-        bool,
-        typer.Option("--check", help="Only say what is wrong, status 1; no message is read."),
-    ] = False
-    select: Annotated[
-        bool,
-        typer.Option(
-            "--select", help="Choose among the configuration's `select` by `split.validation`."
-        ),
-    ] = False
-    compare: Annotated[
-        bool,
-        typer.Option(
-            "--compare", help="Only score every method of every class in `compare`: a table."
-        ),
-    ] = False
-
-
-@dataclass(frozen=True)
 class Reading(Sharing):
     """Who reads the bags, and how patiently."""
 
@@ -100,9 +76,12 @@ class Reading(Sharing):
 def identify(
     folder: DesignArgument,
     bags: BagsArgument,
-    instead: Instead,
     reading: Reading,
     config: ConfigOption = None,
+    only_check: Annotated[
+        bool,
+        typer.Option("--check", help="Only say what is wrong, status 1; no message is read."),
+    ] = False,
 ) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html.
 
@@ -110,14 +89,13 @@ def identify(
     Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
     cannot be used is listed and left out, and the next run reads only what is new.
     """
-    from bags.chain.choosing import sections_to_try
     from bags.chain.config import load_config
     from bags.chain.tracking_config import is_tracking, load_tracking_config
     from bags.recordings.folders import expand_bags
     from bags.recordings.remote import is_url
 
     path = config_of(folder, config)
-    if instead.only_check:
+    if only_check:
         _check(path, expand_bags(bags))
     elif is_tracking(path):
         from bags.commands import states
@@ -125,28 +103,22 @@ def identify(
         states.identify(expand_bags(bags), load_tracking_config(path), folder)
     else:
         settings = load_config(path)
-        if instead.select:
-            sections_to_try(settings)  # before bags are read
-        if instead.compare:
-            _compare(expand_bags(bags), settings)
-        elif reading.count or reading.scheduler or any(map(is_url, bags)):
-            _by_workers(bags, settings, folder, reading, select=instead.select)
+        if reading.count or reading.scheduler or any(map(is_url, bags)):
+            _by_workers(bags, settings, folder, reading)
         else:
-            identify_here(expand_bags(bags), settings, folder, select=instead.select)
+            identify_here(expand_bags(bags), settings, folder)
 
 
-def identify_here(bags: Sequence[Path], settings: Config, folder: Path, *, select: bool) -> None:
+def identify_here(bags: Sequence[Path], settings: Config, folder: Path) -> None:
     """Read and identify in this process, and say what was found."""
     from bags.chain.steps import read_trials
 
     with progress_bar("reading") as progress:
         trials = read_trials(bags, settings, progress=progress)
-    _identify(trials, settings, folder, select=select)
+    _identify(trials, settings, folder)
 
 
-def _by_workers(
-    bags: list[Path], settings: Config, folder: Path, reading: Reading, *, select: bool
-) -> None:
+def _by_workers(bags: list[Path], settings: Config, folder: Path, reading: Reading) -> None:
     """Read by workers, identify at home, say what was left out and why."""
     from bags.commands.fleet_cli import say_read
     from bags.fleet.bags import named_bags
@@ -157,29 +129,16 @@ def _by_workers(
         named = named_bags(bags, patience=reading.patience)
         found = read_fleet(named, settings, folder, workers=workers, progress=progress)
     say_read(found, folder / MANIFEST)  # before anything is made of it, which may fail
-    with workers.sharing() as executor:
-        _identify(found.trials, settings, folder, select=select, executor=executor)
+    _identify(found.trials, settings, folder)
 
 
-def _identify(
-    trials: Trials,
-    settings: Config,
-    folder: Path,
-    *,
-    select: bool,
-    executor: Executor | None = None,
-) -> None:
-    """Identify as configured, or what is best of `select`, and say what was found."""
-    from bags.chain.choosing import select_trials
+def _identify(trials: Trials, settings: Config, folder: Path) -> None:
+    """Identify as configured, and say what was found."""
     from bags.chain.steps import identify_trials
     from bags.commands import show
 
-    with progress_bar("selecting" if select else "identifying") as progress:
-        if select:
-            chosen = select_trials(trials, settings, folder, executor=executor, progress=progress)
-            show.say_selected(out, chosen)
-        else:
-            show.say_identified(out, identify_trials(trials, settings, folder, progress=progress))
+    with progress_bar("identifying") as progress:
+        show.say_identified(out, identify_trials(trials, settings, folder, progress=progress))
 
 
 def _check(path: Path, bags: list[Path]) -> None:
@@ -201,15 +160,3 @@ def _check(path: Path, bags: list[Path]) -> None:
     if wrong:
         raise typer.Exit(1)
     typer.echo(f"{path}: nothing is wrong with it for {len(bags)} bags; no message was read")
-
-
-def _compare(bags: list[Path], settings: Config) -> None:
-    """Score every method on the same test bags: simulation, prediction, residuals, proof."""
-    from bags.chain.choosing import compare_bags
-    from bags.commands import show
-
-    with progress_bar("comparing") as progress:
-        compared = compare_bags(bags, settings, progress=progress)
-    out.print(show.comparison_table(compared))
-    for refusal in compared.refusals:
-        out.print(f"no model: {escape(refusal)}", soft_wrap=True)

@@ -51,12 +51,13 @@ def monitor(
 
     Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside, breaks the
     assumption or raises the CUSUM alarm, 2 if something was not judged. A tube of one output is
-    drawn too. Bags that the design was made with are left out where others are given, as are those
-    of `split.validation`. -y, -u and --period: where state and input of a continuous funnel are.
+    drawn too. Bags that the design was made with are left out where others are given.
+    -y, -u and --period: where state and input of a continuous funnel are.
     """
     from bags.commands import show
     from bags.designs import documents
     from bags.fleet.monitor import judged_of
+    from bags.monitoring.replay import to_judge
     from bags.pictures.report import drawable, write_margins
     from bags.recordings.folders import expand_bags
 
@@ -64,7 +65,7 @@ def monitor(
     design = documents.load(folder, wiring=wired.wiring())
     folders = expand_bags(bags)
     if settings is not None and not judging.every:
-        chosen = show.chosen_bags(design, folders, settings)
+        chosen = to_judge(design, folders)
         folders = list(chosen.judged)
         for line in chosen.said:
             err.print(f"{line}; with --all these are judged too", soft_wrap=True, markup=False)

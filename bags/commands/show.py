@@ -6,28 +6,26 @@ from fractions import Fraction
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from bags.chain.choosing import Compared, Scored, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.commands.progress import progress_bar
 from bags.designs import documents
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
-from bags.monitoring.replay import Replay, ToJudge, replay_bag, to_judge
+from bags.monitoring.replay import Replay, replay_bag
 from bags.pictures.report import report_available
-from bags.pictures.tables import STABILITY, methods_table, stability
+from bags.pictures.tables import methods_table
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import AnyDesign
-from nlsid_core.errors import DataError, duration, percent
-from nlsid_core.identification import Selection, describe, stated_rate
+from nlsid_core.errors import DataError
 from nlsid_core.kernel import text
 from nlsid_core.models import Signal
 from nlsid_core.running.comparison import Centre
@@ -39,11 +37,6 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
-COMPARISON_CAPTION = """\
-free run: simulated; +k: predicted k samples ahead, - of a class that predicts
-what it simulates. residual: coloured (not white), follows the input u, or both,
-at 99 %. rate: proved, a sample; forgets: its time constant. time: of the
-processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
 COLUMNS = 80  # of a terminal that is not asked
 UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
@@ -58,14 +51,6 @@ def say_identified(console: Console, result: Identified) -> None:
         console.print(f"wrote {file}", soft_wrap=True)
     if not report_available():
         console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
-
-
-def say_selected(console: Console, result: Selected) -> None:
-    """Everything that was tried, and what is to be known about the chosen model."""
-    console.print(selection_table(result.selection))
-    if result.selection.refitted:
-        console.print("the chosen class, fitted to training and validation trials together:")
-    say_identified(console, result.identified)
 
 
 def notes(result: Identified) -> list[str]:
@@ -85,68 +70,6 @@ def notes(result: Identified) -> list[str]:
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
-
-
-def selection_table(selection: Selection) -> Table:
-    """Validation, training and test error of every class, the chosen one bold."""
-    table = Table(title="chosen by the validation error", title_justify="left")
-    table.add_column("model class")
-    for name in ("validation", "training", "test"):
-        table.add_column(name, justify="right")
-    table.add_column(STABILITY, min_width=17)
-    for entry in selection.tried:
-        style = "bold" if entry.model_class is selection.best else ""
-        label = describe(entry.model_class)
-        if entry.fit is None:
-            table.add_row(label, "-", "-", "-", escape(entry.refusal))
-            continue
-        errors = [percent(entry.error(name)) for name in ("validation", "train", "test")]
-        table.add_row(label, *errors, stability(entry.fit.chosen), style=style)
-    return table
-
-
-def comparison_table(compared: Compared) -> Group:
-    """Every method of every class, scored on the same samples: a table a class, 80 columns."""
-    left_out = f"after their first {compared.skipped_at_start} samples"
-    parts: list[Table | str] = [f"{len(compared.trials.test)} test trials {left_out}; errors in %"]
-    horizons = sorted({k for row in compared.rows for k in row.scores.prediction_percent})
-    for label in dict.fromkeys(row.label for row in compared.rows):
-        table = Table(title=escape(label), title_justify="left", box=SIMPLE_HEAD, padding=0)
-        table.add_column("method", min_width=13, no_wrap=True)
-        for name in ("free run", *(f"+{k}" for k in horizons)):
-            table.add_column(name, justify="right", min_width=6, no_wrap=True)
-        table.add_column("residual", min_width=9)
-        table.add_column("rate", min_width=6)
-        table.add_column("forgets", justify="right", min_width=7, no_wrap=True)
-        table.add_column("time", justify="right", min_width=7, no_wrap=True)
-        for row in compared.rows:
-            if row.label == label:
-                table.add_row(*_compared(row, horizons))
-        parts.append(table)
-    parts.append(COMPARISON_CAPTION)
-    return Group(*parts)
-
-
-def _compared(row: Scored, horizons: Sequence[int]) -> list[str]:
-    """The cells of one method."""
-    scores, candidate = row.scores, row.candidate
-    flaws = {(True, True): "-", (False, True): "coloured", (True, False): "follows u"}
-    rate, forgets = "[dark_orange3]none", ""
-    if candidate.proof is not None:
-        rate, _, rest = stated_rate(candidate.proof, candidate.model.period).partition(" (")
-        rate, forgets = (f"[green]{rate}", rest.rstrip(")")) if rest else ("[green]proved", "")
-    ahead = [scores.prediction_percent.get(k) for k in horizons]
-    return [
-        candidate.method.name,
-        *(
-            "-" if error is None else percent(error).removesuffix(" %")
-            for error in (scores.simulation_percent, *ahead)
-        ),
-        flaws.get((scores.white, scores.independent), "both"),
-        rate,
-        forgets,
-        duration(candidate.seconds),
-    ]
 
 
 def funnel_table(design: OutputTubeDesign) -> Table:
@@ -190,11 +113,6 @@ def funnel_table(design: OutputTubeDesign) -> Table:
     for line in of_funnel(model.document(), funnel.document()).said:
         table.add_row("measured", escape(line))
     return table
-
-
-def chosen_bags(design: AnyDesign, bags: Sequence[Path], settings: Config | None) -> ToJudge:
-    """Those of the bags that the design was not made with, else all of them."""
-    return to_judge(design, bags, validation=settings.split.validation if settings else ())
 
 
 def replayed(

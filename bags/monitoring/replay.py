@@ -315,19 +315,14 @@ class ToJudge:
         return [f"{what}: {', '.join(names)} (used for {use})" for use, names in uses.items()]
 
 
-def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[str] = ()) -> ToJudge:
+def to_judge(design: AnyDesign, bags: Sequence[Path]) -> ToJudge:
     """The bags that the design was not made with, by their content, else all of them.
 
-    A verdict on a recording that made a design says little. validation: names of bags that orders
-    and bases were chosen by.
+    A verdict on a recording that made a design says little.
     """
     made_with = design.made_with
-    used: dict[Path, str] = {}
-    for bag in bags:
-        if use := made_with.get(bag_digest(bag)):
-            used[bag] = use
-        elif trial_name(bag) in validation:
-            used[bag] = "validation"
+    uses = {bag: made_with.get(bag_digest(bag)) for bag in bags}
+    used = {bag: use for bag, use in uses.items() if use}
     return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
 
 

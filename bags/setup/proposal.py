@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from bags.chain.config import Config
 from nlsid_core.errors import BagError
+from nlsid_core.identification import Promise
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-FITTED: Final = "what it was fitted to"  # of which an error says little
 GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 
 
@@ -39,20 +39,22 @@ class Proposal:
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
-    error: float = math.inf  # %, of the best model that was tried, in simulation
-    tried_on: str = "trials held back"
-    varies: str = ""  # by how much the response does in these
+    promise: Promise | None = None  # of a model's error in simulation
+
+    @property
+    def error(self) -> float:
+        """% of the response's spread; infinite if nothing is promised."""
+        return math.inf if self.promise is None else self.promise.percent
 
     @property
     def expectation(self) -> str:
         """How good a model will be, as far as what was tried says."""
-        if math.isinf(self.error):
-            return "no model that was tried is stable: expect identification to refuse"
+        if self.promise is None:
+            return (
+                "nothing is promised: no model could be held against data that it was not fitted to"
+            )
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
-        if self.tried_on == FITTED:
-            grade = "nothing was held back, so other data may be simulated far worse"
-        of = self.tried_on + self.varies
-        said = f"expect {self.error:.3g} % error in simulation (of {of}): {grade}"
+        said = f"expect an error in simulation of {self.promise}: {grade}"
         return f"{said}, if the question above is answered" if self.doubts else said
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:

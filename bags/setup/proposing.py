@@ -17,25 +17,27 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
-from bags.setup.attempts import followed, say_class, say_degree, say_lags
-from bags.setup.candidates import Found, slope_window
+from bags.setup import ladder
+from bags.setup.attempts import say_model, tried
+from bags.setup.candidates import Found, Pair, slope_window
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
-from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
+from nlsid_core.data.repeats import same_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.progress import silent
+from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
+OTHERS: Final = 3  # commands that are named besides
 
 
 def choose(
@@ -102,6 +104,7 @@ def propose(
     *,
     widen: bool = False,
     alone: bool = False,
+    progress: Progress = silent,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
 
@@ -139,9 +142,6 @@ def propose(
         ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
-    if len(responses) > 1:
-        section |= {"method": "sem", "certified": True}
-        proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
     in_training = _ranges(trials.train)
@@ -153,28 +153,28 @@ def propose(
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
-    if linear:
-        say_lags(proposal, trials.train)
-        if _may_add_up(proposal, found):
-            washed = f"{responses[0]}|washout({WASHOUT:g} s)"
-            moved = propose(bags, found, replace(chosen, responses=(washed,)))
-            if moved.error <= proposal.error / 2.0:
-                _say_washed_out(moved, proposal.error)
-                moved.walls += _beside(moved, found) if alone else []
-                return moved
-    else:
-        say_degree(proposal, trials.train)
+    choice = tried(trials.train, ladder.LINEAR, progress=progress)
+    say_model(proposal, choice, trials.train)
+    if linear and _may_add_up(proposal, found):
+        washed = f"{responses[0]}|washout({WASHOUT:g} s)"
+        moved = propose(bags, found, replace(chosen, responses=(washed,)), progress=progress)
+        if moved.error <= proposal.error / 2.0:
+            _say_washed_out(moved, proposal.error)
+            moved.walls += _beside(moved, found) if alone else []
+            return moved
     _say_funnel(proposal)
     others = [pair.command.text for pair in followed(proposal, found)]
     if widen and proposal.error > POOR and others:
-        wider = propose(bags, found, replace(chosen, excitations=(*excitations, *others)))
+        both = replace(chosen, excitations=(*excitations, *others))
+        wider = propose(bags, found, both, progress=progress)
         wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
             without = f"; without it models are off by {proposal.error:.3g} %"
             wider.why |= {text: wider.why[text] + without for text in others}
             return wider
-    if len(responses) == 1 and not is_swapped:  # who swapped them has to say so first
-        say_class(proposal, trials.train)
+    if choice is not None and not is_swapped:  # who swapped them has to say so first
+        more = ladder.choose(choice.held_out, ladder.BEYOND, choice.rows, progress=progress)
+        say_model(proposal, more, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)
     proposal.walls += _beside(proposal, found) if alone else []
@@ -263,16 +263,24 @@ def _beside(proposal: Proposal, found: Found) -> list[str]:
     ]
 
 
+def followed(proposal: Proposal, found: Found) -> list[Pair]:
+    """The pairs of the first response with commands that were not chosen and that it follows."""
+    signals = proposal.content["signals"]
+    chosen = {signal["path"] for signal in signals["excitation"]}
+    pairs = found.best_for(signals["response"][0]["path"])
+    follows = [p for p in pairs if p.command.text not in chosen and abs(p.correlation) >= RELATED]
+    return follows[:OTHERS]
+
+
 def _say_poor(proposal: Proposal, found: Found) -> None:
     signals = proposal.content["signals"]
     wall = (
-        f"nothing that was tried simulates {proposal.tried_on} with less than "
-        f"{proposal.error:.3g} % error: the tube will be wide; another pair of signals, or more "
-        "of them, may say more"
+        f"nothing that was tried has less than {proposal.error:.3g} % error: the tube will be "
+        "wide; another pair of signals, or more of them, may say more"
     )
-    if len(signals["response"]) > 1:
-        wall += "; of several responses only `state_affine` was tried, and there is `implicit`"
-    elif len(signals["excitation"]) == 1 and (also := followed(proposal, found)):
+    if len(signals["response"]) == len(signals["excitation"]) == 1 and (
+        also := followed(proposal, found)
+    ):
         said = ", ".join(f"{pair.command.text} ({pair.correlation:+.2f})" for pair in also)
         wall += f": it follows {said} too (-u, once for each)"
     proposal.walls.append(wall)

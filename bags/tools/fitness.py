@@ -22,11 +22,11 @@ from bags.signals.delays import RELATED, Delay, delay
 from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
-from bags.signals.repeats import same_excitation
 from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
 from bags.signals.timing import clock_relation, held
 from nlsid_core.arrays import FloatArray
+from nlsid_core.data.repeats import same_excitation
 from nlsid_core.errors import BagError, DataError
 
 JITTER_LOOK: Final = 0.05  # of the period: up to here samples are used as they are (the grid's)

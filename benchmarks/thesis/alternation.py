@@ -2,10 +2,9 @@
 
 It starts from a funnel that holds at its knots and stops when the volume grows by less than 2.5 %.
 What holds at knots alone is a sampled relaxation, thesis (6.7), and proves nothing: only a proof
-for every t makes a funnel, and `design_by_alternation` asks for one.
+for every t makes a funnel.
 """
 
-import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -15,56 +14,19 @@ import scipy.sparse as sp
 
 from benchmarks.thesis.relaxation import Sampled
 from nlsid_core import conic
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.continuous.design import ContinuousSearch, FunnelDesign, decided
 from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.continuous.problem import ContinuousTracking
-from nlsid_core.design.continuous.search import Swept, proved_for
-from nlsid_core.design.continuous.setting import Setting, prepare
-from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
+from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
 from nlsid_core.design.continuous.vstep import DEGREE
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 HIGHEST_DECAY = 40.0  # of the exponential start
-
-
-def design_by_alternation(
-    problem: ContinuousTracking, *, rho: ArrayLike | None = None, executor: Executor | None = None
-) -> FunnelDesign:
-    """The funnel of shape rho that the thesis's alternation finds, proved for every t.
-
-    rho: (K,) the first ρ; None: an exponential one. executor: shares the independent L-steps.
-    Raises DataError and Infeasible as `design` does.
-    """
-    started = time.perf_counter()
-    setting = prepare(problem)
-    steps, policy = setting.steps, setting.policy
-    if len(steps.field.valid):
-        raise DataError("the alternation does not know where dynamics are valid: take the sweep")
-    refuse_shape(steps)
-    if rho is None:
-        start = exponential_start(steps, policy, setting.P, rho_final=setting.rho_final)
-    else:
-        first = np.asarray(rho, dtype=np.float64)
-        refuse_first(setting, first)
-        start = ContinuousFunnel(policy.x, setting.P, first, policy.vector_field, "")
-        refuse_start(start, solve_ends(steps, policy, start, executor=executor))
-
-    def search(margin: float) -> Swept:
-        found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
-        return Swept(setting, found.funnel.rho, None)
-
-    _, funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
-    seconds = {"rho": time.perf_counter() - started}
-    history = (("rho", funnel.volume_integral()),)
-    searched = ContinuousSearch(setting.goal, proved, setting.first_guess(), history, seconds)
-    return decided(setting, funnel, searched)
 
 
 def exponential_start(
@@ -96,16 +58,6 @@ def least_margin(funnel: ContinuousFunnel, ends: Sequence[Ends]) -> float:
         margins.append(min(s.m for s in pair.start) + growth[k] / funnel.rho[k])
         margins.append(min(s.m for s in pair.end) + growth[k] / funnel.rho[k + 1])
     return float(min(margins))
-
-
-def refuse_start(funnel: ContinuousFunnel, ends: Sequence[Ends]) -> None:
-    """Raise Infeasible, with what to try, unless the L-steps at the knots of a first ρ hold."""
-    margin = least_margin(funnel, ends)
-    if margin <= 0:
-        raise Infeasible(
-            f"the first rho does not hold: its margin is {margin:.3g} 1/s at worst. Try one that "
-            "grows faster towards t_f, a smaller one, or none: an exponential one is then found"
-        )
 
 
 def alternate_rho(
@@ -191,20 +143,6 @@ def largest_level(constant: FloatArray, slope: FloatArray, basis: IntArray) -> f
         sp.csc_matrix((1 + size, 1 + size)), q, A, np.concatenate([constant, np.zeros(size)]), cones
     )
     return float(conic.solve(program).x[0])
-
-
-def refuse_first(setting: Setting, rho: FloatArray) -> None:
-    """Raise DataError unless a first ρ (K,) given by a user is positive and ends in the goal."""
-    if rho.shape != setting.policy.t.shape or not (np.isfinite(rho).all() and (rho > 0).all()):
-        raise DataError(
-            f"the first rho should be {len(setting.policy.t)} positive numbers, one per knot; it "
-            f"has shape {rho.shape}"
-        )
-    if rho[-1] > setting.rho_final:
-        raise DataError(
-            f"the first rho does not end in the goal: rho(t_f) = {rho[-1]:.6g}, and the goal holds "
-            f"what ends with at most {setting.rho_final:.6g}. Scale it down, or take a larger goal"
-        )
 
 
 def gram_columns(basis: IntArray) -> tuple[sp.csc_matrix, int]:

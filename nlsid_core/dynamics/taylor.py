@@ -5,7 +5,7 @@ are cubics as they are written stay what they are; every other one has a bounded
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from math import inf, nextafter
@@ -47,7 +47,8 @@ class Rates:
 
     exact: the rates that are polynomials of degree 3 at most in (x, u); else None. uses: of every
     other rate, the entries of z = (t, x, u, w) that it depends on. affine: every cubic is affine in
-    each input, as a hold needs it; what is left out is in its remainder.
+    each input, as a hold needs it; what is left out is in its remainder. valid: (D, 3) as of a
+    VectorField: every box is cut to it, and every field of cubics states it.
 
     Raises NlsidError, naming what is supported, on a function that nothing here expands.
     """
@@ -59,6 +60,7 @@ class Rates:
     exact: tuple[Polynomial | None, ...]
     uses: tuple[frozenset[int], ...]
     affine: bool = False
+    valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def of(
@@ -195,6 +197,9 @@ class Rates:
 
     def on(self, low: FloatArray, high: FloatArray, times: tuple[float, float]) -> "Cubic":
         """The cubics on the box low ≤ (x, u) ≤ high, (n + m,), and the times; DataError if none."""
+        low, high = low.copy(), high.copy()
+        for j, least, most in self.valid.tolist():
+            low[int(j)], high[int(j)] = max(low[int(j)], least), min(high[int(j)], most)
         bottom = np.concatenate([[times[0]], low, self.uncertain[:, 0]])
         top = np.concatenate([[times[1]], high, self.uncertain[:, 1]])
         centre, radius = _centred(bottom, top)
@@ -410,10 +415,11 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
         valid += [(j, float(low[j]), float(high[j]), span) for j in rates.expanded]
     uncertain = np.vstack([given, np.tile([-1.0, 1.0], (len(rows), 1))])
     if not rows:
-        return VectorField((pieces[0],), n, m, uncertain=uncertain)
-    return VectorField(
+        return VectorField((pieces[0],), n, m, uncertain=uncertain, valid=rates.valid)
+    made = VectorField(
         tuple(pieces), n, m, t[1:-1], uncertain, np.array(valid).reshape(-1, 4), EXPANSION
     )
+    return made.within(rates.valid[~np.isin(rates.valid[:, 0], rates.expanded)])
 
 
 def box_of(uncertain: ArrayLike | None) -> FloatArray:

@@ -5,9 +5,10 @@ Source: Makino and Berz, "Taylor models and other validated functional inclusion
 Assumes IEEE 754 double precision, and elementary functions right to a few units in the last place.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import atan, atan2, cos, exp, frexp, log, pi, sin, sqrt, tan, tanh
+from math import atan2, cos, exp, frexp, pi, sin, sqrt, tan
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,12 @@ SUMMED = 1 + 2.0**-40  # covers the roundings of a sum of bounds
 MAX_POWER = 64
 CLEAR_OF_POLE = 1e-3  # rad; there the tangent is right to a SUMMED
 MOST_FOURTH = {"tanh": 0.171, "arctan": 0.195}  # of |f⁗|/4! anywhere: their maxima, rounded up
+CELLS = 256  # of a range, where the error of a cubic is looked at
+GRID = np.linspace(-1.0, 1.0, CELLS + 1)
+NODES = np.cos(np.pi * np.arange(1, 8, 2) / 8)  # Chebyshev's points, for a cubic
+TO_POWERS = np.linalg.inv(np.vander(NODES, increasing=True))  # values there to coefficients
+CANCELLED = 1e3  # Σ of the coefficients that change a cubic of a cubic into Chebyshev's and back
+LEBESGUE = 64.0  # Σ|TO_POWERS| is 12.9: so much of the values' errors is in a cubic, with room
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +36,13 @@ class TaylorModel:
     """Σ coefficients·d^keys ± error. keys: (M,) increasing, the first is 0, the constant.
 
     A key is three digits in BASE, the variables (1 is d_0) of a product, 0 for none, increasing.
+    ridge: of a function of one form T of degree 1, |T| ≤ 1, that form and (4,) the cubic in it.
     """
 
     keys: IntArray
     coefficients: FloatArray
     error: float
+    ridge: "tuple[TaylorModel, FloatArray] | None" = None
 
     @classmethod
     def variable(cls, j: int, centre: float, radius: float) -> "TaylorModel":
@@ -57,8 +66,9 @@ class TaylorModel:
                 return NotImplemented
             shifted = self.coefficients.copy()
             shifted[0] += number
-            lost = 0.0 if number == 0 else ROUNDING * abs(shifted[0])
-            return self._made(self.keys, shifted, self.error, lost)
+            lost = 0.0 if number == 0 else 2 * ROUNDING * (abs(shifted[0]) + abs(number))
+            moved = self._made(self.keys, shifted, self.error, lost)
+            return replace(moved, ridge=self._along(np.array([number, 0.0, 0.0, 0.0]), 1.0))
         keys, first, second = _union(self.keys.tobytes(), other.keys.tobytes())
         total = np.zeros(len(keys))
         total[first] = self.coefficients
@@ -92,7 +102,8 @@ class TaylorModel:
         return self.reciprocal().__mul__(other)
 
     def __neg__(self) -> "TaylorModel":
-        return TaylorModel(self.keys, -self.coefficients, self.error)
+        turned = self._along(np.zeros(4), -1.0)
+        return TaylorModel(self.keys, -self.coefficients, self.error, turned)
 
     def __pos__(self) -> "TaylorModel":
         return self
@@ -136,14 +147,12 @@ class TaylorModel:
     def sin(self) -> "TaylorModel":
         """Its sine."""
         c, b = self._around()
-        left = min(1.0, abs(sin(c)) + b) / 24
-        return self._composed([sin(c), cos(c), -sin(c) / 2, -cos(c) / 6], left)
+        return self._composed(np.sin, min(1.0, abs(sin(c)) + b) / 24)
 
     def cos(self) -> "TaylorModel":
         """Its cosine."""
         c, b = self._around()
-        left = min(1.0, abs(cos(c)) + b) / 24
-        return self._composed([cos(c), -sin(c), -cos(c) / 2, sin(c) / 6], left)
+        return self._composed(np.cos, min(1.0, abs(cos(c)) + b) / 24)
 
     def tan(self) -> "TaylorModel":
         """Its tangent. Raises DataError if the box reaches a pole."""
@@ -151,42 +160,30 @@ class TaylorModel:
         from_pole = pi / 2 - abs((c + pi / 2) % pi - pi / 2)
         if b * SUMMED >= from_pole - CLEAR_OF_POLE:
             raise DataError(f"the tangent of a value that may be at a pole, {c:.3g} ± {b:.3g}")
-        T, most = tan(c), tan(pi / 2 - from_pole + b) * SUMMED
-        one = 1 + T * T
-        fourth = most * (1 + most**2) * (2 + 3 * most**2) / 3
-        return self._composed([T, one, T * one, one * (1 + 3 * T * T) / 3], fourth * SUMMED)
+        most = tan(pi / 2 - from_pole + b) * SUMMED
+        return self._composed(np.tan, most * (1 + most**2) * (2 + 3 * most**2) / 3)
 
     def exp(self) -> "TaylorModel":
         """Its exponential."""
         c, b = self._around()
-        E = exp(c)
-        return self._composed([E, E, E / 2, E / 6], exp(c + b) * SUMMED / 24)
+        return self._composed(np.exp, exp(c + b) / 24)
 
     def log(self) -> "TaylorModel":
         """Its natural logarithm. Raises DataError unless it is positive on the box."""
-        c, least = self._positive("the logarithm of")
-        return self._composed([log(c), 1 / c, -1 / (2 * c**2), 1 / (3 * c**3)], 1 / (4 * least**4))
+        return self._composed(np.log, 1 / (4 * self._positive("the logarithm of") ** 4))
 
     def sqrt(self) -> "TaylorModel":
         """Its root. Raises DataError unless it is positive on the box."""
-        c, least = self._positive("the root of")
-        r = sqrt(c)
-        series = [r, 1 / (2 * r), -1 / (8 * r * c), 1 / (16 * r * c * c)]
-        return self._composed(series, 5 / 128 / (sqrt(least) * least**3))
+        least = self._positive("the root of")
+        return self._composed(np.sqrt, 5 / 128 / (sqrt(least) * least**3))
 
     def tanh(self) -> "TaylorModel":
         """Its hyperbolic tangent."""
-        T = tanh(self._around()[0])
-        one = 1 - T * T
-        series = [T, one, -T * one, -one * (1 - 3 * T * T) / 3]
-        return self._composed(series, MOST_FOURTH["tanh"], cancelled=1.0)
+        return self._composed(np.tanh, MOST_FOURTH["tanh"])
 
     def arctan(self) -> "TaylorModel":
         """Its arc tangent."""
-        c, _ = self._around()
-        q = 1 + c * c
-        series = [atan(c), 1 / q, -c / q**2, (3 * c * c - 1) / (3 * q**3)]
-        return self._composed(series, MOST_FOURTH["arctan"], cancelled=1.0)
+        return self._composed(np.arctan, MOST_FOURTH["arctan"])
 
     def arctan2(self, other: Any) -> "TaylorModel":
         """The angle of (other, self). Raises DataError if the box reaches zero or the cut at π."""
@@ -211,16 +208,16 @@ class TaylorModel:
         """One over it. Raises DataError if it may be zero on the box."""
         if self._around()[0] < 0:
             return -((-self).reciprocal())
-        c, least = self._positive("division by", "may be zero")
-        return self._composed([1 / c, -1 / c**2, 1 / c**3, -1 / c**4], 1 / least**5)
+        least = self._positive("division by", "may be zero")
+        return self._composed(np.reciprocal, 1 / least**5)
 
-    def _positive(self, what: str, otherwise: str = "may not be positive") -> tuple[float, float]:
-        """The middle of its values and a positive lower bound, or DataError."""
+    def _positive(self, what: str, otherwise: str = "may not be positive") -> float:
+        """A positive lower bound, or DataError."""
         c, b = self._around()
         least = (c - b * SUMMED) / SUMMED
         if least <= 0:
             raise DataError(f"{what} a value that {otherwise} in the box around {c:.3g}")
-        return c, least
+        return least
 
     def _spread(self) -> float:
         """A bound of how far from its centre it is."""
@@ -231,6 +228,12 @@ class TaylorModel:
 
         pd + qd² is between its values at d = ±1, and -p²/4q where |p| < 2|q|.
         """
+        if self.ridge is not None:
+            a = self.ridge[1]
+            values = np.polynomial.polynomial.polyval(GRID, a)
+            middle, half = float(values.max() + values.min()) / 2, float(np.ptp(values)) / 2
+            over = float(abs(a[2]) + 3 * abs(a[3])) / CELLS**2 + ROUNDING * float(np.abs(a).sum())
+            return middle, (half + over + self.error) * SUMMED
         squares, lines, others = _alone(self.keys.tobytes())
         q = self.coefficients[squares]
         if not q.any():
@@ -245,26 +248,66 @@ class TaylorModel:
         return c, (rest + self.error) * SUMMED + (SUMMED - 1) * self.size
 
     def _composed(
-        self, series: list[float], fourth: float, *, cancelled: float = 0.0
+        self, function: Callable[[FloatArray], FloatArray], fourth: float
     ) -> "TaylorModel":
-        """Σ series_i δ^i, δ = self - c of `_around`, and what is left: `fourth`·δ⁴ at most.
+        """function(self), whose fourth derivative is 24 `fourth` at most on all its values.
 
-        cancelled: the size of what a coefficient of the series is a difference of.
+        A cubic p interpolates it at Chebyshev's points of [c - b, c + b]. The error e has four
+        zeros, so |e'| ≤ 32 fourth b³ and |e''| ≤ 48 fourth b²; between two of CELLS + 1 points it
+        is then at most 6 fourth b²h² above the larger of its values there, h = 2b/CELLS. Of a
+        ridge, p is a polynomial in one form: what is above degree 3 is left out in Chebyshev's.
         """
-        c, within = self._around()
-        delta = self + -c
-        b = delta.size
-        result = delta * series[3] + series[2]
-        for term in (series[1], series[0]):
-            result = result * delta + term
-        lost = ROUNDING * sum((abs(term) + cancelled) * b**i for i, term in enumerate(series))
-        error = (result.error + fourth * SUMMED * within**4 + lost) * SUMMED
-        return TaylorModel(result.keys, result.coefficients, error)
+        c, b = self._around()
+        if b == 0:
+            value = function(np.array([c]))
+            return TaylorModel(np.array([0]), value, ROUNDING * float(np.abs(value)[0]))
+        nodes, grid = function(c + b * NODES), function(c + b * GRID)
+        a = TO_POWERS @ nodes
+        gaps = np.abs(grid - np.polynomial.polynomial.polyval(GRID, a))
+        between = 24 * fourth * b**4 / CELLS**2
+        # Rounding: of the values, and of the points, which moves values by the slope.
+        size = float(np.abs(grid).max())
+        slope = float(np.abs(a) @ range(4))
+        moved = (abs(c) / b + 1) * (slope + 32 * fourth * b**4)
+        lost = ROUNDING * (LEBESGUE * size + moved)
+        within = float(gaps.max()) + between + lost
+        ridge = self._as_ridge()
+        if ridge is None:
+            delta = (self + -c) * (1 / b)
+            found = ((delta * a[3] + a[2]) * delta + a[1]) * delta + a[0]
+            return TaylorModel(found.keys, found.coefficients, (found.error + within) * SUMMED)
+        form, inner = ridge
+        inner = (inner - [c, 0, 0, 0]) / b
+        outer = np.polynomial.Polynomial(a)(np.polynomial.Polynomial(inner))
+        series = np.polynomial.chebyshev.poly2cheb(outer.coef)
+        low = np.polynomial.chebyshev.cheb2poly(series[:4])
+        kept: FloatArray = np.zeros(4)
+        kept[: len(low)] = low
+        within += float(np.abs(series[4:]).sum()) + slope * self.error / b
+        within += CANCELLED * ROUNDING * float(np.abs(a) @ np.abs(inner).sum() ** np.arange(4))
+        found = ((form * kept[3] + kept[2]) * form + kept[1]) * form + kept[0]
+        error = (found.error + within) * SUMMED
+        return TaylorModel(found.keys, found.coefficients, error, (form, kept))
 
     def _scaled(self, factor: float, exact: bool) -> "TaylorModel":
         scaled = factor * self.coefficients
-        lost = 0.0 if exact else ROUNDING * float(np.abs(scaled).sum())
-        return self._made(self.keys, scaled, abs(factor) * self.error, lost)
+        lost = 0.0 if exact else 2 * ROUNDING * float(np.abs(scaled).sum())
+        made = self._made(self.keys, scaled, abs(factor) * self.error, lost)
+        return replace(made, ridge=self._along(np.zeros(4), factor))
+
+    def _along(self, shift: FloatArray, factor: float) -> "tuple[TaylorModel, FloatArray] | None":
+        """The ridge of shift + factor·self."""
+        return None if self.ridge is None else (self.ridge[0], factor * self.ridge[1] + shift)
+
+    def _as_ridge(self) -> "tuple[TaylorModel, FloatArray] | None":
+        """Its ridge; a form of degree 1 is one of itself."""
+        if self.ridge is not None or self.keys[-1] >= BASE or len(self.keys) < 2:
+            return self.ridge
+        size = float(np.abs(self.coefficients[1:]).sum()) * SUMMED
+        if size == 0:
+            return None
+        form = TaylorModel(self.keys, np.r_[0.0, self.coefficients[1:] / size], 0.0)
+        return form, np.array([self.centre, size, 0.0, 0.0])
 
     def _made(
         self, keys: IntArray, coefficients: FloatArray, error: float, lost: float

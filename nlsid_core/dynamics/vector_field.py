@@ -176,6 +176,14 @@ class VectorField:
             uncertain=np.vstack([self.uncertain, rows[states]]),
         )
 
+    def within(self, rows: FloatArray) -> "VectorField":
+        """The same equations, valid only where entries of (x, u) are within `rows` (D, 3) too."""
+        if self.valid.shape[1] == 4:
+            spans = range(len(self.pieces))
+            more = [[*row, span] for row in rows.tolist() for span in spans]
+            rows = np.array(more).reshape(-1, 4)
+        return replace(self, valid=np.vstack([self.valid, rows]))
+
     @property
     def depends_on_time(self) -> bool:
         """True if t occurs, or equations change at some time."""

@@ -1,6 +1,6 @@
 """Identification: a dataset in, a stable model with its proof out (thesis Part I)."""
 
-from nlsid_core.identification.choosing import Selection, Tried, select
+from nlsid_core.identification.choosing import Attempt, Choice, Promise, Row
 from nlsid_core.identification.families import ModelClass, describe, methods_of
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import identify
@@ -11,7 +11,6 @@ from nlsid_core.identification.methods.options import (
     Rie,
     Rse,
     Sem,
-    alike,
 )
 from nlsid_core.identification.network.options import CellRow, Feedback, FilterMapFilter, Network
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
@@ -28,8 +27,10 @@ from nlsid_core.identification.validation import (
 
 __all__ = [
     "METHODS",
+    "Attempt",
     "Candidate",
     "CellRow",
+    "Choice",
     "Degrees",
     "Feedback",
     "FilterMapFilter",
@@ -42,18 +43,17 @@ __all__ = [
     "ModelClass",
     "Network",
     "Polynomial",
+    "Promise",
     "Proof",
     "RepeatTest",
     "Residual",
     "Rie",
+    "Row",
     "Rse",
-    "Selection",
     "Sem",
     "StabilityProof",
     "Step",
-    "Tried",
     "Validation",
-    "alike",
     "compare_repeats",
     "describe",
     "identify",
@@ -61,7 +61,6 @@ __all__ = [
     "predict",
     "prove_implicit",
     "prove_stability",
-    "select",
     "simulate_trial",
     "simulation_percent",
     "stated_rate",

@@ -1,133 +1,319 @@
-"""`select`: several classes identified, and the one with the least validation error kept."""
+"""The one rule by which everything about a model is chosen: by data that were held out.
 
-import logging
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+The trials are put into folds; trials that repeat one excitation stay together, and where all have
+one excitation, stretches of time are held out instead. Each fold is simulated by models of the
+others, every stretch from a start that is found on its first samples, which are not scored. Taken
+is the simplest model that is within one standard error of the best.
 
-from nlsid_core.data.trajectory import Dataset
+What a person may expect is promised by the same errors, and by none that chose: for each fold the
+model is chosen by the other folds alone, and its error on that fold counts.
+Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Section
+3.4.3 (the rule of one standard error).
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.repeats import by_excitation
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.families import ModelClass, describe
-from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.identify import identify
-from nlsid_core.identification.methods.options import Method
-from nlsid_core.progress import Progress, silent
+from nlsid_core.identification.methods.options import Method, Rse
+from nlsid_core.identification.polynomial.options import Polynomial
+from nlsid_core.identification.prediction import Model, simulate_started
+from nlsid_core.identification.rates import rate_of_memory
 
-log = logging.getLogger(__name__)
-
-
-def select(
-    train: Dataset,
-    validation: Dataset,
-    classes: Sequence[ModelClass],
-    *,
-    method: Method | None = None,
-    test: Dataset | None = None,
-    transient: int = 0,
-    max_rate: float | None = None,
-    allow_unproved: bool = False,
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> "Selection":
-    """Identify every class on `train`, choose by the error on `validation`, fit to both again.
-
-    No class sees `validation` before it is judged by it. A class that does not fit the data or
-    (unless `allow_unproved`) has no proof counts as infinitely bad. The chosen class is identified
-    once more on both datasets together, or, where it makes choices by validation trials, on `train`
-    with these. executor: tries the classes beside each other; what it finds is the same to the last
-    bit, in the order of `classes`. The other options are those of `identify`. Raises Infeasible if
-    no class has a model.
-    """
-    fitted = partial(
-        identify,
-        method=method,
-        comparators=(),
-        test=test,
-        transient=transient,
-        max_rate=max_rate,
-        allow_unproved=allow_unproved,
-    )
-    one = partial(_tried, fitted, train, validation)
-    tried: list[Tried] = []
-    for entry in map(one, classes) if executor is None else executor.map(one, classes):
-        tried.append(entry)
-        progress(describe(entry.model_class), len(tried) / (len(classes) + 1))
-    if not tried:
-        raise DataError("no model class to select from")
-    best = min(tried, key=lambda entry: entry.error("validation"))
-    if best.fit is None:
-        reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
-        raise Infeasible(f"no class has a proved model: {reasons}")
-    progress("fitting to training and validation trials", len(classes) / (len(classes) + 1))
-    refit, chooses = best.fit, getattr(best.model_class, "needs_validation", False)
-    try:
-        if chooses:
-            refit = fitted(train, best.model_class, validation=validation)
-        else:
-            both = Dataset((*train.trajectories, *validation.trajectories))
-            refit = fitted(both, best.model_class)
-    except (DataError, SolverError) as refusal:
-        log.warning("not fitted with the validation trials: %s", refusal)
-    progress("done", 1.0)
-    refitted = refit is not best.fit and not chooses
-    return Selection(tuple(tried), best.model_class, refit, refitted)
+FOLDS = 3
+STRETCHES = 6  # of a recording, where stretches of time are held out
+FEW = 5  # excitations: of fewer, each is judged in stretches
+STARTS = (10, 20, 30, 45)  # samples that may show how a stretch starts, a fifth of it at most;
+PLACES = (0.0, 0.15, 0.3, 0.45)  # of a trial, where it is tried how many are needed,
+START_LAGS, START_STEPS, START_CLOSE = 4, 6, 1.04  # by a linear model, and its squared error
+SHORTEST = 20  # samples of a stretch
+SAMPLES = 8000  # that a fold is fitted to, at most
+CLOSE = 1.05  # times the best error: what is worse is not "as good", however few folds there are
+SURE = 0.9  # probability of the promised interval, were squared errors normal
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """One class: its fit, or the reason why there is none."""
+@dataclass(frozen=True)
+class Attempt:
+    """A class and a method to try. memory: the longest time constant, in longest trials."""
 
     model_class: ModelClass
-    fit: Fit[Any] | None
-    refusal: str = ""
+    method: Method
+    memory: float = 1.0
 
-    def error(self, dataset: str) -> float:
-        """The chosen method's error in %; infinite where there is no fit."""
-        return float("inf") if self.fit is None else self.fit.errors[dataset][self.fit.method.name]
-
-
-def _tried(
-    fitted: Callable[[Dataset, ModelClass], Fit[Any]],
-    train: Dataset,
-    validation: Dataset,
-    model_class: ModelClass,
-) -> Tried:
-    """The class fitted to `train` and judged by `validation`, or why there is no fit."""
-    try:
-        fit = fitted(train, model_class)
-    except (DataError, SolverError) as refusal:
-        return Tried(model_class, None, str(refusal))
-    judged = {fit.method.name: fit.chosen.error_percent(validation)}
-    errors = {"train": fit.errors["train"], "validation": judged, **fit.errors}
-    return Tried(model_class, replace(fit, errors=errors))
+    def __str__(self) -> str:
+        iterations = getattr(self.method, "iterations", None)
+        steps = "" if iterations is None else f" ({iterations})"
+        limit = "" if self.memory == 1.0 else f", memory at most {self.memory:.2g} trials"
+        return f"{describe(self.model_class)}: {self.method.name}{steps}{limit}"
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
-    """Everything that was tried, in order, and the class with the least validation error.
+class Row:
+    """What became of an attempt: mean squared errors of the stretches, in squared spreads.
 
-    fit: of that class, to training and validation trials together if `refitted`.
+    errors: of each stretch, NaN where there is none. size: numbers in the model's file. refusal:
+    why an error is missing.
     """
 
-    tried: tuple[Tried, ...]
-    best: ModelClass
-    fit: Fit[Any]
-    refitted: bool
+    attempt: Attempt
+    errors: FloatArray
+    size: int = 0
+    refusal: str = ""
 
     @property
-    def errors(self) -> tuple[float, ...]:
-        """Validation errors in % of the chosen method; infinite where none was found."""
-        return tuple(entry.error("validation") for entry in self.tried)
+    def percent(self) -> float:
+        """The error over all stretches in % of the outputs' spread; infinite without one."""
+        return 100.0 * math.sqrt(self.errors.mean()) if not self.refusal else math.inf
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What to expect of new data, in % of the outputs' spread: an error, and between which two.
+
+    on: what was held out, in words.
+    """
+
+    percent: float
+    low: float
+    high: float
+    on: str
 
     def __str__(self) -> str:
-        rows = [
-            f"{'*' if entry.model_class is self.best else ' '} {describe(entry.model_class):70s}"
-            + (entry.refusal or f"{entry.error('validation'):9.2f} %")
-            for entry in self.tried
-        ]
-        on = "training and validation trials" if self.refitted else "training trials"
-        return "\n".join(
-            ["model class, validation error", *rows, f"fitted to {on}:", str(self.fit)]
+        return f"{self.low:.3g} to {self.high:.3g} % on {self.on} that were held out"
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """fitted: what models are fitted to; judged: stretches, each of one or several repeats."""
+
+    fitted: Dataset
+    judged: tuple[tuple[Trajectory, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Data in folds.
+
+    on: what is held out, in words. start: samples that show how a stretch starts, and are not
+    scored. spread: (p,) of the outputs.
+    """
+
+    data: Dataset
+    on: str
+    folds: tuple[Fold, ...]
+    start: int
+    spread: FloatArray
+
+    @classmethod
+    def of(cls, data: Dataset) -> "HeldOut":
+        """DataError if there is too little of it."""
+        groups = by_excitation(data)
+        if len(groups) == 1:
+            on, folds = "stretches of time", list(_folds_in_time(data))
+        else:
+            on, folds = "excitations", list(_folds_of(groups))
+        spread = np.concatenate([trial.y for trial in data]).std(axis=0)
+        shortest = min(len(t) for fold in folds for group in fold.judged for t in group)
+        return cls(
+            data, on, tuple(folds), _start(data, shortest), np.maximum(spread, np.finfo(float).tiny)
         )
+
+    @property
+    def fold_of(self) -> FloatArray:
+        """The fold of each stretch."""
+        return np.repeat(np.arange(len(self.folds)), [len(fold.judged) for fold in self.folds])
+
+    def error(self, model: Model, stretch: Sequence[Trajectory]) -> float:
+        """The mean squared error of a simulation, in squared spreads; infinite if it diverges."""
+        squares = []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for trial in stretch:
+                missed = simulate_started(model, trial, self.start) - trial.y
+                squares.append((missed[self.start :] / self.spread) ** 2)
+            error = float(np.mean(np.concatenate(squares)))
+        return error if np.isfinite(error) else np.inf
+
+    def judged(self, attempt: Attempt) -> Row:
+        """The row of an attempt."""
+        errors, size = np.full(len(self.fold_of), np.nan), 0
+        for k, fold in enumerate(self.folds):
+            try:
+                model = fitted(fold.fitted, attempt, self.data)
+            except (DataError, SolverError) as refusal:
+                return Row(attempt, errors, size, str(refusal))
+            here = self.fold_of == k
+            errors[here] = [self.error(model, stretch) for stretch in fold.judged]
+            size = max(size, _numbers(model.document()))
+            if not np.isfinite(errors[here]).all():
+                return Row(attempt, errors, size, "its simulation diverges")
+        return Row(attempt, errors, size)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Everything that was tried, in order, and what the rule takes."""
+
+    held_out: HeldOut
+    rows: tuple[Row, ...]
+
+    @property
+    def best(self) -> Row:
+        """What is taken; Infeasible if nothing has a proved model."""
+        return self.ranked[0]
+
+    @property
+    def ranked(self) -> list[Row]:
+        """What is taken, then the others that have an error, the best first."""
+        known = [row for row in self.rows if not row.refusal]
+        if not known:
+            raise Infeasible("no class that was tried has a proved model of these data")
+        first = simplest(known, np.ones(len(known[0].errors), dtype=bool))
+        others = sorted((row for row in known if row is not first), key=lambda row: row.percent)
+        return [first, *others]
+
+    @property
+    def promise(self) -> Promise:
+        """The errors on each fold of what the other folds choose.
+
+        The interval is that of as much new data as a fold: the mean of n squared errors and that of
+        n/3 new ones differ by a standard deviation of 2 σ/√n, half of it in the root.
+        """
+        known, fold_of = self.ranked, self.held_out.fold_of
+        errors = np.empty(len(fold_of))
+        for k in range(len(self.held_out.folds)):
+            errors[fold_of == k] = simplest(known, fold_of != k).errors[fold_of == k]
+        n, mean = len(errors), float(errors.mean())
+        deviation = float(errors.std(ddof=1)) / max(mean, np.finfo(float).tiny) / math.sqrt(n)
+        factor = math.exp(float(student.ppf(0.5 + 0.5 * SURE, n - 1)) * deviation)
+        percent = 100.0 * math.sqrt(mean)
+        return Promise(percent, percent / factor, factor * percent, self.held_out.on)
+
+
+def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
+    """The smallest model within one standard error of the best, by these stretches.
+
+    The error is that of the difference, stretch by stretch. Of equally small ones the best.
+    """
+    means = [float(np.mean(row.errors[by])) for row in rows]
+    best = rows[int(np.argmin(means))]
+
+    def is_as_good(row: Row) -> bool:
+        worse = (row.errors - best.errors)[by]
+        error = float(worse.std(ddof=1)) / math.sqrt(len(worse))
+        limit = (CLOSE**2 - 1.0) * float(np.mean(best.errors[by]))
+        return float(worse.mean()) <= min(error, limit)
+
+    good = [(row.size, mean, i) for i, (row, mean) in enumerate(zip(rows, means, strict=True))]
+    return rows[min(entry for entry in good if is_as_good(rows[entry[2]]))[2]]
+
+
+def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Model:
+    """The attempt's proved model of a part of the data. Raises as `identify`."""
+    model: Model = identify(
+        train,
+        attempt.model_class,
+        method=attempt.method,
+        comparators=(),
+        max_rate=rate_of_memory(whole, attempt.memory),
+    ).model
+    return model
+
+
+def _start(data: Dataset, shortest: int) -> int:
+    """Samples that show how a stretch starts: the fewest that are about as good as more.
+
+    By the errors of a linear model that starts at several places of every trial.
+    """
+    rows = [min(samples, shortest // 5) for samples in STARTS]
+    attempt = Attempt(Polynomial(START_LAGS), Rse(START_STEPS))
+    try:
+        model = fitted(shortened(data.trajectories), attempt, data)
+    except (DataError, SolverError):
+        return rows[0]
+    errors = []
+    for samples in rows:
+        squares = []
+        for trial in data:
+            for first in (int(place * len(trial)) for place in PLACES):
+                part = trial.rows(slice(first, first + min(shortest, SAMPLES // FOLDS)))
+                missed = simulate_started(model, part, samples) - part.y
+                squares.append(np.mean(missed[rows[-1] :] ** 2))
+        errors.append(float(np.mean(squares)))
+    return next(n for n, e in zip(rows, errors, strict=True) if e <= START_CLOSE * min(errors))
+
+
+def _folds_of(groups: Sequence[Sequence[Trajectory]]) -> Iterator[Fold]:
+    """Every third excitation is judged, whole, or in stretches where there are few."""
+    count = min(FOLDS, len(groups))
+    for k in range(count):
+        rest = [trial for i, group in enumerate(groups) if i % count != k for trial in group]
+        judged = [list(group) for i, group in enumerate(groups) if i % count == k]
+        if len(groups) < FEW:
+            judged = [part for group in judged for part in _stretches(group, FOLDS)]
+        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
+
+
+def _folds_in_time(data: Dataset) -> Iterator[Fold]:
+    """Every third of the stretches of each trial is judged, what is left between them is fitted."""
+    for k in range(FOLDS):
+        rest = []
+        for trial in data:
+            ends = _ends(trial, STRETCHES)
+            kept = [i for i in range(STRETCHES) if i % FOLDS != k]
+            runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+            rest += [_part(trial, ends[run[0]], ends[run[-1] + 1]) for run in runs]
+        judged = _stretches(data.trajectories, STRETCHES)[k::FOLDS]
+        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
+
+
+def _stretches(trials: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
+    """The trials cut into so many stretches each, the first ones of all, the second ones, …."""
+    parts = []
+    for i in range(count):
+        ends = [(trial, _ends(trial, count)) for trial in trials]
+        parts.append([_part(trial, end[i], end[i + 1]) for trial, end in ends])
+    return parts
+
+
+def _ends(trial: Trajectory, count: int) -> list[int]:
+    if len(trial) < count * SHORTEST:
+        raise DataError(
+            f"{trial.name}: {len(trial)} samples are too few to hold a part of them out; at least "
+            f"{count * SHORTEST} are needed"
+        )
+    ends: list[int] = np.linspace(0, len(trial), count + 1).round().astype(int).tolist()
+    return ends
+
+
+def _part(trial: Trajectory, first: int, end: int) -> Trajectory:
+    return trial.rows(slice(first, end), f"{trial.name}[{first}:{end}]")
+
+
+def _cut(trials: Sequence[Trajectory]) -> list[Trajectory]:
+    """The first samples of each."""
+    return [trial.rows(slice(SAMPLES // FOLDS)) for trial in trials]
+
+
+def shortened(trials: Sequence[Trajectory], samples: int = SAMPLES) -> Dataset:
+    """At most about so many: the first of each trial, or of as many trials as have enough."""
+    share = max(samples // len(trials), min(min(map(len, trials)), samples // FOLDS))
+    every = max(1, round(sum(min(len(t), share) for t in trials) / samples))
+    return Dataset(tuple(trial.rows(slice(share)) for trial in trials[::every]))
+
+
+def _numbers(document: object) -> int:
+    """How many numbers there are in a document that are not whole."""
+    if isinstance(document, dict):
+        return sum(map(_numbers, document.values()))
+    if isinstance(document, list):
+        return sum(map(_numbers, document))
+    return int(isinstance(document, float) and document != round(document))

@@ -13,7 +13,6 @@ from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
 
 M = TypeVar("M", bound=Model, covariant=True)
-AT_BOUND = 1.15  # of 1 - max_rate: a search keeps 1.1 (`rates.ROOM`), and a proof loses a little
 
 
 class Proof(Protocol):
@@ -104,7 +103,7 @@ class History:
 class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
-    errors: simulation error in % by dataset name ("train", "validation", "test", those given) and
+    errors: simulation error in % by dataset name ("train", "test", those given) and
     name of the method. max_rate: the slowest rate a sample that was searched, and proofs of which
     count. fit[name] is the candidate of the method called so.
     """
@@ -142,16 +141,8 @@ class Fit(Generic[M]):
 
     @property
     def slowest(self) -> str:
-        """The slowest rate that was allowed, in words, and whether the chosen model has it."""
-        said = f"slowest rate allowed: {rate_text(self.max_rate, self.model.period)} a sample"
-        proof = self.chosen.proof
-        if proof is None or not 0.0 < 1.0 - proof.rate <= AT_BOUND * (1.0 - self.max_rate):
-            return said
-        return (
-            f"{said}. This bound is active: the model is proved at "
-            f"{stated_rate(proof, self.model.period)}, and the trials may ask for a slower one. "
-            "Longer training trials allow it (the longest is the time constant), or max_rate does"
-        )
+        """The slowest rate that was allowed, in words."""
+        return f"slowest rate allowed: {rate_text(self.max_rate, self.model.period)} a sample"
 
     def __str__(self) -> str:
         columns = list(self.errors)

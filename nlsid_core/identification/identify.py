@@ -1,18 +1,15 @@
 """`identify`: a dataset in, one stable model with its proof and the comparators out."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.identification.families import ModelClass, methods_of, search
 from nlsid_core.identification.fit import Fit
-from nlsid_core.identification.methods.options import METHODS, Method, alike
-from nlsid_core.identification.rates import default_max_rate
+from nlsid_core.identification.methods.options import METHODS, Method
+from nlsid_core.identification.rates import rate_of_memory
 from nlsid_core.identification.trail import Task
 from nlsid_core.progress import Progress, silent
 
@@ -23,25 +20,20 @@ def identify(
     *,
     method: Method | None = None,
     comparators: Sequence[Method] | None = None,
-    validation: Dataset | None = None,
     test: Dataset | None = None,
     transient: int = 0,
     max_rate: float | None = None,
     allow_unproved: bool = False,
-    executor: Executor | None = None,
     progress: Progress = silent,
 ) -> Fit[Any]:
     """Identify a model of the class, proved incrementally stable.
 
     method: one that is for the class (`model_class.methods`), such as `Rse(iterations=20)`; None:
-    the first of them. comparators: what else runs beside it; None: what is quick, with the options
-    that it shares with the method. `test` is only scored; so is `validation`, but by it a
-    `FilterMapFilter` chooses its phases and knots (without it by every third training trial, the
-    second of two, or the last third of one). transient: samples at the start of every trial that
-    are simulated and not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a
-    sample: two solutions approach each other by it or faster, and a slower proof does not count
-    (None: the time constant is the length of the longest training trial). executor: shares work
-    that splits, such as moments of many bags. progress: called with (what was done, fraction done).
+    the first of them. comparators: what else runs beside it; None: what is quick. `test` is only
+    scored. transient: samples at the start of every trial that are simulated and not scored.
+    max_rate: of models that are searched, 0 < max_rate < 1 a sample: two solutions approach each
+    other by it or faster, and a slower proof does not count (None: the time constant is the length
+    of the longest training trial). progress: called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
     """
@@ -50,20 +42,19 @@ def identify(
     for asked in (chosen, *(comparators or ())):
         if getattr(asked, "name", None) not in [one.name for one in known]:
             raise DataError(_unknown(asked, known))
-    datasets = {"train": train, "validation": validation, "test": test}
+    datasets = {"train": train, "test": test}
     scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
-    _refuse_other_signals(scored)
+    for dataset in scored.values():  # a dataset has the same signals and period throughout
+        Dataset((train.trajectories[0], dataset.trajectories[0]))
     if max_rate is not None and not 0.0 < max_rate < 1.0:
         raise OptionError("max_rate", max_rate, "a number between 0 and 1")
-    slowest = default_max_rate(train) if max_rate is None else max_rate
-    quick = tuple(alike(one, chosen) for one in model_class.comparators if one.name != chosen.name)
+    slowest = rate_of_memory(train) if max_rate is None else max_rate
+    quick = tuple(one for one in model_class.comparators if one.name != chosen.name)
     task = Task(
         method=chosen,
         comparators=quick if comparators is None else tuple(comparators),
         max_rate=slowest,
-        validation=validation,
         transient=transient,
-        executor=executor,
         progress=progress,
     )
     trail = search(train, model_class, task)
@@ -86,19 +77,3 @@ def _unknown(asked: object, known: Sequence[Method]) -> str:
     if not isinstance(asked, Method):
         return f"{asked!r} is no method; there are: {', '.join(METHODS)}"
     return f"{asked!r} is not for this model class; it has: {names}"
-
-
-def _refuse_other_signals(datasets: dict[str, Dataset]) -> None:
-    first = datasets["train"].trajectories[0]
-    for name, dataset in datasets.items():
-        other = dataset.trajectories[0]
-        if (other.y_names, other.u_names) != (first.y_names, first.u_names):
-            raise DataError(
-                f"the {name} data hold {other.y_names + other.u_names}, the training data "
-                f"{first.y_names + first.u_names}"
-            )
-        if not np.isclose(dataset.period, datasets["train"].period, rtol=1e-6, atol=0.0):
-            raise DataError(
-                f"the {name} data are sampled every {dataset.period:g} s, the training data every "
-                f"{datasets['train'].period:g} s"
-            )

@@ -3,6 +3,7 @@ over single predictions: all starts advance together.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import lfilter
@@ -20,6 +21,7 @@ from nlsid_core.models import (
     StableModel,
     StateAffineModel,
 )
+from nlsid_core.models.starts import nearest_start
 
 Model = StableModel
 # [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
@@ -62,6 +64,26 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
         return simulate_together(model, [trial])[0]
     u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
     return model.simulate(u, trial.y[:n, 0])[:, None]
+
+
+def simulate_started(model: Model, trial: Trajectory, samples: int) -> FloatArray:
+    """`simulate_trial` from the start that is nearest to the first samples of the trial."""
+    n = history(model)
+    if isinstance(model, CellNetwork):
+        return model.simulate(trial.u, trial.y[: samples or n])
+    if samples <= n:
+        return simulate_trial(model, trial)
+    beginning = trial.rows(slice(samples))
+
+    def simulated(starts: FloatArray) -> FloatArray:
+        return np.stack([simulate_trial(model, _from(start, beginning)) for start in starts])
+
+    return simulate_trial(model, _from(nearest_start(simulated, beginning.y, n), trial))
+
+
+def _from(start: FloatArray, trial: Trajectory) -> Trajectory:
+    """The trial with other first outputs (n, p)."""
+    return replace(trial, y=np.concatenate([start, trial.y[len(start) :]]))
 
 
 def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArray]:

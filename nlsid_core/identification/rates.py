@@ -8,21 +8,15 @@ neither. So unless it is given the slowest rate is exp(-1/N) a sample of the lon
 import math
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.identification.fit import Proof
 
 ROOM = 1.1  # of 1 - rate, that a search keeps so that an exact proof is not slower
 
 
-def default_max_rate(train: Dataset) -> float:
-    """exp(-1/N), N the samples of the longest trial: its time constant is that trial's length."""
-    return math.exp(-1.0 / max(map(len, train)))
+def rate_of_memory(train: Dataset, trials: float = 1.0) -> float:
+    """The rate whose time constant is so many times the longest trial."""
+    return math.exp(-1.0 / (trials * max(map(len, train))))
 
 
 def searched_rate(max_rate: float) -> float:
     """The rate that a search keeps, so that the proof of what it finds is at most `max_rate`."""
     return max(1.0 - ROOM * (1.0 - max_rate), 0.5 * max_rate)
-
-
-def is_too_slow(proof: Proof, max_rate: float) -> bool:
-    """The proof states a rate, and that is slower than asked for."""
-    return max_rate < proof.rate < 1.0

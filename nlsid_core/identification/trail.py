@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -26,7 +25,7 @@ from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.methods.rse import Iterate, affordable_steps, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.prediction import Model
-from nlsid_core.identification.rates import is_too_slow, searched_rate
+from nlsid_core.identification.rates import searched_rate
 from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.progress import Progress, silent
 
@@ -48,9 +47,7 @@ class Task:
     method: Method
     comparators: tuple[Method, ...]
     max_rate: float
-    validation: Dataset | None = None
     transient: int = 0
-    executor: Executor | None = None
     progress: Progress = silent
 
     @property
@@ -90,9 +87,11 @@ class Trail(Generic[T]):
         started = time.process_time()
         try:
             model, proof = make(method)
-        except NlsidError as reason:
-            if method is self.task.method:
+        except (NlsidError, LinAlgError) as reason:
+            if method is self.task.method and isinstance(reason, NlsidError):
                 raise
+            if method is self.task.method:
+                raise SolverError(f"{method.title}: {reason}") from reason
             log.warning("no comparison with %s: %s", method.name, reason)
             return
         self._keep(method, model, proof, time.process_time() - started)
@@ -160,7 +159,7 @@ class Trail(Generic[T]):
 
     def _keep(self, method: Method, model: T, proof: Proof | None, seconds: float) -> None:
         remark = ""
-        if proof is not None and is_too_slow(proof, self.task.max_rate):
+        if proof is not None and self.task.max_rate < proof.rate < 1.0:
             period = model.period
             remark = (
                 f"proved only at {stated_rate(proof, period)} a sample, slower than the max_rate "

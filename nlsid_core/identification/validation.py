@@ -246,18 +246,6 @@ def prediction_percent(
     return _percent(pairs)
 
 
-def hold_out(train: Dataset) -> tuple[Dataset, Dataset]:
-    """(fitted, judged), judged on every third trial, the second of two or the end of one."""
-    if len(train) == 1:
-        (trial,), cut = train, 2 * len(train.trajectories[0]) // 3
-        return Dataset((trial.rows(slice(cut)),)), Dataset((trial.rows(slice(cut, None)),))
-    judged = [i % 3 == min(2, len(train) - 1) for i in range(len(train))]
-    return (
-        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if not out)),
-        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if out)),
-    )
-
-
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity

@@ -27,6 +27,7 @@ from nlsid_core.models import (
 from nlsid_core.models.implicit_step import SingleStep
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.signal import Signal
+from nlsid_core.models.starts import nearest_start
 from nlsid_core.polynomial.products import Products
 
 
@@ -54,13 +55,30 @@ class Stepper:
     def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
         """The state (n,) after the samples y (k, p), u (k, n_u), k >= lags.
 
-        A block cascade's first filter starts as if its input had always been the first one.
+        Of more samples than `lags` all are used: the run from the nearest start. A block cascade's
+        first filter starts as if its input had always been the first one.
         """
         if len(y) < self.lags or y.shape[1] != len(self.y) or u.shape != (len(y), len(self.u)):
             raise ShapeError(
                 f"y and u should be (k, {len(self.y)}) and (k, {len(self.u)}), k >= {self.lags}; "
                 f"are {y.shape} and {u.shape}"
             )
+        if len(y) == self.lags or isinstance(self.model, CellNetwork):
+            return self._begun(y, u)
+        start = nearest_start(lambda starts: self._run(starts, u)[0], y, self.lags)
+        return np.asarray(self._run(start[None], u)[1][0])
+
+    def _run(self, starts: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs (B, k, p), and states (B, n) after them, from the first outputs (B, lags, p)."""
+        x = np.stack([self._begun(start, u[: self.lags]) for start in starts])
+        outputs = list(starts.swapaxes(0, 1))
+        for given in u[self.lags :]:
+            y, x = self.advance(x, given)
+            outputs.append(y)
+        return np.stack(outputs, axis=1), x
+
+    def _begun(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        """The state after samples that are taken as they are; a network's, by its own search."""
         self._past.clear()
         self._past.extend(u[max(0, len(u) - self._kind.delays - 1) :])
         state: FloatArray = self._kind.begin(y, u)

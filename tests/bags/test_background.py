@@ -99,7 +99,7 @@ def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
         split(data, SplitConfig(share=0.01))
 
 
-@pytest.mark.parametrize("use", ["validation", "calibration"])
+@pytest.mark.parametrize("use", ["calibration"])
 def test_trials_of_another_use_are_left_whole(use: str) -> None:
     data = synthetic_dataset(0.01, trials=2, samples=80)
     trials = split(data, SplitConfig(share=0.25, **{use: data.names[:1]}))

@@ -281,7 +281,7 @@ def replay(chain: Path, bag: Path) -> Replay:
     return replay_bag(proved, bag, centre=Centre.COMMAND)
 
 
-@pytest.mark.parametrize("use", ["test", "validation", "calibration"])
+@pytest.mark.parametrize("use", ["test", "calibration"])
 @pytest.mark.parametrize("name", ["trial_5", "trial_?", "trial_04.2"])
 def test_a_name_in_the_split_that_no_bag_has_is_refused(
     config: Config, use: str, name: str

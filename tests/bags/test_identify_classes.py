@@ -8,7 +8,7 @@ import pytest
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import (
     Degrees,
     FilterMapFilter,
@@ -21,11 +21,9 @@ from nlsid_core.identification import (
     Sem,
     identify,
     predict,
-    select,
     validate,
 )
 from nlsid_core.identification.prediction import simulate_trial, solve_increasing_at
-from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.proofs import check
@@ -33,7 +31,7 @@ from tests import repeated
 from tests.conftest import synthetic_dataset
 from tests.identified_bags import saturating
 
-CASCADE = Network(FilterMapFilter((2, 1), phases=(1,), intervals=(8,), starts=4))
+CASCADE = Network(FilterMapFilter((2, 1), intervals=8, starts=4))
 
 
 def saturated(samples: int, seed: int, noise: float = 0.01) -> Trajectory:
@@ -48,7 +46,6 @@ def cascade() -> Fit[BlockCascade]:
     return identify(
         Dataset((saturated(500, 0), saturated(700, 1))),
         CASCADE,
-        validation=Dataset((saturated(500, 2),)),
         test=Dataset((saturated(600, 3),)),
         transient=60,
     )
@@ -68,14 +65,14 @@ def affine(train: Dataset) -> Fit[StateAffineModel]:
 
 def test_a_cascade_fit_is_a_fit_with_the_choices_as_its_history(cascade: Fit[BlockCascade]) -> None:
     assert cascade.methods == ("sem_certified",)
-    assert "8 intervals" in cascade.history.steps[0].what
-    assert cascade.history.value == "validation error, rms []"
+    assert cascade.history.steps[0].what == "8 intervals"
+    assert cascade.history.value == "training error, rms []"
     assert cascade.chosen.transient == 60
     assert cascade.errors["test"]["sem_certified"] < 2.0
     assert cascade.proof.rate < 1.0
     text = str(cascade)
     assert "block cascade: filters of orders 2 and 1" in text
-    assert "train  validation        test" in text
+    assert "train        test" in text
 
 
 def test_moments_stand_beside_the_biased_rie_and_least_squares(
@@ -106,11 +103,11 @@ def test_a_comparator_that_fails_is_left_out_and_logged(
 
 def test_other_signals_or_another_period_are_refused(train: Dataset) -> None:
     renamed = Dataset(tuple(replace(t, u_names=("torque",)) for t in train))
-    with pytest.raises(DataError, match=r"the test data hold .*torque"):
+    with pytest.raises(DataError, match="torque"):
         identify(train, Polynomial(2), test=renamed)
     slow = Dataset(tuple(replace(t, t=2.0 * t.t) for t in train))
-    with pytest.raises(DataError, match=r"the validation data are sampled every 0\.2 s"):
-        identify(train, Polynomial(2), validation=slow)
+    with pytest.raises(DataError, match=r"sample time 0\.2 s"):
+        identify(train, Polynomial(2), test=slow)
 
 
 # -- bad input ---------------------------------------------------------------------------------
@@ -132,7 +129,7 @@ def test_too_little_data_says_how_much_there_is_and_what_for() -> None:
         ),
     ):
         with pytest.raises(DataError, match=reason):
-            identify(short, model_class, validation=short)
+            identify(short, model_class)
 
 
 def test_a_basis_that_repeats_itself_says_its_rank() -> None:
@@ -225,53 +222,6 @@ def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[Monoton
     assert scores.simulation.white
     assert not scores.one_step.white
     assert scores.white, "one of the two is"
-
-
-@pytest.mark.slow
-def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None:
-    train = Dataset((saturated(400, 0), saturated(500, 1)))
-    validation = Dataset((saturated(400, 2),))
-    orders = [
-        replace(CASCADE, structure=replace(CASCADE.structure, orders=orders))
-        for orders in ((1, 0), (2, 1))
-    ]
-    chosen = select(train, validation, orders, transient=60)
-    assert chosen.best == orders[1]
-    assert not chosen.refitted, "validation trials choose its knots"
-    assert chosen.fit.model.bags == train.bags
-
-
-@pytest.mark.slow
-def test_no_class_chooses_by_the_trials_that_it_is_judged_by() -> None:
-    train, validation = Dataset((saturated(400, 0), saturated(500, 1))), saturated(400, 2)
-    knots = replace(CASCADE, structure=replace(CASCADE.structure, intervals=(1, 2, 8, 16)))
-    alone = identify(train, knots, transient=60)
-    assert alone.model.bags == train.bags, "the trial its knots were chosen by is named too"
-    for sign in (1.0, -1.0):  # with other outputs the same model is judged
-        judged = Dataset((replace(validation, y=sign * validation.y),))
-        (tried,) = select(train, judged, [knots], transient=60).tried
-        assert tried.fit is not None
-        assert tried.fit.model.document() == alone.model.document()
-        assert tried.error("validation") == alone.chosen.error_percent(judged)
-
-
-def test_the_second_of_two_trials_and_the_last_third_of_one_are_held_out() -> None:
-    trials = [saturated(90 + k, k) for k in range(5)]
-    for count, judged in ((2, [1]), (3, [2]), (5, [2])):
-        left, out = hold_out(Dataset(tuple(trials[:count])))
-        assert out.names == tuple(trials[k].name for k in judged)
-        assert left.names == tuple(t.name for t in trials[:count] if t.name not in out.names)
-    (first,), (last,) = hold_out(Dataset((trials[0],)))
-    assert (len(first), len(last)) == (60, 30)
-    np.testing.assert_array_equal(np.concatenate([first.y, last.y]), trials[0].y)
-
-
-def test_a_selection_without_a_model_says_why() -> None:
-    train, validation = Dataset((saturated(400, 0),)), Dataset((saturated(400, 2),))
-    with pytest.raises(Infeasible, match="equations for"):
-        select(train, validation, [Polynomial(98), Polynomial(99)])
-    with pytest.raises(DataError, match="no model class to select from"):
-        select(train, validation, [])
 
 
 # -- documents ---------------------------------------------------------------------------------

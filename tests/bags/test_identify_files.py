@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 
-from bags.chain.choosing import compare_bags, sections_to_try, select_trials
 from bags.chain.config import SplitConfig, load_config
 from bags.chain.steps import read_trials, split
 from bags.designs import documents
@@ -18,8 +17,7 @@ from bags.signals.grid import read_dataset, skipped_samples
 from bags.signals.sampling import Grid
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.identification import METHODS
+from nlsid_core.errors import DataError
 from nlsid_core.models import (
     BlockCascade,
     CellNetwork,
@@ -43,8 +41,7 @@ HOWTO = Path(__file__).resolve().parents[2] / "docs" / "howto-offline.md"
 CASCADE = {
     "model": "block_cascade",
     "orders": [2, 1],
-    "phases": [1],
-    "intervals": [8],
+    "intervals": 8,
     "starts": 4,
     "transient": 60,
 }
@@ -161,100 +158,6 @@ def test_a_stronger_claim_needs_another_proof(made: tuple[str, Path, str], tmp_p
     assert REASONS[claimed(name)] in refused
 
 
-@pytest.mark.slow
-def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
-    folder: Path, tmp_path: Path
-) -> None:
-    affine = {"model": "state_affine", "lags": 1, "right_degree": 2, "iterations": 3}
-    monotone = {"model": "monotone", "lags": 2, "delays": [0, 1]}
-    compare = [{"lags": 3}, CASCADE, affine, monotone]
-    config = write_config(tmp_path / "robot.yaml", {"lags": 3}, compare=compare)
-    compared = compare_bags(bags_in(folder), load_config(config), progress=silent)
-    best = min(compared.rows, key=lambda row: row.scores.simulation_percent)
-    assert best.label.startswith("network, filter map filter")
-    assert compared.skipped_at_start == 60
-    assert len({row.scores.samples for row in compared.rows}) == 1, "all on the same samples"
-    methods = {row.candidate.method.name.removesuffix("_certified") for row in compared.rows}
-    assert methods == set(METHODS), "every method the library has"
-
-
-def test_what_cannot_be_compared_is_named_and_the_rest_is(folder: Path, tmp_path: Path) -> None:
-    alone = [bag for bag in bags_in(folder) if bag.name not in ("run_1", "run_3")]
-    compare = [{"model": "monotone", "lags": 2}, {"lags": 90}]
-    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 2}, compare=compare))
-    compared = compare_bags(alone, config, progress=silent)
-    names = [row.candidate.method.name for row in compared.rows]
-    assert names == ["least_squares", "rie", "sem", "sem_certified"]
-    assert "lags 90" in compared.refusals[0]
-    impossible = config.model_copy(update={"compare": config.identification.each({"lags": [100]})})
-    with pytest.raises(Infeasible, match="no class has a model"):
-        compare_bags([alone[0], *alone[-2:]], impossible, progress=silent)
-
-
-@pytest.mark.slow
-def test_select_takes_the_order_with_the_least_validation_error(
-    folder: Path, tmp_path: Path
-) -> None:
-    orders = [[1, 1], [2, 1], [0, 2]]
-    config = write_config(tmp_path / "robot.yaml", CASCADE, select={"orders": orders})
-    made = nlsid("identify", tmp_path / "out", folder, "--config", config, "--select")
-    model = BlockCascade.from_document(files.load_document(tmp_path / "out" / documents.MODEL))
-    assert (len(model.a1), len(model.a2)) == (2, 1)
-    nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
-    assert "chosen by the validation error" in made
-
-
-def test_select_tries_every_combination_and_shows_what_has_no_model(
-    folder: Path, tmp_path: Path
-) -> None:
-    config = load_config(
-        write_config(tmp_path / "c.yaml", {"lags": 1}, select={"lags": [1, 3, 100]})
-    )
-    few = [bag for bag in bags_in(folder) if bag.name in ("run_0", "run_4", "run_5")]
-    trials = read_trials(few, config, progress=silent)
-    chosen = select_trials(trials, config, tmp_path, progress=silent)
-    one, three, hundred = chosen.selection.errors
-    assert three < one
-    assert hundred == np.inf
-    assert "equations for 202 parameters" in chosen.selection.tried[2].refusal
-    section = {"model": "state_affine", "lags": 1, "iterations": 3}
-    tried = {"lags": [1, 2], "right_degree": [1, 2]}
-    affine = load_config(write_config(tmp_path / "a.yaml", section, select=tried))
-    both = select_trials(trials, affine, tmp_path, progress=silent)
-    assert len(both.selection.tried) == 4
-    least = both.selection.tried[int(np.argmin(both.selection.errors))]
-    assert both.selection.best is least.model_class
-    assert both.selection.fit.model.bags == tuple((t.name, t.digest) for t in both.identified.train)
-    assert len(both.identified.train) == 2, "the training and the validation trial"
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        (
-            {"orders": [1]},
-            "select.orders: no option of `model: linear`, .*remove select.orders, or try: la",
-        ),
-        ({"method": ["rse"]}, "select.method"),
-        ({"lags": [2, 0]}, r"select.lags: should be a whole number from 1 to 100 \(found 0\)"),
-        ({}, "nothing to select from"),
-    ],
-)
-def test_a_selection_that_makes_no_sense_says_why(
-    tmp_path: Path, options: dict[str, list[object]], reason: str
-) -> None:
-    path = write_config(tmp_path / "c.yaml", {"lags": 1}, select=options or None)
-    with pytest.raises(DataError, match=reason):
-        sections_to_try(load_config(path))
-
-
-def test_a_selection_needs_validation_bags(folder: Path, tmp_path: Path) -> None:
-    split = {"test": ["run_5"]}
-    config = write_config(tmp_path / "c.yaml", {"lags": 1}, split=split, select={"lags": [1]})
-    given = ("identify", tmp_path / "out", folder, "--config", config, "--select")
-    assert "validation trials" in nlsid(*given, status=None)
-
-
 # -- several inputs and outputs, gaps ----------------------------------------------------------
 
 
@@ -339,15 +242,11 @@ def test_stretches_of_one_bag_are_not_repeats_of_each_other(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("named", "reason"),
     [
-        ({"test": "b", "validation": "b"}, "'b' is named for test and for validation"),
-        ({"test": "a", "validation": "d"}, "none of the bags is a validation trial"),
         ({"test": "b", "calibration": "d"}, "none of the bags is a calibration trial"),
         ({}, "none of the bags is a test trial; split.test names nothing"),
-        ({"test": "a c", "validation": "b"}, "all of the bags are test or validation"),
         ({"test": "b", "calibration": "b"}, "'b' is named for test and for calibration"),
-        ({"test": "b", "validation": "c", "calibration": "c"}, "'c' is named for validation"),
         ({"test": "b", "calibration": "a c"}, "all of the bags are test or calibration"),
-        ({"test": "a", "validation": "*1"}, r"'a\.1' is named for test and for validation"),
+        ({"test": "a", "calibration": "*1"}, r"'a\.1' is named for test and for calibration"),
         ({"test": "b", "calibration": "?"}, "'b' is named for test and for calibration"),
     ],
 )
@@ -418,12 +317,8 @@ def test_every_example_of_the_how_to_runs(
 ) -> None:
     content = dict(example)
     config = write_config(tmp_path / "robot.yaml", content.pop("identification"), **content)
-    options = [f"--{option}" for option in ("select", "compare") if option in content]
-    made = nlsid("identify", tmp_path / "out", folder, "--config", config, *options)
-    if options == ["--compare"]:
-        assert "proved" in made
-    else:
-        nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
+    nlsid("identify", tmp_path / "out", folder, "--config", config)
+    nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
 
 
 def test_the_how_to_has_an_example_of_every_class() -> None:

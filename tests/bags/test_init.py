@@ -24,9 +24,7 @@ from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
-from bags.setup.proposal import Proposal
 from bags.setup.proposing import choose
-from bags.setup.written import yaml_text
 from bags.tools.fitness import check_fitness
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
@@ -492,12 +490,6 @@ def test_many_bags_are_said_as_their_folder(tmp_path: Path) -> None:
     assert said_briefly(bags) == "BAGS"
 
 
-def test_units_keep_their_letters_at_the_head_of_the_file() -> None:
-    proposal = Proposal({}, error=3.0, varies=", in which T varies by 10.5 degC, rms")
-    said = "# Expect 3 % error in simulation (of trials held back, in which T varies by 10.5 degC"
-    assert said in yaml_text(proposal)
-
-
 def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
     commands = np.repeat(np.random.default_rng(2).uniform(-1.0, 1.0, (20, 2)), 10, axis=0)
     types, kind = standard_types(), "geometry_msgs/msg/Twist"
@@ -717,5 +709,5 @@ def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_pat
     config = tmp_path / "robot.yaml"
     said = nlsid("init", config.parent, tmp_path, "--yes", "-u", CMD, "-y", SPEED)
     assert "will refuse" not in said
-    assert "of what it was fitted to" in said
+    assert "the model is a first guess" in said
     nlsid("identify", tmp_path / "out", tmp_path, "--config", config)

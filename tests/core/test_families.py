@@ -43,7 +43,7 @@ FAMILIES: dict[str, ModelClass] = {
     "monotone": Polynomial(1, (1,), Degrees(left=3)),
     "implicit": Polynomial(1, (1,), Degrees(left=3, inputs=2)),
     "measured states": Polynomial(1, (1,), set="2.19"),
-    "filter, map, filter": Network(FilterMapFilter((1, 1), phases=(1,), intervals=(4,), starts=2)),
+    "filter, map, filter": Network(FilterMapFilter((1, 1), intervals=4, starts=2)),
     "cells": Network(CellRow(1, intervals=3, limit="none")),
     "feedback": Network(Feedback(2, stages=1, imitated=8)),
 }

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.alternation import design_by_alternation
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.design import ContinuousTracking, design, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.lstep import sphere_program
@@ -74,12 +73,11 @@ def test_beyond_degree_five_the_taylor_way_is_named() -> None:
         design_funnel(ContinuousTracking(field, nominal, goal=np.eye(1), Q=np.zeros((1, 1))))
 
 
-@pytest.mark.parametrize("alternate", [False, True])
-def test_v_steps_are_for_degree_three_and_say_what_to_do_instead(alternate: bool) -> None:
+def test_v_steps_are_for_degree_three_and_say_what_to_do_instead() -> None:
     field = quintic(2)
     problem = ContinuousTracking(field, moving(field), goal=8 * np.eye(2), shape="P")
     with pytest.raises(DataError, match="degree up to 3, not 5: take shape rho by the sweep"):
-        (design_by_alternation if alternate else design)(problem)
+        design(problem)
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -6,11 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.alternation import (
-    alternate_rho,
-    design_by_alternation,
-    exponential_start,
-)
+from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
@@ -97,39 +93,6 @@ def test_a_sample_at_one_end_only_is_refused() -> None:
 
 
 # -- the thesis's alternation for ρ ------------------------------------------------------------
-
-
-def test_the_alternation_is_proved_and_ends_within_one_percent_of_the_sweep() -> None:
-    sweep = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL))
-    assert np.min(found.found.proved.margins) > 0
-    ratio = found.funnel.volume_integral() / sweep.funnel.volume_integral()
-    assert 0.99 <= ratio <= 1.001
-
-
-def test_the_alternation_may_start_from_a_given_rho() -> None:
-    sweep = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    first = 0.9 * sweep.funnel.rho * np.linspace(0.7, 1, 9)
-    found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL), rho=first)
-    assert found.funnel.rho[-1] == 0.9
-    assert (found.funnel.rho[:-1] > first[:-1]).all()
-    assert np.min(found.found.proved.margins) > 0
-
-
-@pytest.mark.parametrize(
-    ("rho", "error", "reason"),
-    [
-        (np.linspace(0.05, 1.2, 9), DataError, r"does not end in the goal: rho\(t_f\) = 1.2"),
-        (np.linspace(0.05, 0.9, 8), DataError, "9 positive numbers"),
-        (np.linspace(-0.05, 0.9, 9), DataError, "9 positive numbers"),
-        (np.linspace(1.8, 0.9, 9), Infeasible, r"does not hold: its margin is -.* Try"),
-    ],
-)
-def test_a_first_rho_that_cannot_start_is_refused(
-    rho: FloatArray, error: type[Exception], reason: str
-) -> None:
-    with pytest.raises(error, match=reason):
-        design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL, **WEIGHTS), rho=rho)
 
 
 def test_an_unknown_option_is_named_with_the_known_ones() -> None:

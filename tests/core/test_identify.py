@@ -1,6 +1,5 @@
 """One verb for every model class and method, in Python and on the command line."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +18,9 @@ from nlsid_core.identification import (
     LeastSquares,
     Method,
     Polynomial,
-    Rie,
     Rse,
     Sem,
-    describe,
     identify,
-    select,
     validate,
 )
 from nlsid_core.models import DifferenceEquation, StateAffineModel
@@ -56,7 +52,7 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("method", [Rse(), Sem(), LeastSquares(), Rie()])
+@pytest.mark.parametrize("method", [Rse(), Sem(), LeastSquares()])
 def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Method) -> None:
     fit = identify(train, Polynomial(2), method=method)
     assert isinstance(fit.model, DifferenceEquation)
@@ -67,9 +63,9 @@ def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Met
 
 def test_a_fit_says_what_was_found(train: Dataset) -> None:
     test = synthetic_dataset(0.01, trials=2)
-    fit = identify(train, Polynomial(2), validation=test, test=test)
+    fit = identify(train, Polynomial(2), test=test)
     text = str(fit)
-    assert "train  validation        test" in text
+    assert "train        test" in text
     assert f"* {Rse().title}" in text
     assert fit.errors["test"]["rse"] == fit.chosen.error_percent(test)
 
@@ -81,7 +77,7 @@ def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
     assert fit["rse"].error_percent(train) == pytest.approx(
         linear["rse"].error_percent(train), rel=1e-4
     )
-    assert set(fit.methods) >= {"least_squares", "rie", "rse_certified"}
+    assert set(fit.methods) >= {"least_squares", "rse_certified"}
     lagged = np.array([g.coefficients[0, 0, 0] for g in fit.model.G])
     np.testing.assert_allclose(-lagged[1:] / lagged[0], TRUE_A, atol=0.02)
 
@@ -117,35 +113,6 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
     assert "one-step residual is NOT white (99 %)" in report
 
 
-def test_selection_takes_the_class_with_the_least_validation_error(train: Dataset) -> None:
-    validation = synthetic_dataset(0.01, trials=3)
-    classes = [Polynomial(1), Polynomial(2), Polynomial(60)]
-    seen: list[str] = []
-    chosen = select(train, validation, classes, progress=lambda what, _: seen.append(what))
-    assert chosen.best == Polynomial(2)
-    assert chosen.errors[0] > chosen.errors[1]
-    assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
-    assert seen == [*map(describe, classes), "fitting to training and validation trials", "done"]
-    assert "polynomial, lags 2" in str(chosen)
-    with pytest.raises(Infeasible, match="no class has a proved model"):
-        select(train, validation, [Polynomial(60)])
-
-
-def test_the_class_that_is_selected_is_fitted_to_training_and_validation_trials(
-    train: Dataset,
-) -> None:
-    validation = synthetic_dataset(0.01, trials=3)
-    chosen = select(train, validation, [Polynomial(1), Polynomial(2)])
-    assert chosen.refitted
-    both = Dataset((*train.trajectories, *validation.trajectories))
-    direct = identify(both, Polynomial(2), comparators=())
-    np.testing.assert_array_equal(chosen.fit.model.a, direct.model.a)
-    assert len(chosen.fit.model.bags) == len(train) + 3
-    tried = chosen.tried[1].fit
-    assert tried is not None
-    assert len(tried.model.bags) == len(train), "what was judged on validation had not seen it"
-
-
 @pytest.mark.slow
 def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     config: Path, tmp_path: Path
@@ -158,27 +125,3 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     refused = CliRunner().invoke(app, ["funnel", str(out), "--config", str(config)])
     assert refused.exit_code != 0
     assert "has no section 'funnel'" in str(refused.exception)
-
-
-@pytest.mark.slow
-@pytest.mark.pictures
-def test_the_command_line_compares_methods_on_the_same_bags(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    content = yaml.safe_load(config.read_text())
-    content["compare"] = [content["identification"] | {"lags": lags} for lags in (1, 2)]
-    both = tmp_path / "both.yaml"
-    both.write_text(yaml.safe_dump(content))
-    # A console that was made by an earlier test keeps the width it found.
-    monkeypatch.setattr("bags.commands.options.out._width", 80)
-    given = ["identify", str(tmp_path), *BAGS, "--config", str(both), "--compare"]
-    made = CliRunner().invoke(app, given)
-    assert made.exit_code == 0, made.output
-    for method in (LeastSquares(), Rie(), Rse(), Rse(certified=True)):
-        rows = re.findall(rf"^ {method.name} .*", made.output, re.MULTILINE)
-        assert len(rows) == 2
-        for row in rows:
-            assert len(row) <= 80
-            assert re.search(r"\d (ms|s) *$", row), "to the last column, the time"
-    assert "+20" in made.output
-    assert "…" not in made.output

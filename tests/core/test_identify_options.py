@@ -19,7 +19,6 @@ from nlsid_core.identification import (
     Rie,
     Rse,
     Sem,
-    alike,
     methods_of,
 )
 
@@ -38,8 +37,8 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (Degrees, "leading"): ((0, 5), (-1, 6)),
     (Degrees, "lagged"): ((0, 5), (-1, 6)),
     (FilterMapFilter, "orders"): (((1, 0), (0, 100)), ((0, 0), (-1, 2), (101, 0), (1,))),
-    (FilterMapFilter, "phases"): (((1,), (4,)), ((0,), (5,), ())),
-    (FilterMapFilter, "intervals"): (((1,),), ((0,), ())),
+    (FilterMapFilter, "phases"): ((1, 4), (0, 5)),
+    (FilterMapFilter, "intervals"): ((1, 1000), (0, 1001)),
     (FilterMapFilter, "starts"): ((1, 1000), (0, 1001)),
     (FilterMapFilter, "begin"): (("measured", "rest"), ("motion",)),
     (CellRow, "cells"): ((1, 3), (0, 4, 1.5)),
@@ -115,11 +114,6 @@ def test_a_word_and_a_title_belong_to_one_method() -> None:
     assert all(METHODS[word].word == word for word in METHODS)
     assert {Rse().name, Rse(certified=True).name} == {"rse", "rse_certified"}
     assert len({method().title for method in METHODS.values()}) == len(METHODS) == 4
-
-
-def test_what_runs_beside_a_method_takes_over_the_options_that_both_have() -> None:
-    assert alike(Rse(), Sem(iterations=3, certified=True)) == Rse(iterations=3)
-    assert alike(Rie(), Rse(iterations=3)) == Rie()
 
 
 def test_the_methods_of_a_class_begin_with_the_one_that_is_taken() -> None:

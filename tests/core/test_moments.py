@@ -1,6 +1,5 @@
 """Moments of repeated experiments, and the robust identification error through them."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -67,21 +66,13 @@ def test_both_roles_count_the_same() -> None:
     np.testing.assert_allclose(one, other, atol=1e-12)
 
 
-def test_moments_add_over_bags_and_over_an_executor() -> None:
+def test_moments_add_over_bags() -> None:
     groups = [pair(300, seed) for seed in (1, 2, 3)]
-    runs = [trial for group in groups for trial in group]
     together = repeated_moments(groups, CLASS, OFFSETS)
     apart = [repeated_moments([group], CLASS, OFFSETS) for group in groups]
     summed = apart[0] + apart[1] + apart[2]
-    with ThreadPoolExecutor(2) as executor:
-        spread = repeated_moments(groups, CLASS, OFFSETS, executor=executor)
-        plainly = plain_moments(runs, CLASS, OFFSETS, executor=executor)
-    for other in (summed, spread):
-        assert other.count == together.count
-        np.testing.assert_allclose(other.matrix(), together.matrix(), atol=1e-12)
-    plain = plain_moments(runs, CLASS, OFFSETS)
-    assert plainly.count == plain.count
-    np.testing.assert_allclose(plainly.matrix(), plain.matrix(), atol=1e-12)
+    assert summed.count == together.count
+    np.testing.assert_allclose(summed.matrix(), together.matrix(), atol=1e-12)
 
 
 def test_three_repeats_use_every_pair() -> None:

@@ -4,6 +4,10 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
+from benchmarks.thesis.rie import (
+    IdentificationErrorBound,
+    robust_identification_error,
+)
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.methods.banded import Rows
@@ -15,10 +19,6 @@ from nlsid_core.identification.methods.newton import (
     smallest_eigenvalues,
 )
 from nlsid_core.identification.methods.rse import Bound
-from nlsid_core.identification.polynomial.rie import (
-    IdentificationErrorBound,
-    robust_identification_error,
-)
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 

@@ -104,7 +104,7 @@ def test_the_score_of_a_public_set_is_the_rms_of_what_it_says() -> None:
     t = np.arange(5.0)
     data = Dataset((Trajectory(t=t, y=np.array([0.0, 2.0, 2.0, 2.0, 2.0]), u=t),))
     outputs = [np.array([[9.0], [1.0], [3.0], [1.0], [3.0]])]
-    plain = PublicSet("p", ".", lambda _: (data, data, data), "mV", {}, factor=1e3)
+    plain = PublicSet("p", ".", lambda _: (data, data), "mV", {}, factor=1e3)
     assert plain.score(outputs, data, skipped=1) == pytest.approx(1e3)
-    summed = PublicSet("s", ".", lambda _: (data, data, data), "m", {}, integrated=True)
+    summed = PublicSet("s", ".", lambda _: (data, data), "m", {}, integrated=True)
     assert summed.score(outputs, data, skipped=1) == pytest.approx(np.sqrt(0.5)), "-1, 0, -1, 0"

@@ -11,20 +11,32 @@ from typing import TypeAlias
 
 import numpy as np
 
+from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.finer import NEARBY, coarse, halved, most_knots, refusal_time
+from nlsid_core.design.continuous.problem import ContinuousTracking
 from nlsid_core.design.continuous.reachable import reached
-from nlsid_core.design.continuous.search import Found, search
-from nlsid_core.design.continuous.setting import MOST_KNOTS, Setting, final_level
+from nlsid_core.design.continuous.search import Found, expected, search
+from nlsid_core.design.continuous.setting import (
+    MOST_KNOTS,
+    Setting,
+    final_level,
+    limits_of,
+    prepare,
+    valid_rows,
+)
+from nlsid_core.design.continuous.shape import validity_caps
 from nlsid_core.dynamics import Nominal
+from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress
 
 HALVINGS = 6  # of intervals where P is far from linear
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FASTER, SLOWER = 0.25, 4.0  # of the default R
-
-Again: TypeAlias = Callable[..., Setting]  # the same problem around another motion, with another R
+MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
+AT_LIMIT = 0.99  # of ρ's cap: an input reaches its limit
+NARROW = 0.5  # of half-widths without limits: with less, few limited inputs may saturate
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +68,34 @@ class Tried:
 Attempt: TypeAlias = tuple[str, Callable[[list[Tried]], Setting | None]]
 
 
-def attempts(setting: Setting, again: Again | None, *, other_weights: bool) -> list[Attempt]:
-    """As it is; with more knots where that stopped it; around what w reaches; with another R.
+def with_knots(problem: ContinuousTracking) -> Setting:
+    """The setting of a problem, with more knots where P(t) is far from linear, as near the goal."""
+    setting = prepare(problem)
+    most = most_knots(len(setting.policy.t))
+    for _ in range(HALVINGS if problem.policy is None else 0):
+        chosen = coarse(setting, most)
+        if not chosen.any():
+            break
+        setting = prepare(_with(problem, motion_of(setting).halved(chosen)))
+    return setting
 
-    again: None for a given policy, whose motion keeps its knots. other_weights: whether R is free.
+
+def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
+    """As it is; with more knots where that stopped it; around what w reaches; with another R; with
+
+    inputs that saturate. A given policy keeps its knots, its R, and what it does at its limits.
     """
     listed: list[Attempt] = [("as it is", lambda _: setting)]
-    if again is not None:
-        listed += HALVINGS * [("with more knots", partial(_finer, again))]
-    listed.append(("around what w reaches", partial(_pushed, again)))
-    if again is not None and other_weights:
+    if problem.policy is None:
+        listed += HALVINGS * [("with more knots", partial(_finer, problem))]
+    listed.append(("around what w reaches", partial(_pushed, problem)))
+    if problem.policy is None and problem.R is None and setting.steps.field.m > 0:
         listed += [
-            ("with a quarter of R", partial(_weighed, again, FASTER)),
-            ("with four times R", partial(_weighed, again, SLOWER)),
+            ("with a quarter of R", partial(_weighed, problem, FASTER)),
+            ("with four times R", partial(_weighed, problem, SLOWER)),
         ]
+    if problem.policy is None and 0 < len(_limits(problem)) <= MOST_LIMITED:
+        listed.append(("with inputs that saturate", partial(_saturated, problem)))
     return listed
 
 
@@ -99,7 +125,41 @@ def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, s
     raise Infeasible(f"{farthest.refusal}{said}") from farthest.refusal
 
 
-def _finer(again: Again, tried: list[Tried]) -> Setting | None:
+def widened(problem: ContinuousTracking, found: Found, progress: Progress) -> Found:
+    """The funnel in which inputs saturate, if few may and it is much wider at the start."""
+    setting, funnel, field = found.setting, found.funnel, found.setting.steps.field
+    limits = _limits(problem)
+    few = len(limits) <= (MOST_LIMITED if field.n <= FEW_STATES else 1)
+    if problem.policy is not None or not len(limits) or not few or len(setting.policy.limits):
+        return found
+    kept = replace(field, valid=valid_rows(limits, field.n))
+    if (funnel.rho < AT_LIMIT * validity_caps(kept, setting.policy, setting.P)).all():
+        return found
+    again = replace(_with(problem, motion_of(setting)), R=setting.weights[1])
+    try:
+        free = expected(prepare(replace(again, limits=None)), progress)
+        if funnel.rho[0] >= NARROW**2 * free[0]:
+            return found
+        wider = search(prepare(again, saturated=True), progress)
+    except Infeasible:
+        return found
+    return wider if wider.funnel.volume(funnel.t0) > funnel.volume(funnel.t0) else found
+
+
+def motion_of(setting: Setting) -> Nominal:
+    """The motion of a setting's policy."""
+    return Nominal(setting.policy.x, setting.policy.u)
+
+
+def _with(problem: ContinuousTracking, nominal: Nominal) -> ContinuousTracking:
+    return replace(problem, nominal=nominal)
+
+
+def _limits(problem: ContinuousTracking) -> FloatArray:
+    return limits_of(problem.limits, problem.nominal.u.control.shape[2])
+
+
+def _finer(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
     """With more knots than the last, near where that was refused; see `halved`."""
     last, before, nearby = tried[-1], np.inf, NEARBY
     for one in tried:
@@ -108,47 +168,36 @@ def _finer(again: Again, tried: list[Tried]) -> Setting | None:
     chosen = halved(last.setting, last.refusal, nearby) if last.cause in FINER else None
     if chosen is None:
         return None
-    policy = last.setting.policy
-    return again(Nominal(policy.x, policy.u).halved(chosen))
+    return prepare(_with(problem, motion_of(last.setting).halved(chosen)))
 
 
-def _pushed(again: Again | None, tried: list[Tried]) -> Setting | None:
-    """P(t) of what a pushed linear loop reaches, if w stopped the last."""
-    return _reached(tried[-1].setting, again) if tried[-1].cause == "disturbance" else None
+def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
+    """P(t) of what a pushed linear loop reaches, if w stopped the last; None if it misses the goal.
 
-
-def _weighed(again: Again, factor: float, tried: list[Tried]) -> Setting:
-    """R times this, around the motion as it was given."""
-    first = tried[0].setting
-    return again(Nominal(first.policy.x, first.policy.u), R=factor * first.weights[1])
-
-
-def _reached(setting: Setting, again: Again | None) -> Setting | None:
-    """The setting with P(t) of what a pushed linear loop reaches; None if that misses the goal.
-
-    again: the same problem around a motion with more knots, if it can have more.
+    Where P turns fast on some intervals, there are more knots.
     """
+    setting = tried[-1].setting if tried[-1].cause == "disturbance" else None
     for _ in range(HALVINGS):
-        found, policy, steps = reached(setting), setting.policy, setting.steps
-        if found is None:
+        found = None if setting is None else reached(setting)
+        if setting is None or found is None:
             return None
         if found.size < 1:
-            steps.tightness = found.tightness
-            rho = final_level(policy, found.P, setting.goal, setting.expansion)
+            setting.steps.tightness = found.tightness
+            rho = final_level(setting.policy, found.P, setting.goal, setting.expansion)
             return replace(setting, P=found.P, rho_final=rho)
         more = int(found.coarse.sum())
-        if again is None or not more or len(policy.t) + more > MOST_KNOTS:
+        if problem.policy is not None or not more or len(setting.policy.t) + more > MOST_KNOTS:
             return None
-        setting = again(Nominal(policy.x, policy.u).halved(found.coarse))
+        setting = prepare(_with(problem, motion_of(setting).halved(found.coarse)))
     return None
 
 
-def with_knots(setting: Setting, again: Again) -> Setting:
-    """The setting with more knots where P(t) is far from linear, such as near the goal."""
-    most = most_knots(len(setting.policy.t))
-    for _ in range(HALVINGS):
-        chosen = coarse(setting, most)
-        if not chosen.any():
-            break
-        setting = again(Nominal(setting.policy.x, setting.policy.u).halved(chosen))
-    return setting
+def _weighed(problem: ContinuousTracking, factor: float, tried: list[Tried]) -> Setting:
+    """R times this, around the motion as it was given."""
+    first = tried[0].setting
+    return prepare(replace(problem, nominal=motion_of(first), R=factor * first.weights[1]))
+
+
+def _saturated(problem: ContinuousTracking, tried: list[Tried]) -> Setting:
+    """With every mode of its inputs, around the motion as it was given."""
+    return prepare(_with(problem, motion_of(tried[0].setting)), saturated=True)

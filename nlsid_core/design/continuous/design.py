@@ -3,19 +3,17 @@
 import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.attempts import attempts, first_found, with_knots
+from nlsid_core.design.continuous.attempts import attempts, first_found, widened, with_knots
 from nlsid_core.design.continuous.pieces import Proved, proof_of
 from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
-from nlsid_core.design.continuous.setting import Setting, prepare
+from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
 from nlsid_core.designs import Design
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -29,15 +27,13 @@ KIND = "continuous_funnel"
 class ContinuousSearch:
     """What the search for a funnel leaves beside it.
 
-    proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. first: a
-    first guess to compare with, of which nothing is proved. history: (what, ∫ volume dt). seconds:
-    wall clock of each stage. cost: what a hold and measurement errors take, in words. tried: what
-    was refused with other weights before, in words.
+    proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. history:
+    (what, ∫ volume dt). seconds: wall clock of each stage. cost: what a hold and measurement errors
+    take, in words. tried: what was refused with other weights before, in words.
     """
 
     goal: Goal
     proved: Proved
-    first: ContinuousFunnel
     history: tuple[tuple[str, float], ...]
     seconds: dict[str, float]
     cost: str = ""
@@ -63,22 +59,18 @@ def design_funnel(
     Infeasible if no funnel was found or proved: it says what each attempt gave.
     """
     started = time.perf_counter()
-    setting, again = prepare(problem), partial(_again, problem)
-    own_policy = problem.policy is None
-    if own_policy:
-        setting = with_knots(setting, again)
+    setting = with_knots(problem)
     if problem.shape == "P":
         refuse_shape(setting.steps)
         if setting.hold is not None:
             raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
-    free = own_policy and problem.R is None and setting.steps.field.m > 0
-    listed = attempts(setting, again if own_policy else None, other_weights=free)
     try:
-        (setting, funnel, proved, margin), tried = first_found(listed, progress)
+        found, tried = first_found(attempts(problem, setting), progress)
     except Infeasible as refusal:
         raise Infeasible(f"{refusal}. {_in_use(setting)}") from refusal
+    setting, funnel, proved, margin = widened(problem, found, progress)
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if problem.shape == "P":
@@ -99,20 +91,12 @@ def design_funnel(
     search = ContinuousSearch(
         setting.goal,
         proved,
-        setting.first_guess(),
         tuple(history),
         seconds,
         _cost(setting, funnel),
         tried,
     )
     return decided(setting, funnel, search)
-
-
-def _again(
-    problem: ContinuousTracking, nominal: Nominal, *, R: FloatArray | None = None
-) -> Setting:
-    """The same problem around another motion, with another R if one is given."""
-    return prepare(replace(problem, nominal=nominal, R=problem.R if R is None else R))
 
 
 def decided(setting: Setting, funnel: ContinuousFunnel, found: ContinuousSearch) -> FunnelDesign:

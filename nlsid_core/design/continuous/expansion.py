@@ -1,6 +1,6 @@
 """Dynamics that are not polynomial, expanded anew on each interval around what the funnel needs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from traceback import extract_tb
 
@@ -46,9 +46,9 @@ class Expansion:
             raise NoExpansion(self, low, high, k, error) from error
 
     def linear(self) -> VectorField:
-        """The field to linearise: expanded close to the motion."""
+        """The field to linearise: expanded close to the motion, of no use anywhere else."""
         cubics = [self.on(k, self._near()) for k in range(len(self.nominal.t) - 1)]
-        return field_of(cubics, self.nominal.t)
+        return replace(field_of(cubics, self.nominal.t), valid=self.rates.valid)
 
     def _near(self) -> FloatArray:
         """(n + m,) so far from the motion a cubic is as good as the derivative."""

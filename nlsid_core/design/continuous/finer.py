@@ -15,11 +15,14 @@ ENDS = 1e-9  # of an interval, where its own closed loop holds
 
 
 class Unproved(Infeasible):
-    """Nothing was found wrong at the knots around this time, but nothing proves it between them."""
+    """Nothing was found wrong at the knots around t, in s, but nothing proves it between them.
 
-    def __init__(self, said: str, t: float) -> None:
+    intervals: (K-1,) True where that is so.
+    """
+
+    def __init__(self, said: str, t: float, intervals: BoolArray) -> None:
         super().__init__(said)
-        self.t = t
+        self.t, self.intervals = t, intervals
 
 
 def lost(setting: Setting) -> FloatArray:

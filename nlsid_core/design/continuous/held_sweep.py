@@ -12,13 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Changes, Hold, fastest
-from nlsid_core.design.continuous.lstep import LSteps, Section, sections
+from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import Wanted, sweep_rho
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -132,18 +130,9 @@ def held_sweep(
     table: see `HeldSteps`. caps: (K,) that ρ keeps below. Raises Infeasible.
     """
     assert setting.hold is not None  # a search for a hold begins with what is found without one
-    free, policy, P = setting.hold.free, setting.policy, setting.P
-    steps = HeldSteps(setting.steps, setting, free, table)
-    rho_final = min(setting.rho_final, float(caps[-1]))
-    margin = setting.margin(rho_final)
+    steps = HeldSteps(setting.steps, setting, setting.hold.free, table)
     if expansion is not None:
         steps.field = expansion.linear()
-        expanded = replace(setting, steps=steps, expansion=expansion)
-        wanted = Wanted(margin, rho_final, caps)
-        found = sweep_expanded(expanded, wanted, most_back=MOST_BACK, progress=progress)
-        return found.rho, field_of(found.cubics, policy.t)
-    caps = np.minimum(validity_caps(steps.field, policy, P), caps)
-    rho_final = min(rho_final, float(caps[-1]))
-    wanted = Wanted(margin, rho_final, caps)
-    rho, _ = sweep_rho(steps, sections(steps, policy, P), wanted, progress)
-    return rho, steps.field
+    expanded = replace(setting, steps=steps, expansion=expansion)
+    found = swept(expanded, wanted_of(setting, caps), progress, most_back=MOST_BACK)
+    return found.rho, found.setting.steps.field

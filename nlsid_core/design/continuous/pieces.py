@@ -74,9 +74,7 @@ def prove_pieces(
     done: list[tuple[Pieces, FloatArray]] = []
     unproved: list[Part] = []
     while waiting:
-        refused = next((p for p in waiting if not _solved(steps, policy, funnel, p, known)), None)
-        if refused is not None:
-            unproved.append(refused)
+        unproved += [p for p in waiting if not _solved(steps, policy, funnel, p, known)]
         if unproved:  # the rest is not worth a program
             break
         waiting.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))

@@ -6,7 +6,6 @@ Nothing is tried here but what the setting says; `attempts` says which settings.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expanded_sweep import sweep_expanded
+from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
@@ -24,18 +23,15 @@ from nlsid_core.design.continuous.held_sweep import (
     widths_by_size,
     with_widths,
 )
-from nlsid_core.design.continuous.lstep import sections
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
-from nlsid_core.dynamics.taylor import field_of
+from nlsid_core.design.continuous.sweep import Ends, Wanted
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
 
-MARGINS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)  # times the first, until every piece is proved
+LARGER, ROUNDS = 16.0, 4  # times the margin where a piece is not proved, so many times
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 
@@ -49,14 +45,6 @@ class Found(NamedTuple):
     margin: float
 
 
-class Swept(NamedTuple):
-    """ρ (K,), the L-steps at the knots if they are at hand, and the setting of their field."""
-
-    setting: Setting
-    rho: FloatArray
-    ends: list[Ends] | None
-
-
 def search(setting: Setting, progress: Progress) -> Found:
     """ρ by the backward sweep, and its proof; where inputs are held, for bounds of their change.
 
@@ -64,13 +52,13 @@ def search(setting: Setting, progress: Progress) -> Found:
     """
     expansion, hold = setting.expansion, setting.hold
     if hold is None or expansion is not None:
-        first = _unheld(setting, progress)
+        first = _proved(setting, wanted_of(setting), progress)
         if hold is None:
             return first
         hold = replace(hold, free=first.funnel.rho, needed=first.margin)
         setting = replace(first.setting, expansion=None, hold=hold)
     else:
-        hold = replace(hold, free=_free(setting, progress))
+        hold = replace(hold, free=expected(setting, progress))
         setting = replace(setting, hold=hold)
     span = float(setting.policy.t[-1] - setting.policy.t[0])
     if hold.shortest > span:
@@ -131,10 +119,10 @@ def _held(
             if hold.period:
                 rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
             steps.widths = widths
-            caps = validity_caps(field, policy, setting.P, widths)
             bounded = replace(hold, rates=rates)
             held = replace(setting, steps=steps, policy=policy, hold=bounded)
-            return _swept(held, np.minimum(caps, rho), progress)
+            wanted = replace(wanted_of(held, rho, widths), expected=hold.period > 0)
+            return _proved(held, wanted, progress)
         except (Infeasible, DataError) as error:
             refusal = error
         if isinstance(refusal, NoFunnel):
@@ -161,68 +149,39 @@ def _held(
     ) from refusal
 
 
-def _free(setting: Setting, progress: Progress) -> FloatArray:
-    """ρ (K,) as it is found if nothing is held."""
-    steps, policy, P = setting.steps, setting.policy, setting.P
-    caps = validity_caps(steps.field, policy, P)
-    rho_final = min(setting.rho_final, float(caps[-1]))
-    wanted = Wanted(setting.margin(rho_final), rho_final, caps)
-    rho, _ = sweep_rho(steps, sections(steps, policy, P), wanted, progress)
-    return rho
+def expected(setting: Setting, progress: Progress) -> FloatArray:
+    """ρ (K,) as the sweep finds it if nothing is held; nothing is proved."""
+    return swept(setting, wanted_of(setting), progress).rho
 
 
-def _unheld(setting: Setting, progress: Progress) -> Found:
-    """The funnel if nothing is held."""
-    if setting.expansion is not None:
-        return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
-    caps = validity_caps(setting.steps.field, setting.policy, setting.P)
-    return _swept(setting, caps, progress)
+def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
+    """ρ by the backward sweep, and its proof; with larger margins where there is none."""
+    times = np.ones(len(setting.P) - 1)
+    for _ in range(ROUNDS):
+        made, rho, ends = swept(setting, replace(wanted, times=times), progress)
+        try:
+            return proved(made, rho, ends, wanted.margin)
+        except Unproved as error:
+            refusal = error
+            times = np.where(error.intervals, LARGER * times, times)
+    raise refusal
 
 
-def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> Found:
-    """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
-    steps, policy, P = setting.steps, setting.policy, setting.P
-    pairs = sections(steps, policy, P)
-    rho_final = min(setting.rho_final, float(caps[-1]))
+def proved(setting: Setting, rho: FloatArray, ends: list[Ends] | None, margin: float) -> Found:
+    """The funnel with this ρ and its proof; Unproved if there is none on some part of time.
 
-    expected = setting.hold is not None and setting.hold.rates is not None
-
-    def search(margin: float) -> Swept:
-        wanted = Wanted(margin, rho_final, caps, expected)
-        return Swept(setting, *sweep_rho(steps, pairs, wanted, progress))
-
-    return proved_for(setting, rho_final, search)
-
-
-def _expanded(setting: Setting, progress: Progress, margin: float) -> Swept:
-    """The sweep that expands the dynamics around what it finds; the setting has their field."""
+    ends: the L-steps at the knots, if they are at hand. margin: what was left in these, in 1/s.
+    """
     steps, policy = setting.steps, setting.policy
-    found = sweep_expanded(setting, Wanted(margin, setting.rho_final), progress=progress)
-    field = field_of(found.cubics, policy.t)
-    policy = replace(policy, vector_field=files.digest(field.document()))
-    proving = steps.like(field, policy)
-    proving.kappa = steps.kappa
-    return Swept(replace(setting, steps=proving, policy=policy), found.rho, found.ends)
-
-
-def proved_for(
-    setting: Setting,
-    rho_final: float,
-    search: Callable[[float], Swept],
-) -> Found:
-    """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
-    first = setting.margin(rho_final)
-    for factor in MARGINS:
-        setting, rho, ends = search(factor * first)
-        steps, policy = setting.steps, setting.policy
-        digest = files.digest(policy.document())
-        funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
-        refuse_unmonitorable(funnel)
-        proved = prove_pieces(steps, policy, funnel, ends)
-        if not proved.unproved:
-            return Found(setting, funnel, proved, factor * first)
-    raise Unproved(
-        f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
-        "knots hold: try more knots there",
-        float(policy.t[proved.unproved[-1].interval]),
-    )
+    digest = files.digest(policy.document())
+    funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
+    refuse_unmonitorable(funnel)
+    shown = prove_pieces(steps, policy, funnel, ends)
+    if shown.unproved:
+        raise Unproved(
+            f"no proof from {unsolved(policy, shown.unproved)} although the L-steps at its "
+            "knots hold: try more knots there",
+            float(policy.t[shown.unproved[-1].interval]),
+            np.isin(np.arange(len(policy.t) - 1), [part.interval for part in shown.unproved]),
+        )
+    return Found(setting, funnel, shown, margin)

@@ -34,8 +34,8 @@ MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its o
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
-DECAY = 3.0  # c of the thesis's first guess for the satellite
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
+SAME_MOTION = 1e-9  # of states, relative and absolute: the motion of a policy is the one given
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 AT_REST = 1e-9  # |ẋ₀| of a motion that stays where it is, of 1 and of |x₀| over the motion's length
 
@@ -57,12 +57,6 @@ class Setting:
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
-
-    def first_guess(self) -> ContinuousFunnel:
-        """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
-        t = self.policy.t
-        rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
-        return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
 
     def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
         """The members of a proof about how fast the input changes in the funnel.
@@ -93,11 +87,19 @@ class Setting:
         return own if self.hold is None else max(own, self.hold.needed)
 
 
-def prepare(problem: ContinuousTracking) -> Setting:
-    """The problem, checked and completed; see `design_funnel` for what is raised."""
+def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
+    """The problem, checked and completed; see `design_funnel` for what is raised.
+
+    saturated: whether inputs may be at their limits; else the funnel keeps them within. A given
+    policy clips at its own limits.
+    """
+    if problem.policy is not None:
+        problem = replace(problem, nominal=own_motion(problem.policy, problem.nominal))
     nominal = problem.nominal
     held = Hold.of(problem.hold, problem.error, nominal.x.control.shape[2])
-    field, expansion = _dynamics(problem, held)
+    limits = limits_of(problem.limits, nominal.u.control.shape[2])
+    refuse_saturated(nominal, limits)
+    field, expansion = _dynamics(problem, held, limits[:0] if saturated else limits)
     nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
@@ -110,13 +112,12 @@ def prepare(problem: ContinuousTracking) -> Setting:
         linear = problem.hold is not None  # a held input may not jump
         tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, linear=linear)
     else:
-        refuse_other(problem.policy, field, nominal)
-        P = lyapunov(field, problem.policy, Q=Q, P_final=final)
-        tracking = Tracking(problem.policy, P)
+        given = replace(problem.policy, vector_field=files.digest(field.document()))
+        tracking = Tracking(given, lyapunov(field, given, Q=Q, P_final=final))
     policy, S = tracking.policy, tracking.S
-    if problem.limits is not None:
-        policy = replace(policy, limits=limits_of(problem.limits, field.m))
-    refuse_saturated(policy)
+    if saturated:
+        policy = replace(policy, limits=limits)
+    refuse_saturated(nominal, policy.limits)
     pushed = field.only_pushes and (field.is_pushed or expansion is not None)
     nonlinear = None
     if expansion is not None and (pushed or not len(field.uncertain)):
@@ -144,42 +145,53 @@ def default_weights(
     return goal.P / tau, np.diag(tau * effect)
 
 
-def limits_of(limits: ArrayLike, m: int) -> FloatArray:
-    """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too."""
-    rows = numbers(limits, "limits")
+def limits_of(limits: ArrayLike | None, m: int) -> FloatArray:
+    """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too. None: no rows."""
+    rows = numbers([] if limits is None else limits, "limits")
+    if not rows.size:
+        return np.zeros((0, 3))
     if rows.shape == (m, 2):
         return np.column_stack([np.arange(m), rows])
-    if rows.ndim != 2 or rows.shape[1] != 3:
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isin(rows[:, 0], range(m)).all():
         raise DataError(
             f"limits should be rows (input, low, high), or one pair (low, high) for each of {m} "
-            f"inputs; they have shape {rows.shape}"
+            f"inputs; they are {rows.tolist()}"
         )
     return rows
 
 
+def valid_rows(limits: FloatArray, n: int) -> FloatArray:
+    """Rows (input, low, high) as rows of what a field of n states says is valid."""
+    return np.column_stack([n + limits[:, 0], limits[:, 1:]])
+
+
 def _dynamics(
-    problem: ContinuousTracking, held: Hold | None
+    problem: ContinuousTracking, held: Hold | None, limits: FloatArray
 ) -> tuple[VectorField, Expansion | None]:
     """The field; or, where it is no polynomial of a degree that fits, its linearisation.
+
+    limits: rows (input, low, high) within which both say they are valid.
 
     A hold needs fields that are affine in each input, and cubics at most. Without a given policy
     the motion gets more knots where they are too far apart to expand anything.
     """
     dynamics, nominal, uncertain = problem.dynamics, problem.nominal, problem.uncertain
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
+    valid = valid_rows(limits, sizes[0])
     if isinstance(dynamics, VectorField):
         if uncertain is not None:
             raise DataError("a vector field states its own bounds of w: leave out `uncertain`")
-        return dynamics, None
+        return dynamics.within(valid), None
     try:
         field = VectorField.from_function(dynamics, *sizes, uncertain=uncertain)
         few = field.n <= FEW_STATES and not (held is not None and held.period)
         affine = held is None or not field.squares_inputs
         if field.degree <= (MAX_DEGREE if few else DEGREE) and affine:
-            return field, None
+            return field.within(valid), None
     except NotPolynomial:
         pass
     rates = Rates.of(dynamics, *sizes, uncertain, affine=held is not None)
+    rates = replace(rates, valid=valid)
     expansion = Expansion(rates, nominal).refined(
         MOST_KNOTS if problem.policy is None else len(nominal.t)
     )
@@ -211,10 +223,10 @@ def largest_defect(nominal: Nominal) -> float:
     return DEFECT * max(rate, AT_REST * max(size, 1.0))
 
 
-def refuse_saturated(policy: ContinuousPolicy) -> None:
-    """Raise DataError unless the nominal's own inputs are within the policy's limits."""
-    for i, low, high in policy.limits.tolist():
-        u = policy.u.control[:, :, int(i)]
+def refuse_saturated(nominal: Nominal, limits: FloatArray) -> None:
+    """Raise DataError unless the nominal's own inputs are within the limits (L, 3)."""
+    for i, low, high in limits.tolist():
+        u = nominal.u.control[:, :, int(i)]
         least, most = float(np.min(u)), float(np.max(u))
         if not (low < least and most < high):
             raise DataError(
@@ -248,13 +260,14 @@ def _wanted_goal(goal: Goal | ArrayLike, nominal: Nominal, n: int) -> Goal:
     return Goal(wanted.centre, P)
 
 
-def refuse_other(policy: ContinuousPolicy, field: VectorField, nominal: Nominal) -> None:
-    """Raise DataError unless the policy was made for these dynamics and this motion."""
-    if policy.vector_field != files.digest(field.document()):
-        raise DataError("the policy was made for other dynamics")
-    same = np.array_equal(policy.x.control, nominal.x.control)
-    if not same or not np.array_equal(policy.t, nominal.t):
+def own_motion(policy: ContinuousPolicy, nominal: Nominal) -> Nominal:
+    """The motion of a policy, with its knots; DataError unless it is the nominal."""
+    own, t = Nominal(policy.x, policy.u), nominal.t
+    same = own.x.control.shape[2] == nominal.x.control.shape[2]
+    same = same and np.array_equal(own.t[[0, -1]], t[[0, -1]])
+    if not same or not np.allclose(own.x(t), nominal.x(t), SAME_MOTION, SAME_MOTION):
         raise DataError("the policy is around another nominal")
+    return own
 
 
 def final_level(

@@ -5,7 +5,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -29,13 +29,21 @@ class Wanted:
     """What ρ(t) keeps to.
 
     margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. final: ρ(t_f). caps: (K,) that ρ keeps below
-    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first.
+    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first. times:
+    (K-1,) what the margin is multiplied by on each interval (None: 1).
     """
 
     margin: float
     final: float
     caps: FloatArray | None = None
     expected: bool = False
+    times: FloatArray | None = None
+
+    def on(self, k: int) -> "Wanted":
+        """With the margin of interval k."""
+        if self.times is None:
+            return self
+        return replace(self, margin=self.margin * float(self.times[k]), times=None)
 
     def cap(self, k: int) -> float:
         """The cap at knot k."""
@@ -66,32 +74,49 @@ def sweep_rho(
     ends: list[Ends] = []
     duals: list[SphereSolution] | None = None
     for k in range(len(instants) - 1, -1, -1):
-        start, *between, end = instants[k]
-        h, after = end.t - start.t, float(rho[k + 1])
-        steps.bound_pushes(end, after)
-        first = _Instant(steps, start, 0.0, after, h, wanted)
-
-        # The end's program is solved until it allows as much as the start may.
-        cap, near = wanted.cap(k), None
-        if duals is not None and not wanted.expected and not len(steps.limits):
-            near = duals
-            phi = steps.predicted(end, after, duals)
-            cap = first.bound(duals, min(cap, first.allowed(phi)))
-        at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + wanted.margin)
-        phi = min(s.m for s in at_end)
-        cap = min(cap, first.allowed(phi))
-        if cap <= LOWEST * after:  # ρ̇ cannot be large enough for this end
-            why = partial(diagnosed, steps.as_it_is(), [end], [after], after / h)
-            raise NoFunnel(end.t, why, phi - wanted.margin)
-
-        for section in between:
-            inner = _Instant(steps, section, (section.t - start.t) / h, after, h, wanted)
-            cap, _ = inner.largest(cap, at_end)
-        rho[k], at_start = first.largest(cap, near or at_end)
-        ends.append(Ends(at_start, at_end))
-        duals = at_start
-        progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
+        after, cap = float(rho[k + 1]), wanted.cap(k)
+        rho[k], found = largest_before(steps, instants[k], after, cap, wanted.on(k), duals)
+        ends.append(found)
+        duals = found.start
+        progress(f"rho at {instants[k][0].t:.3g} s", 1 - k / len(instants))
     return rho, ends[::-1]
+
+
+def largest_before(
+    steps: LSteps,
+    instants: Sequence[Section],
+    after: float,
+    cap: float,
+    wanted: Wanted,
+    duals: list[SphereSolution] | None,
+) -> tuple[float, Ends]:
+    """The largest ρ ≤ cap at the start of an interval that ends with ρ = `after`, and its L-steps.
+
+    duals: solutions nearby.
+    """
+    start, *between, end = instants
+    h = end.t - start.t
+    steps.bound_pushes(end, after)
+    first = _Instant(steps, start, 0.0, after, h, wanted)
+
+    # The end's program is solved until it allows as much as the start may.
+    near = None
+    if duals is not None and not wanted.expected and not len(steps.limits):
+        near = duals
+        phi = steps.predicted(end, after, duals)
+        cap = first.bound(duals, min(cap, first.allowed(phi)))
+    at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + wanted.margin)
+    phi = min(s.m for s in at_end)
+    cap = min(cap, first.allowed(phi))
+    if cap <= LOWEST * after:  # ρ̇ cannot be large enough for this end
+        why = partial(diagnosed, steps.as_it_is(), [end], [after], after / h)
+        raise NoFunnel(end.t, why, phi - wanted.margin)
+
+    for section in between:
+        inner = _Instant(steps, section, (section.t - start.t) / h, after, h, wanted)
+        cap, _ = inner.largest(cap, at_end)
+    rho, at_start = first.largest(cap, near or at_end)
+    return rho, Ends(at_start, at_end)
 
 
 @dataclass(frozen=True, eq=False)

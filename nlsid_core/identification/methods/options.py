@@ -4,8 +4,8 @@ A method's `word` is what configurations call it, its `name` is what programs an
 `title` is shown to people.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 from nlsid_core.options import require_whole
 
@@ -92,10 +92,3 @@ class Sem(Iterated):
 
 Method = LeastSquares | Rie | Rse | Sem
 METHODS: dict[str, type[Method]] = {kind.word: kind for kind in (LeastSquares, Rie, Rse, Sem)}
-
-
-def alike(method: Method, other: Method) -> Method:
-    """The method with the other options, such as iterations, that it shares with another one."""
-    shared = {f.name for f in fields(method)} & {f.name for f in fields(other)} - {"certified"}
-    changed: dict[str, Any] = {name: getattr(other, name) for name in shared}
-    return replace(method, **changed)

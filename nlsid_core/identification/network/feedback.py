@@ -6,7 +6,7 @@ for every input only where its damping is large beside the slopes of φ. Elsewhe
     y_0 = G_0 u,    y_s = G_s u + H_s φ_s(y_{s-1}),    s = 1 … K:
 stable filters in a row are stable whatever the maps are. The stages imitate the loop on inputs that
 nobody recorded, phases drawn at random and sizes beyond those of the trials, and on the trials; a
-loop that answers a stronger input well thus hands that on. K is chosen by held-back trials.
+loop that answers a stronger input well thus hands that on.
 Source: Picard's iteration, whose truncated form is a Volterra series (Boyd and Chua 1985).
 """
 
@@ -42,7 +42,6 @@ from nlsid_core.identification.network.signals import (
 from nlsid_core.identification.proofs.stability import prove_stability
 from nlsid_core.identification.starts import autoregression, reflected
 from nlsid_core.identification.trail import Task
-from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import CellNetwork
 
 SHAPES: tuple[Callable[[FloatArray], FloatArray], ...] = (  # of φ at the start, y in its range
@@ -57,7 +56,6 @@ LENGTH = 500  # samples of an input that is imitated
 FITTED = 30_000  # samples of the trials that the stages are fitted to, beside them
 LOOP_STEPS, LOOP_TOLERANCE = 60, 1e-4
 TOLERANCE = 2e-3  # relative gain of a step of the stages
-WORTH = 0.98  # of the held-back error, that a further stage has to reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,68 +168,41 @@ def _imitated(layout: Layout, loop: Minimum, count: int, rng: np.random.Generato
     return made
 
 
-def loop_alone(train: Dataset, model_class: Network[Feedback], task: Task) -> CellNetwork:
-    """The loop as a network, which may be proved or not. Raises as `feedback_unrolled`."""
-    scaled = _scaled(train, model_class, task)
-    layout, loop = _loop(model_class.structure, scaled.trials)
-    return network_of(layout.loop(), loop, scaled, train, model_class.start_samples)
-
-
 def feedback_unrolled(
     train: Dataset, model_class: Network[Feedback], task: Task
 ) -> tuple[CellNetwork, tuple[Step, ...]]:
-    """A `CellNetwork` that can be proved, and the held-back rms errors that chose its maps.
+    """A `CellNetwork` that can be proved, and the rms errors of more and more stages.
 
-    Stages are fitted to most of the trials while the others choose their number; the chosen number
-    is fitted again to all. Raises DataError or ShapeError on data that cannot be used, Infeasible
-    if nothing is found.
+    Raises DataError or ShapeError on data that cannot be used, Infeasible if nothing is found.
     """
     made, slowest = model_class.structure, min(MAX_RADIUS, task.searched_rate)
-    scaled = _scaled(train, model_class, task)
+    scaled = Scaled.of(train, task.transient, model_class.start_samples)
     layout, loop = _loop(made, scaled.trials)
     whole = network_of(layout.loop(), loop, scaled, train, model_class.start_samples)
     proof: Proof | None = prove_stability(whole)
     if proof is not None and proof.rate <= slowest:
         return whole, (Step("the loop itself", scaled.y[1] * loop.rms),)
     task.progress("feedback fitted", 0.2)
-    few, others = (_scaled(data, model_class, task, scaled).trials for data in hold_out(train))
-    first, first_loop = _loop(made, few)
-    known = _known(first, first_loop, model_class)
-    rng = np.random.default_rng(model_class.seed + 1)
-    unseen = _imitated(first, first_loop, made.imitated // 4, rng)
-    judges = [*(replace(trial, start=trial.y[: made.lags]) for trial in others), *unseen]
+    known = _known(layout, loop, model_class)
     theta = _linear(known, layout, slowest)
-    further = _as_stage(first_loop.parameters, first, slowest)
-    history, best, chosen = [], np.inf, (0, theta)
+    further = _as_stage(loop.parameters, layout, slowest)
+    steps = []
     for maps in range(1, made.stages + 1):
-        begin = np.concatenate([theta, further])
-        problem = _stages(first, maps, known, slowest)
+        problem = _stages(layout, maps, known, slowest)
         theta = minimise(
-            problem, begin, steps=task.wanted("sem_certified").iterations, tolerance=TOLERANCE
+            problem,
+            np.concatenate([theta, further]),
+            steps=task.wanted("sem_certified").iterations,
+            tolerance=TOLERANCE,
         ).parameters
         further = theta[-len(further) :]
-        reached = _stages(first, maps, judges, slowest).mean_square(theta) ** 0.5
-        history.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * reached))
-        task.progress(history[-1].what, 0.2 + 0.6 * maps / made.stages)
-        if reached < WORTH * best:
-            best, chosen = reached, (maps, theta)
-    maps, theta = chosen
-    problem = _stages(layout, maps, _known(layout, loop, model_class), slowest)
-    last = minimise(
-        problem, theta, steps=task.wanted("sem_certified").iterations, tolerance=TOLERANCE
-    )
-    every = _stages(layout, maps, loop.trials, slowest)
-    error = every.mean_square(last.parameters) ** 0.5
-    history.append(Step("fitted to all trials, training error", scaled.y[1] * error))
-    found = Minimum(error, last.parameters, tuple(every.trials))
+        every = _stages(layout, maps, loop.trials, slowest)
+        error = every.mean_square(theta) ** 0.5
+        steps.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * error))
+        task.progress(steps[-1].what, 0.2 + 0.8 * maps / made.stages)
+    found = Minimum(error, theta, tuple(every.trials))
     model = network_of(every.signals, found, scaled, train, model_class.start_samples)
-    return model, tuple(history)
-
-
-def _scaled(
-    data: Dataset, model_class: Network[Feedback], task: Task, like: Scaled | None = None
-) -> Scaled:
-    return Scaled.of(data, task.transient, model_class.start_samples, like)
+    return model, tuple(steps)
 
 
 def _stages(layout: Layout, maps: int, trials: Sequence[Trial], radius: float) -> Problem:

@@ -2,8 +2,8 @@
 
     x_j = B1_j/A1 u,    y = Σ_j B2_j/A2 f(x_j),    j = 0 … phases - 1
 
-Random starts on a part of the data, then all of it; the number of phases and of knots are chosen
-by the simulation error on validation data. `BlockCascade` says what the phases are.
+Random starts on a part of the data, then all of it with more and more knots. `BlockCascade` says
+what the phases are.
 """
 
 from dataclasses import dataclass, replace
@@ -27,15 +27,15 @@ from nlsid_core.identification.network.options import FilterMapFilter, Network
 from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Taps, Trial
 from nlsid_core.identification.regressors import signal_scale
 from nlsid_core.identification.trail import Task
-from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import BlockCascade, Spline
 from nlsid_core.models.signal import signals_of
 
-STEPS, TOLERANCE = 40, 1e-3  # where a choice of knots and phases is judged
+STEPS, TOLERANCE = 40, 1e-3  # with fewer knots
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
 SMOOTHING = 1e-8  # of the spline
 START_SAMPLES = 10_000  # of each trial, for the starts
 START_INTERVALS = 12
+FEWEST_INTERVALS = 6  # of a map that is refined
 SCREENING_STEPS, START_STEPS = 20, 60
 KEPT_STARTS = 3  # of the screened ones, minimised further
 POLE_RADII = (0.5, 0.95)
@@ -107,91 +107,45 @@ class Cascade:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """What was fitted with a number of phases and of knots, and its rms errors in y's unit."""
-
-    cascade: Cascade
-    train_rms: float
-    validation_rms: float
-
-    def __str__(self) -> str:
-        M = self.cascade.phases
-        phases = "1 phase" if M == 1 else f"{M} phases"
-        return f"{phases}, {self.cascade.f.intervals} intervals"
-
-
 def filter_map_filter(
     train: Dataset, model_class: Network[FilterMapFilter], task: Task
 ) -> tuple[BlockCascade, tuple[Step, ...]]:
-    """A `BlockCascade` by simulation error, and the rms errors of the choices.
+    """A `BlockCascade` by simulation error, and the rms errors with more and more knots.
 
-    Without validation trials some of the training trials choose, and what they chose is fitted to
-    all. Raises ShapeError for several inputs or outputs, DataError on too little or constant data.
+    Raises ShapeError for several inputs or outputs, DataError on too little or constant data.
     """
     made, progress = model_class.structure, task.progress
-    fitted, judged = (train, task.validation) if task.validation else hold_out(train)
-    scaled = _scales(fitted)
-    known, others = (_trials(data, scaled, made, task) for data in (fitted, judged))
-    search = _Search(min(MAX_RADIUS, task.searched_rate), known, others, scaled.y[1])
-    total = len(made.phases) * len(made.intervals) + 2
-    first = _best_start(search, made, np.random.default_rng(model_class.seed))
-    progress(f"best of {made.starts} starts", 1 / total)
-    single = search.minimised(_with_intervals(first, known, made.intervals[0]), known)[0]
-    tried: list[Choice] = []
-    for M in made.phases:
-        base = single if M == 1 else _with_phases(single, search, M)
-        coarser = np.inf
-        for K in made.intervals:
-            finer = search.choice(_with_intervals(base, known, K))
-            tried.append(finer)
-            progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
-            if finer.validation_rms > coarser:
-                break  # finer knots still would fit noise
-            coarser, base = finer.validation_rms, finer.cascade
-    history = [Step(str(choice), choice.validation_rms) for choice in tried]
-    best = min(tried, key=lambda choice: choice.validation_rms)
-    polished = search.choice(best.cascade, FINAL_STEPS, FINAL_TOLERANCE)
-    history.append(Step(f"{polished}, minimised further", polished.validation_rms))
-    chosen = min(best, polished, key=lambda choice: choice.validation_rms).cascade
-    if task.validation is None:
-        progress("fitted to all trials", 1.0 - 1.0 / total)
-        every = replace(search, known=_trials(train, scaled, made, task))
-        again = every.choice(
-            _with_intervals(chosen, every.known, chosen.f.intervals), FINAL_STEPS, FINAL_TOLERANCE
-        )
-        chosen = again.cascade
-        history.append(Step("fitted to all trials, training error", again.train_rms))
+    scaled = _scales(train)
+    trials = _trials(train, scaled, made, task)
+    radius = min(MAX_RADIUS, task.searched_rate)
+    found = _best_start(trials, radius, made, np.random.default_rng(model_class.seed))
+    progress(f"best of {made.starts} starts", 0.4)
+    knots = [K for K in (made.intervals // 4, made.intervals // 2) if K >= FEWEST_INTERVALS]
+    steps: list[Step] = []
+    for K in (*knots, made.intervals):
+        found, reached = _minimised(_with_intervals(found, trials, K), trials, radius)
+        if not steps and made.phases > 1:
+            wider = _with_phases(found, trials, made.phases)
+            found, reached = _minimised(wider, trials, radius)
+        steps.append(Step(f"{K} intervals", scaled.y[1] * reached.rms))
+        progress(steps[-1].what, 0.4 + 0.4 * len(steps) / (1 + len(knots)))
+    found, reached = _minimised(found, trials, radius, steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE)
+    steps.append(Step("minimised further", scaled.y[1] * reached.rms))
     progress("minimised further", 1.0)
-    return _model(chosen, scaled, train), tuple(history)
+    return _model(found, scaled, train), tuple(steps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """radius: of the poles; known, others: trials that are fitted and that judge; unit: of y."""
-
-    radius: float
-    known: tuple[Trial, ...]
-    others: tuple[Trial, ...]
-    unit: float
-
-    def minimised(
-        self,
-        start: Cascade,
-        trials: tuple[Trial, ...],
-        steps: int = STEPS,
-        tolerance: float = TOLERANCE,
-    ) -> tuple[Cascade, Minimum]:
-        """A local minimum on these trials."""
-        problem = start.problem(trials, self.radius)
-        found = minimise(problem, start.theta, steps=steps, tolerance=tolerance)
-        return replace(start, theta=found.parameters), found
-
-    def choice(self, start: Cascade, steps: int = STEPS, tolerance: float = TOLERANCE) -> Choice:
-        """A local minimum, with its errors."""
-        cascade, found = self.minimised(start, self.known, steps, tolerance)
-        judged = cascade.problem(self.others, self.radius).mean_square(cascade.theta)
-        return Choice(cascade, self.unit * found.rms, self.unit * judged**0.5)
+def _minimised(
+    start: Cascade,
+    trials: tuple[Trial, ...],
+    radius: float,
+    *,
+    steps: int = STEPS,
+    tolerance: float = TOLERANCE,
+) -> tuple[Cascade, Minimum]:
+    """A local minimum, with poles within the radius."""
+    found = minimise(start.problem(trials, radius), start.theta, steps=steps, tolerance=tolerance)
+    return replace(start, theta=found.parameters), found
 
 
 def _scales(train: Dataset) -> Scaled:
@@ -220,15 +174,18 @@ def _trials(data: Dataset, scales: Scaled, made: FilterMapFilter, task: Task) ->
     return trials
 
 
-def _best_start(search: _Search, made: FilterMapFilter, rng: np.random.Generator) -> Cascade:
+def _best_start(
+    trials: tuple[Trial, ...], radius: float, made: FilterMapFilter, rng: np.random.Generator
+) -> Cascade:
     """The best of the minima from random all-pole filters with f by linear least squares."""
-    part = tuple(replace(t, u=t.u[:START_SAMPLES], y=t.y[:START_SAMPLES]) for t in search.known)
+    part = tuple(replace(t, u=t.u[:START_SAMPLES], y=t.y[:START_SAMPLES]) for t in trials)
     screened = [
-        search.minimised(_random_start(part, made, rng, search.radius), part, SCREENING_STEPS)
+        _minimised(_random_start(part, made, rng, radius), part, radius, steps=SCREENING_STEPS)
         for _ in range(made.starts)
     ]
     screened.sort(key=lambda found: found[1].rms)
-    finished = [search.minimised(start, part, START_STEPS) for start, _ in screened[:KEPT_STARTS]]
+    kept = screened[:KEPT_STARTS]
+    finished = [_minimised(start, part, radius, steps=START_STEPS) for start, _ in kept]
     return min(finished, key=lambda found: found[1].rms)[0]
 
 
@@ -269,14 +226,14 @@ def _with_intervals(cascade: Cascade, trials: tuple[Trial, ...], intervals: int)
     return replace(cascade.moved({"c": fitted}), f=f)
 
 
-def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
+def _with_phases(cascade: Cascade, trials: tuple[Trial, ...], phases: int) -> Cascade:
     """A cascade of one phase with `phases` of them: phase j sees x(t - j/phases).
 
     b1[j] is fitted to x delayed by FFT, then every b2 to the outputs; both are linear.
     """
     _, b1_at, _, b2_at, _ = cascade.places
     columns, targets = [], []
-    for trial in search.known:
+    for trial in trials:
         sources, derivatives = cascade.signals.sensitivities(cascade.theta, trial)
         x, moved = sources[2], derivatives[2]
         inside = slice(trial.skipped, len(x) - trial.skipped)  # an FFT is periodic
@@ -286,7 +243,7 @@ def _with_phases(cascade: Cascade, search: _Search, phases: int) -> Cascade:
     b1 = np.concatenate([cascade.theta[b1_at], shifted.T])
     wide = cascade.moved({"b1": b1, "b2": np.zeros((phases, b2_at.shape[1]))})
     at = wide.places[3].ravel()
-    return replace(wide, theta=best_for(wide.problem(search.known, np.inf), wide.theta, at))
+    return replace(wide, theta=best_for(wide.problem(trials, np.inf), wide.theta, at))
 
 
 def _knots(x: FloatArray, intervals: int) -> Smooth:

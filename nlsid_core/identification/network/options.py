@@ -8,7 +8,7 @@ from nlsid_core.identification.methods.options import Method, Sem
 from nlsid_core.models.cell_network import MAX_MAPS
 from nlsid_core.options import require_one_of, require_whole
 
-MOST_ORDER, MOST_PHASES, MOST_STARTS = 100, 4, 1000
+MOST_ORDER, MOST_PHASES, MOST_KNOTS, MOST_STARTS = 100, 4, 1000, 1000
 MOST_CELLS, MOST_INTERVALS, MOST_LAGS = 3, 30, 8
 MOST_IMITATED = MOST_START_SAMPLES = 10_000
 
@@ -21,15 +21,15 @@ class FilterMapFilter:
     """A filter, a static map, a filter, of one input and one output.
 
     orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models. phases:
-    tried, each 1 to 4; several presume an input without power near half the sampling frequency.
-    intervals: of knots, tried, ascending, while that helps; validation data choose both. starts:
-    random ones, 1 to 1000. begin: how trials begin, "measured" (in motion, from the first measured
-    outputs) or "rest" (from zero states). Source: `theory-cascades-and-moments.md`.
+    1 to 4; several presume an input without power near half the sampling frequency. intervals: of
+    knots, 1 to 1000. starts: random ones, 1 to 1000. begin: how trials begin, "measured" (in
+    motion, from the first measured outputs) or "rest" (from zero states). Source:
+    `theory-cascades-and-moments.md`.
     """
 
     orders: tuple[int, int] = (3, 3)
-    phases: tuple[int, ...] = (1, 2)
-    intervals: tuple[int, ...] = (24, 48, 96)
+    phases: int = 1
+    intervals: int = 24
     starts: int = 12
     begin: Begin = "measured"
 
@@ -37,10 +37,8 @@ class FilterMapFilter:
         if len(self.orders) != 2 or min(self.orders) < 0 or not 1 <= max(self.orders) <= MOST_ORDER:
             allowed = f"two whole numbers from 0 to {MOST_ORDER}, not both zero"
             raise OptionError("orders", self.orders, allowed)
-        if not self.phases or not all(1 <= M <= MOST_PHASES for M in self.phases):
-            raise OptionError("phases", self.phases, f"between 1 and {MOST_PHASES} each")
-        if not self.intervals or min(self.intervals) < 1:
-            raise OptionError("intervals", self.intervals, "at least 1 each")
+        require_whole(self, "phases", 1, MOST_PHASES)
+        require_whole(self, "intervals", 1, MOST_KNOTS)
         require_whole(self, "starts", 1, MOST_STARTS)
         require_one_of(self, "begin", get_args(Begin))
 
@@ -68,7 +66,7 @@ class Feedback:
     """A filter with feedback through a static map of its output, of any number of inputs.
 
     lags: of output and inputs, 1 to 8. intervals: of the map's spline, 1 to 30 (1 is a cubic).
-    stages: of the unrolled equation that are tried, 1 to 8; each is one map of the proof.
+    stages: of the unrolled equation, 1 to 8; each is one map of the proof.
     imitated: inputs that nobody recorded, on which the stages do as the loop does, 0 to 10000.
     """
 
@@ -109,16 +107,10 @@ class Network(Generic[S]):
 
     @property
     def methods(self) -> tuple[Method, ...]:
-        """Those for such models, the default first; a loop may be fitted without a proof."""
-        certified = Sem(certified=True)
-        return (certified, Sem()) if isinstance(self.structure, Feedback) else (certified,)
+        """The only one for such models."""
+        return (Sem(certified=True),)
 
     @property
     def comparators(self) -> tuple[Method, ...]:
-        """Those that run beside what is asked for, because they are quick."""
-        return self.methods[1:]
-
-    @property
-    def needs_validation(self) -> bool:
-        """The search chooses by validation trials, or by some of the training trials."""
-        return isinstance(self.structure, FilterMapFilter)
+        """None is quick enough to run beside it."""
+        return ()

@@ -4,7 +4,6 @@ Source: thesis Chapter 4 and Section 1.1.1.
 """
 
 import logging
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +14,7 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible, SolverError
 from nlsid_core.identification.fit import History, Step
 from nlsid_core.identification.methods.newton import Descent
-from nlsid_core.identification.methods.options import Rse, Sem
+from nlsid_core.identification.methods.options import LeastSquares, Rse, Sem
 from nlsid_core.identification.methods.rse import robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
 from nlsid_core.identification.polynomial.certified import (
@@ -23,7 +22,6 @@ from nlsid_core.identification.polynomial.certified import (
     descend_certified,
 )
 from nlsid_core.identification.polynomial.options import Polynomial
-from nlsid_core.identification.polynomial.rie import robust_identification_error
 from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 from nlsid_core.identification.proofs.stability import prove_stability
 from nlsid_core.identification.starts import SLOWEST_POLE, poles_of, reflected, stable_starts
@@ -31,7 +29,6 @@ from nlsid_core.identification.trail import Task, Trail, least_error, tried
 from nlsid_core.models import StateAffineModel
 
 BOUND = "bound on the simulation error"
-MOST_ENTRIES = 1_500_000  # of the equation errors; above it, searches that are not asked for wait
 POLE_ROUNDING = 1e-9  # of a pole that was put on the radius
 
 Model = Any  # a DifferenceEquation or a StateAffineModel
@@ -41,16 +38,12 @@ log = logging.getLogger(__name__)
 def search(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Model]:
     """Candidates of the methods that are asked for."""
     problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
-    if problem.rows.errors.size > MOST_ENTRIES:
-        task = _without_slow_comparators(task, problem)
     trail: Trail[Model] = Trail(task, prove_stability, BOUND)
     radius, n_y = task.searched_rate, len(problem.y_scale[0])
-    starts = [
-        (name, problem.embedded(theta))
-        for name, theta in stable_starts(train, model_class.lags, radius)
-    ]
+    is_solved = {task.method, *task.comparators} == {LeastSquares()}  # without an iteration
+    found = () if is_solved else stable_starts(train, model_class.lags, radius)
+    starts = [(name, problem.embedded(theta)) for name, theta in found]
     trail.add("least_squares", lambda _: equation_error(problem))
-    trail.add("rie", lambda _: robust_identification_error(problem)[0])
     trail.follow(
         problem.rows,
         lambda i: problem.model(i.theta, i.p),
@@ -164,15 +157,3 @@ def _last_step(problem: StateAffineRows, trail: Trail[Model], method: Sem) -> Mo
     if not reached:
         raise Infeasible("no proof for the last certified iterate, where the last step starts")
     return least_error(reached, train)
-
-
-def _without_slow_comparators(task: Task, problem: StateAffineRows) -> Task:
-    beside = tuple(m for m in task.comparators if m.name == "least_squares")
-    left_out = ", ".join(m.name for m in task.comparators if m not in beside)
-    if left_out:
-        log.warning(
-            "%d rows of %d unknowns: no comparison with %s; ask for one to have it",
-            *problem.rows.errors.shape,
-            left_out,
-        )
-    return replace(task, comparators=beside)

@@ -14,7 +14,6 @@ Source: thesis (3.6)-(3.9), Claim 3.6, Section 3.5.2, with V = |x₁ - x₂|²_P
 2.10, 2.16.
 """
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,14 +61,13 @@ def identify_from_repeats(
     transient: int = 0,
     accept_untested_repeats: bool = False,
     slowest: float = 1.0,
-    executor: Executor | None = None,
 ) -> MomentFit:
     """Identify a `MonotoneEquation` from the dataset's groups of repeats, proved stable.
 
     Trajectories without a repeat are not used. transient: samples at the start of each that the
     test of the repeats leaves out. accept_untested_repeats: skip that test; the bias of noise is
     then removed only if the trials repeat one excitation all the same. slowest: as of
-    `minimise_moment_rie`. executor: for the moments.
+    `minimise_moment_rie`.
     Raises DataError if there are no repeats or they are not repeats, ShapeError for several
     outputs, Infeasible or SolverError as `minimise_moment_rie`.
     """
@@ -83,7 +81,7 @@ def identify_from_repeats(
         refuse_false_repeats(data, transient=transient)
     used = Dataset(tuple(trial for group in groups for trial in group))
     offsets = offsets_of(used.trajectories)
-    moments = repeated_moments(groups, model_class, offsets, executor=executor)
+    moments = repeated_moments(groups, model_class, offsets)
     return minimise_moment_rie(moments, model_class, used, offsets, slowest=slowest)
 
 

@@ -9,7 +9,6 @@ Source: Hausman, Newey, Ichimura and Powell 1991; thesis Lemma 3.12 and its proo
 """
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
@@ -113,8 +112,6 @@ def repeated_moments(
     groups: Sequence[Sequence[Trajectory]],
     model_class: Polynomial,
     offsets: Offsets,
-    *,
-    executor: Executor | None = None,
 ) -> Moments:
     """Moments without the bias of noise, from groups of repeats: every pair, in both roles.
 
@@ -128,26 +125,16 @@ def repeated_moments(
         pairs += list(combinations(group, 2))
     if not pairs:
         raise DataError("no repeated experiments; bias removal needs a pair")
-    first, second = ([pair[k] for pair in pairs] for k in (0, 1))
-    classes, shifts = [model_class] * len(pairs), [offsets] * len(pairs)
-    mapped = map if executor is None else executor.map
-    return reduce(add, mapped(_pair, first, second, classes, shifts))
+    return reduce(add, (_pair(one, other, model_class, offsets) for one, other in pairs))
 
 
 def plain_moments(
     trials: Sequence[Trajectory],
     model_class: Polynomial,
     offsets: Offsets,
-    *,
-    executor: Executor | None = None,
 ) -> Moments:
-    """Moments of the signals as measured: right without noise, biased with it.
-
-    executor: shares the trials.
-    """
-    classes, shifts = [model_class] * len(trials), [offsets] * len(trials)
-    mapped = map if executor is None else executor.map
-    return reduce(add, mapped(_pair, trials, trials, classes, shifts))
+    """Moments of the signals as measured: right without noise, biased with it."""
+    return reduce(add, (_pair(trial, trial, model_class, offsets) for trial in trials))
 
 
 def _pair(

@@ -115,17 +115,17 @@ class Polynomial:
             return (Rie(), LeastSquares(), Sem(), Sem(certified=True))
         if self.form:
             return (Rie(), LeastSquares(), Sem(certified=True))
-        found = (Rse(), LeastSquares(), Rie(), Sem(), Rse(certified=True), Sem(certified=True))
+        found = (Rse(), LeastSquares(), Sem(), Rse(certified=True), Sem(certified=True))
         lagged, leading = self.degrees.lagged, self.degrees.leading
         most = CERTIFIABLE_AFFINE if lagged else CERTIFIABLE_DEGREE
-        return found if max(lagged, leading) <= most else found[:4]
+        return found if max(lagged, leading) <= most else found[:3]
 
     @property
     def comparators(self) -> tuple[Method, ...]:
         """Those that run beside what is asked for, because they are quick."""
         if self.is_linear:
             return (LeastSquares(), Rse(), Sem())
-        return (LeastSquares(), Rie()) if self.form else (LeastSquares(), Rie(), Rse())
+        return (LeastSquares(), Rie()) if self.form else (LeastSquares(), Rse())
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""

@@ -55,7 +55,6 @@ def _implicit(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Mode
                 train,
                 model_class,
                 transient=task.transient,
-                executor=task.executor,
                 accept_untested_repeats=method.accept_untested_repeats,
                 slowest=task.searched_rate,
             )

@@ -1,0 +1,190 @@
+"""What is tried for recordings, in which order; the one rule (`choosing`) takes what is best.
+
+It is a list, cheap first: linear models, what bends them, networks, then the best of them with more
+or fewer lags, higher degrees, more or fewer steps, and a shorter memory.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError
+from nlsid_core.identification.choosing import Attempt, Choice, Fold, HeldOut, Row, shortened
+from nlsid_core.identification.methods.options import LeastSquares, Method, Rse, Sem
+from nlsid_core.identification.network.options import (
+    CellRow,
+    Feedback,
+    FilterMapFilter,
+    Limit,
+    Network,
+)
+from nlsid_core.identification.polynomial.options import Degrees, Polynomial
+from nlsid_core.identification.polynomial.rows import build_state_affine_rows
+from nlsid_core.progress import Progress, silent
+
+LAGS = (1, 2, 3, 4, 6, 8, 10)  # of one input and output
+FEW_LAGS = (1, 2, 3, 4)
+STEPS = 6  # of a search while it is one of many
+MORE_STEPS = 20  # of the best
+MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
+GLANCE = 1000  # samples, to which an attempt is fitted to see whether it is worth a closer look
+DROPPED = 1.25  # times the best glance of a stage: worse ones are not looked at again
+MOST_FILTERED = 6  # states of filters
+SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
+ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
+
+
+def choose(
+    held_out: HeldOut,
+    stages: "Stages",
+    known: Sequence[Row] = (),
+    *,
+    progress: Progress = silent,
+) -> Choice:
+    """Try what there is for such data: a glance at all, and the best of each stage judged.
+
+    known: what was tried before.
+    """
+    rows, best = list(known), math.inf
+    first = held_out.folds[0]
+    few = Fold(shortened(first.fitted.trajectories, GLANCE), first.judged)
+    glance = replace(held_out, folds=(few,))
+    for number, (stage, kept) in enumerate(stages):
+        before = {row.attempt for row in rows}
+        attempts = [one for one in dict.fromkeys(stage(held_out.data, rows)) if one not in before]
+        glances = []
+        for attempt in attempts:
+            progress(str(attempt), number / len(stages))
+            glances.append(glance.judged(attempt))
+            best = min(best, glances[-1].percent)
+        glances.sort(key=lambda row: row.percent)
+        for place, row in enumerate(glances):
+            if row.refusal:
+                rows.append(row)
+            elif place < kept and row.percent <= DROPPED * best:
+                progress(str(row.attempt), (number + 0.5) / len(stages))
+                rows.append(held_out.judged(row.attempt))
+            else:
+                rows.append(replace(row, refusal=f"{row.percent:.3g} % at a glance"))
+    return Choice(held_out, tuple(rows))
+
+
+def least(rows: Iterable[Row]) -> Row | None:
+    """The row with the least error, if one has an error."""
+    return min((row for row in rows if not row.refusal), key=lambda row: row.percent, default=None)
+
+
+Stage = Callable[[Dataset, Sequence[Row]], Iterator[Attempt]]
+
+
+def linear(data: Dataset, _rows: Sequence[Row]) -> Iterator[Attempt]:
+    """By least squares, and by simulation error."""
+    outputs, inputs = signals_of(data)
+    iterated: Method = Rse(STEPS) if outputs == 1 else Sem(STEPS, certified=True)
+    for lags in LAGS if outputs == inputs == 1 else FEW_LAGS:
+        delays: list[tuple[int, ...] | None] = [None]
+        if inputs > 1:
+            delays += [(k,) for k in range(1, lags + 1)]
+        for chosen in delays:
+            yield Attempt(Polynomial(lags, chosen), LeastSquares())
+            if lags in FEW_LAGS:
+                yield Attempt(Polynomial(lags, chosen), iterated)
+
+
+def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
+    """Polynomials of the inputs, factors of the outputs, increasing functions of the output."""
+    outputs, _ = signals_of(data)
+    best = least(rows)
+    if best is None or best.percent < ENOUGH:
+        return
+    certified = Sem(STEPS, certified=True)
+    lags = max(2, min(_lags(best), FEW_LAGS[-1]))
+    for degree in (2, 3):
+        delays = excited(data, lags, degree)
+        yield Attempt(Polynomial(lags, delays, Degrees(inputs=degree)), Rse(STEPS))
+    delays = excited(data, lags, 2)
+    yield Attempt(Polynomial(lags, delays, Degrees(inputs=2, leading=1)), certified)
+    delays = excited(data, lags, 3)
+    yield Attempt(Polynomial(lags, delays, Degrees(left=3, inputs=3)), certified)
+    if outputs == 1:
+        yield Attempt(Polynomial(lags, degrees=Degrees(left=3)), certified)
+
+
+def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
+    """Filters around a map, with as many states as linear models need, and rows of cells."""
+    outputs, inputs = signals_of(data)
+    best = least(rows)
+    if outputs > 1 or best is None or best.percent < ENOUGH:
+        return
+    certified = Sem(STEPS, certified=True)
+    limits: tuple[tuple[int, Limit], ...] = ((1, "none"), (1, "friction"), (2, "top"))
+    for cells, limit in limits:
+        yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
+    if inputs == 1:
+        straight = least(row for row in rows if row.attempt.model_class == Polynomial(_lags(row)))
+        n = 4 if straight is None else max(2, min(_lags(straight), MOST_FILTERED))
+        for orders in dict.fromkeys(((n, 0), (0, n), (n - n // 2, n // 2))):
+            filters = FilterMapFilter(orders, intervals=12, starts=4)
+            yield Attempt(Network(filters), certified)
+    if best.percent > SWINGS:
+        loop = Network(Feedback(2, stages=2, imitated=20))
+        yield Attempt(loop, certified)
+
+
+def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
+    """The best with more or fewer lags, higher degrees, and by more or fewer steps."""
+    best = least(rows)
+    if best is None:
+        return
+    attempt = best.attempt
+    if isinstance(made := attempt.model_class, Polynomial):
+        for lags in (made.lags - 1, made.lags + 1, made.lags + 2):
+            if lags >= 1:
+                yield replace(attempt, model_class=replace(made, lags=lags))
+        if made.degrees.leading:
+            higher = replace(made.degrees, inputs=3, leading=2 if signals_of(data) == (1, 1) else 1)
+            yield replace(attempt, model_class=replace(made, lags=made.lags - 1, degrees=higher))
+    if isinstance(method := attempt.method, Rse | Sem):
+        for iterations in (1, MORE_STEPS):
+            yield replace(attempt, method=replace(method, iterations=iterations))
+
+
+def memories(_data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
+    """The best with a shorter memory."""
+    best = least(rows)
+    if best is not None and best.attempt.method != LeastSquares():  # which knows no limit
+        for memory in MEMORIES:
+            yield replace(best.attempt, memory=memory)
+
+
+def _lags(row: Row) -> int:
+    """Of an equation; 0 of a network."""
+    made = row.attempt.model_class
+    return made.lags if isinstance(made, Polynomial) else 0
+
+
+def signals_of(data: Dataset) -> tuple[int, int]:
+    """How many outputs and inputs there are."""
+    first = data.trajectories[0]
+    return first.y.shape[1], first.u.shape[1]
+
+
+def excited(data: Dataset, lags: int, degree: int) -> tuple[int, ...] | None:
+    """All delays (None) where the inputs excite their products, else one."""
+    try:
+        build_state_affine_rows(data, Polynomial(lags, degrees=Degrees(inputs=degree)))
+    except DataError:
+        return (1,)
+    return None
+
+
+Stages = Sequence[tuple[Stage, int]]  # with how many of each are judged
+LINEAR: Stages = ((linear, 4),)
+BEYOND: Stages = (
+    (curved, 2),
+    (networks, 1),
+    (nearby, 2),
+    (memories, 1),
+)
+STAGES = (*LINEAR, *BEYOND)
