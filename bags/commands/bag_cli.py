@@ -83,8 +83,12 @@ def info(
 
     for path in expand_bags(bags):
         with progress_bar("reading") as progress:
-            types = _definitions(definitions)
-            found = bag_info(path, messages=messages, definitions=types, progress=progress)
+            found = bag_info(
+                path,
+                messages=messages,
+                definitions=_definitions(definitions),
+                progress=progress,
+            )
         if as_json:
             typer.echo(bag_show.info_json(found))
         else:

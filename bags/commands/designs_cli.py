@@ -190,6 +190,11 @@ def check(
     that contradicts itself. Status 2 if a proof cannot be read, so that nothing was decided about
     it, or if the second kernel was asked and has no opinion of it.
     """
+    raise typer.Exit(decided(paths, deciding.Limits(seconds, memory), second=second))
+
+
+def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False) -> int:
+    """Say of every proof whether it is one; the status that `check` ends with."""
     from bags.designs.provenance import of_proof
 
     status = 0
@@ -197,7 +202,6 @@ def check(
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            limits = deciding.Limits(seconds, memory)
             said = str(deciding.Deciding(path, limits, remembered=False).wait())
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
@@ -217,7 +221,7 @@ def check(
         except OSError as error:
             status = 2
             typer.echo(f"NOT READ {name}: {error.strerror}")
-    raise typer.Exit(status)
+    return status
 
 
 def _proofs(path: Path) -> list[Path]:

@@ -9,7 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from bags.commands.progress import progress_bar
 from bags.recordings.bag import Bag
@@ -20,8 +23,9 @@ from bags.setup.proposal import Proposal
 from bags.setup.proposing import Chosen, choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.reader import expanded
-from nlsid_core.errors import BagError, DataError
+from nlsid_core.errors import BagError, DataError, percent
 from nlsid_core.files import write_atomically
+from nlsid_core.identification import Choice
 
 SHOWN = 9  # pairs beside a question
 NAMED = 3  # bags that a command names one by one
@@ -92,6 +96,8 @@ def _say(console: Console, proposal: Proposal, target: Path, bags: Sequence[Path
     """What was chosen and why, what to mind, and which commands come next."""
     for text in (path for role in ROLES for path in _paths(proposal, role)):
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
+    if proposal.choice is not None:
+        console.print(tried_table(proposal.choice))
     for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
@@ -106,6 +112,26 @@ def _say(console: Console, proposal: Proposal, target: Path, bags: Sequence[Path
         f"nlsid monitor {folder} {given}",
     ):
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
+
+
+def tried_table(choice: Choice) -> Table:
+    """What was tried, the best first, and what it is held against."""
+    table = Table(
+        title=f"tried on {choice.held_out.on} that were held out",
+        caption="error: of the simulation, in % of the response's spread",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column("model: method (steps)")
+    table.add_column("error", justify="right")
+    judged = choice.ranked
+    for row in judged:
+        style = "bold" if row is choice.best else ""
+        table.add_row(escape(str(row.attempt)), percent(row.percent), style=style)
+    for row in (row for row in choice.rows if row not in judged):
+        table.add_row(escape(str(row.attempt)), escape(row.refusal), style="dim")
+    return table
 
 
 def _show_others(console: Console, found: Found, taken: set[str]) -> None:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from bags.chain.config import Config
     from bags.chain.steps import Trials
+    from bags.setup.proposal import Proposal
 
 
 def init(
@@ -49,6 +50,19 @@ def init(
     It is tried on the bags, every key says why, and what later steps will meet is said first.
     Status 1 if nothing can be identified from these bags.
     """
+    proposed(folder, bags, signals, definitions, robot=robot, yes=yes)
+
+
+def proposed(
+    folder: Path,
+    bags: list[Path],
+    signals: Signals,
+    definitions: list[Path] | None,
+    *,
+    robot: str,
+    yes: bool,
+) -> Proposal:
+    """Write the first configuration; Exit with status 1 if nothing can be identified."""
     from bags.commands.init import run_init
     from bags.setup.proposal import Unfit
     from bags.setup.proposing import Chosen
@@ -60,7 +74,7 @@ def init(
         tuple(definitions or ()),
     )
     try:
-        run_init(out, bags, folder / CONFIG, chosen, yes=yes)
+        return run_init(out, bags, folder / CONFIG, chosen, yes=yes)
     except Unfit as reason:
         err.print(f"nothing was written: {reason}", soft_wrap=True, markup=False)
         raise typer.Exit(1) from reason

@@ -270,10 +270,12 @@ class Storage:
     @property
     def kinds(self) -> dict[str, list[str]]:
         """What the files are, and how what is in them is compressed."""
-        blocks = [block.compression for file in self.files for block in file.contents.blocks]
         return {
             "storage": sorted({KINDS[type(file)] for file in self.files}),
-            "compression": sorted(set(blocks) - {"", "none"}),
+            "compression": sorted(
+                {block.compression for file in self.files for block in file.contents.blocks}
+                - {"", "none"}
+            ),
         }
 
     @property

@@ -38,7 +38,7 @@ def say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> None
     if section["model"] == "state_affine":
         section |= {key: value for key, value in kept.items() if value is not None}
     proposal.content["identification"] = section
-    proposal.promise = choice.promise
+    proposal.choice = choice
     shown = [row for row in choice.ranked if math.isfinite(row.percent)][:SHOWN]
     said = "; ".join(f"{row.attempt}: {row.percent:.3g} %" for row in shown)
     proposal.why["model"] = (

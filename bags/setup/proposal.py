@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from bags.chain.config import Config
 from nlsid_core.errors import BagError
-from nlsid_core.identification import Promise
+from nlsid_core.identification import Choice
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
@@ -39,22 +39,22 @@ class Proposal:
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
-    promise: Promise | None = None  # of a model's error in simulation
+    choice: Choice | None = None  # of everything that was tried, if something was taken
 
     @property
     def error(self) -> float:
         """% of the response's spread; infinite if nothing is promised."""
-        return math.inf if self.promise is None else self.promise.percent
+        return math.inf if self.choice is None else self.choice.promise.percent
 
     @property
     def expectation(self) -> str:
         """How good a model will be, as far as what was tried says."""
-        if self.promise is None:
+        if self.choice is None:
             return (
                 "nothing is promised: no model could be held against data that it was not fitted to"
             )
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
-        said = f"expect an error in simulation of {self.promise}: {grade}"
+        said = f"expect an error in simulation of {self.choice.promise}: {grade}"
         return f"{said}, if the question above is answered" if self.doubts else said
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:

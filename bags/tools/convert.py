@@ -136,8 +136,9 @@ def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
     there = {topic for bag in bags for topic in bag.topics}
     for pattern in what.topics or ():
         if not any(fnmatchcase(topic, pattern) for topic in there):
-            said = ", ".join(sorted(there))
-            raise BagError(f"{bags[0].path} has no topic {pattern}; it has: {said}")
+            raise BagError(
+                f"{bags[0].path} has no topic {pattern}; it has: {', '.join(sorted(there))}"
+            )
     names = {}
     for text in what.rename or ():
         old, equals, new = text.partition("=")
@@ -154,8 +155,9 @@ def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
             profiles: dict[Profile, None] = {}
             for other in bags:
                 profiles |= dict.fromkeys(other.offered(topic))
-            renamed = names.get(topic, topic)
-            known[channel.key] = replace(channel, topic=renamed, offered=tuple(profiles))
+            known[channel.key] = replace(
+                channel, topic=names.get(topic, topic), offered=tuple(profiles)
+            )
         found.append(known)
     return found
 
@@ -291,8 +293,9 @@ class _Parts:
             for key, value in bag.custom.items():
                 if custom.setdefault(key, value) != value:
                     custom[key] = f"{custom[key]}; {value}"
-        path = self._out.with_name(self.name)
-        writer = BagWriter(path, custom=custom, compression=self._into.compression)
+        writer = BagWriter(
+            self._out.with_name(self.name), custom=custom, compression=self._into.compression
+        )
         for bag in self._bags:
             for record in bag.kept_beside:
                 writer.keep(record)

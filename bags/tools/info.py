@@ -163,9 +163,16 @@ def bag_info(
             order = np.argsort(log_ns, kind="stable")
             log_ns = log_ns[order]
             said = looked[topic].messages(order, log_ns) if messages else None
-            kind = bag.topics[topic]
-            times_of = _log_times(log_ns)
-            found.append(TopicInfo(topic, kind, len(log_ns), times_of, bag.offered(topic), said))
+            found.append(
+                TopicInfo(
+                    topic,
+                    bag.topics[topic],
+                    len(log_ns),
+                    _log_times(log_ns),
+                    bag.offered(topic),
+                    said,
+                )
+            )
         made = {name: ", ".join(said) for name, said in bag.kinds.items()}
         return BagInfo(
             path=bag.path,

@@ -100,8 +100,11 @@ def export_topics(
         if not kept:
             what = "; ".join(left_out) or "there are no messages"
             raise BagError(f"{bag.path}: nothing was exported: {what}")
-    rows = {out / file.path.name: counts[topic] for topic, file in kept.items()}
-    return Exported(rows, tuple(left_out), (*bag.lost, *bag.disagreements))
+    return Exported(
+        {out / file.path.name: counts[topic] for topic, file in kept.items()},
+        tuple(left_out),
+        (*bag.lost, *bag.disagreements),
+    )
 
 
 def frame(

@@ -711,3 +711,19 @@ def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_pat
     assert "will refuse" not in said
     assert "the model is a first guess" in said
     nlsid("identify", tmp_path / "out", tmp_path, "--config", config)
+
+
+def test_one_command_goes_from_bags_to_a_checked_design_or_says_what_to_decide(
+    tmp_path: Path,
+) -> None:
+    bags = lagging(tmp_path / "bags", period=0.02, trials=4)
+    said = nlsid("learn", bags, "--out", tmp_path / "out", "-u", "/a:data", "-y", "/b:data")
+    assert said.count("PROVED") == 2
+    promised = re.search(r"simulation of ([\d.]+) to ([\d.]+) % on excitations", said)
+    assert promised
+    assert float(promised[1]) < 3.3 < float(promised[2]) * 1.5, "the noise is 3 % of the spread"
+    assert {"robot.yaml", "design.html"} < {path.name for path in (tmp_path / "out").iterdir()}
+    swapped = nlsid(
+        "learn", bags, "--out", tmp_path / "b", "-u", "/b:data", "-y", "/a:data", status=None
+    )
+    assert "are they swapped?" in swapped
