@@ -79,9 +79,14 @@ def of_funnel(model: Json, funnel: Json) -> Provenance:
         given = tube["assumption"]
         factor = Fraction(given["safety_factor"]) ** 2
         bounds = [("its level", Fraction(tube["level"]), factor * Fraction(given["measured"]))]
-        if peak := tube.get("peak"):
+        peak = tube.get("peak", {})
+        if "level" in peak:
             most = factor * Fraction(peak["measured"])
             bounds.append(("its peak", Fraction(peak["level"]), most))
+        if "direct" in tube:
+            most = Fraction(given["safety_factor"])
+            pairs = zip(peak["at_most"], peak["measured"], strict=True)
+            bounds += [("a peak", Fraction(bound), most * Fraction(seen)) for bound, seen in pairs]
         found.append(_judged(f"innovation energy of tube {i}", given, fitted, bounds))
     if response := funnel.get("response"):
         given = response["assumption"]

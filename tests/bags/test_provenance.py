@@ -84,6 +84,11 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
     [
         ("level", {"level": 0.02}, "its level is below"),
         ("peak", {"peak": {"level": 0.01, "measured": 0.007}}, "its peak is below"),
+        (
+            "peak",
+            {"direct": [1.0], "peak": {"at_most": [0.01], "measured": [0.007]}},
+            "a peak is below",
+        ),
         ("assumption", {"safety_factor": 0.5}, "the safety factor is below 1"),
         ("assumption", {"measured_on": []}, "measured on no trial"),
         (

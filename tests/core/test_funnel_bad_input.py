@@ -18,7 +18,7 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
-from nlsid_core.errors import DataError, NlsidError, NotPolynomial, OptionError
+from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
 from tests import funnel_problem
 from tests.marks import slow_among
 
@@ -231,17 +231,19 @@ def test_a_policy_around_another_nominal_is_told_and_one_that_was_found_is_taken
     policy = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2))).policy
     again = design_funnel(ContinuousTracking(field, nominal, goal=30 * np.eye(2), policy=policy))
     assert again.verdict is not None
-    t = np.linspace(0, 2, KNOTS)
-    away = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.array([0.01, 0]))
+    away = integrate_nominal(field, lambda _: np.zeros(1), t=nominal.t, start=np.array([0.01, 0]))
     with pytest.raises(DataError, match="around another nominal"):
         design_funnel(ContinuousTracking(field, away, goal=20 * np.eye(2), policy=policy))
 
 
-def test_an_uncontrollable_linearisation_may_still_have_a_goal_and_a_riccati_solution() -> None:
-    field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
-    t = np.linspace(0, 1, 5)
-    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=[0.0, 0.0])
+def test_a_state_that_no_input_moves_has_a_riccati_solution_and_is_named_in_a_refusal() -> None:
+    field = VectorField.from_function(
+        lambda x, u, w: np.array([x[0] + w[0], -x[1] + u[0]]), 2, 1, uncertain=[[-1.0, 1.0]]
+    )
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=np.arange(5) / 4, start=[0.0, 0.0])
     assert tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).S.shape == (5, 2, 2)
+    with pytest.raises(Infeasible, match="No input moves x0, through no other state either"):
+        design_funnel(ContinuousTracking(field, nominal, goal=[0.1, 0.1]))
 
 
 def test_dynamics_valid_only_where_the_nominal_is_not_are_told() -> None:

@@ -270,8 +270,8 @@ def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
     bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=[[2, -1.0, 1.0]])
     options: Any = {"nominal": still(field, 13, 0.6), "goal": 20 * np.eye(2)}
-    policy = design_funnel(ContinuousTracking(field, **options)).policy
-    policy = replace(policy, limits=np.array([[0, -0.5, 1.0]]))
+    free = design_funnel(ContinuousTracking(field, **options))
+    policy = replace(free.policy, limits=np.array([[0, -0.5, 1.0]]))
     found = design_funnel(ContinuousTracking(field, **options, policy=policy))
     assert found.found.proved.pieces.kappa is not None
     assert demand(found, 0.0) > 0.6

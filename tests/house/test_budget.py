@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_828,
-    ("bags",): 11_961,
+    ("bags",): 11_966,
     ("nlsid_ros",): 2_679,
     ("tests",): 23_181,
     ("benchmarks", "examples"): 3_799,

@@ -76,7 +76,7 @@ def with_knots(problem: ContinuousTracking) -> Setting:
         chosen = coarse(setting, most)
         if not chosen.any():
             break
-        setting = prepare(_with(problem, motion_of(setting).halved(chosen)))
+        setting = prepare(replace(problem, nominal=motion_of(setting).halved(chosen)))
     return setting
 
 
@@ -135,7 +135,7 @@ def widened(problem: ContinuousTracking, found: Found, progress: Progress) -> Fo
     kept = replace(field, valid=valid_rows(limits, field.n))
     if (funnel.rho < AT_LIMIT * validity_caps(kept, setting.policy, setting.P)).all():
         return found
-    again = replace(_with(problem, motion_of(setting)), R=setting.weights[1])
+    again = replace(problem, nominal=motion_of(setting), R=setting.weights[1])
     try:
         free = expected(prepare(replace(again, limits=None)), progress)
         if funnel.rho[0] >= NARROW**2 * free[0]:
@@ -151,10 +151,6 @@ def motion_of(setting: Setting) -> Nominal:
     return Nominal(setting.policy.x, setting.policy.u)
 
 
-def _with(problem: ContinuousTracking, nominal: Nominal) -> ContinuousTracking:
-    return replace(problem, nominal=nominal)
-
-
 def _limits(problem: ContinuousTracking) -> FloatArray:
     return limits_of(problem.limits, problem.nominal.u.control.shape[2])
 
@@ -168,7 +164,7 @@ def _finer(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
     chosen = halved(last.setting, last.refusal, nearby) if last.cause in FINER else None
     if chosen is None:
         return None
-    return prepare(_with(problem, motion_of(last.setting).halved(chosen)))
+    return prepare(replace(problem, nominal=motion_of(last.setting).halved(chosen)))
 
 
 def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
@@ -188,7 +184,7 @@ def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
         more = int(found.coarse.sum())
         if problem.policy is not None or not more or len(setting.policy.t) + more > MOST_KNOTS:
             return None
-        setting = prepare(_with(problem, motion_of(setting).halved(found.coarse)))
+        setting = prepare(replace(problem, nominal=motion_of(setting).halved(found.coarse)))
     return None
 
 
@@ -200,4 +196,4 @@ def _weighed(problem: ContinuousTracking, factor: float, tried: list[Tried]) -> 
 
 def _saturated(problem: ContinuousTracking, tried: list[Tried]) -> Setting:
     """With every mode of its inputs, around the motion as it was given."""
-    return prepare(_with(problem, motion_of(tried[0].setting)), saturated=True)
+    return prepare(replace(problem, nominal=motion_of(tried[0].setting)), saturated=True)

@@ -143,11 +143,19 @@ def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
 
 
 def _in_use(setting: Setting) -> str:
-    """The weights of a policy, which the advice of a refusal compares with."""
+    """The weights of a policy, which the advice of a refusal compares with; what it cannot move."""
     named = zip("QR", setting.weights, strict=True)
     rows = [
         f"{name} is ({', '.join(f'{entry:.3g}' for entry in np.diag(M).tolist())})"
         for name, M in named
         if len(M)
     ]
-    return f"The diagonal of {' and of '.join(rows)}"
+    field, policy = setting.steps.field, setting.policy
+    slopes = [field.jacobians(t, policy.x(t), policy.u(t)) for t in policy.t.tolist()]
+    A, B = (sum(np.abs(part) for part in parts) for parts in zip(*slopes, strict=True))
+    moved = np.any(B, axis=1)
+    for _ in moved:
+        moved = moved | (A @ moved > 0)
+    fixed = ", ".join(f"x{i}" for i in np.flatnonzero(~moved).tolist() if moved.any())
+    said = f". No input moves {fixed}, through no other state either: uncontrollable"
+    return f"The diagonal of {' and of '.join(rows)}{said if fixed else ''}"

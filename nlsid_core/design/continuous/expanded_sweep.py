@@ -55,8 +55,7 @@ def swept(
     steps, policy = setting.steps, setting.policy
     if setting.expansion is not None:
         return sweep_expanded(setting, wanted, most_back=most_back, progress=progress)
-    pairs = sections(steps, policy, setting.P)
-    return Swept(setting, *sweep_rho(steps, pairs, wanted, progress))
+    return Swept(setting, *sweep_rho(steps, sections(steps, policy, setting.P), wanted, progress))
 
 
 def sweep_expanded(
@@ -117,11 +116,15 @@ def _expanded(
     levels: a guess of it, ρ at the interval's end, and what it is below. The box is first larger
     than the guess, until it holds what is found; then once as large as that.
     """
-    steps, policy, P = setting.steps, setting.policy, setting.P
+    steps, policy, P, expansion = setting.steps, setting.policy, setting.P, setting.expansion
+    assert expansion is not None  # as in `sweep_expanded`
     guess, after, cap = levels
     box, last = min(LARGER * guess, cap), False
     while True:
-        if not _expand(setting, k, (box, after)):
+        held = None if steps.widths is None else steps.widths[k]
+        try:
+            steps.local[k] = expansion.around(policy, P, k, (box, after), held)
+        except NoExpansion:
             box, cap = box / 2, box / 2
             continue
         shares = (0.0, 0.5, 1.0) if last else (0.0, 1.0)
@@ -138,18 +141,6 @@ def _expanded(
         last = rho < box or box >= cap
         box = min(CLOSE * rho if last else LARGER * box, cap)
         duals = found.start
-
-
-def _expand(setting: Setting, k: int, levels: tuple[float, float]) -> bool:
-    """Take the cubics around the funnel with these ρ at the ends; False if there are none."""
-    steps, expansion = setting.steps, setting.expansion
-    assert expansion is not None  # as in `sweep_expanded`
-    held = None if steps.widths is None else steps.widths[k]
-    try:
-        steps.local[k] = expansion.around(setting.policy, setting.P, k, levels, held)
-    except NoExpansion:
-        return False
-    return True
 
 
 def with_field(setting: Setting) -> Setting:
