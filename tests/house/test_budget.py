@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 11_966,
     ("nlsid_ros",): 2_679,
-    ("tests",): 23_181,
+    ("tests",): 23_254,
     ("benchmarks", "examples"): 3_799,
 }
 ARGUMENTS, FIELDS = 6, 8
