@@ -38,7 +38,6 @@ from nlsid_core.progress import Progress, silent
 REPORT_EVERY: Final = 1000  # messages between two reports of progress
 SINCE_1970: Final = 1e8  # s, three years: a larger number is no time since the first message
 STORAGES: Final = ("mcap", "sqlite3", "ros1")
-LEFT_OUT: Final = "sequence numbers, times of publishing, attachments and metadata records"
 
 
 @dataclass
@@ -124,7 +123,10 @@ def convert(
             said = "".join(f"; {note}" for note in copied.notes[:5])
             raise BagError(f"{bags[0].path}: no message can be read there{said}")
     if into.storage != "mcap":
-        copied.notes.append(f"{into.storage} keeps no {LEFT_OUT}")
+        copied.notes.append(
+            f"{into.storage} keeps no sequence numbers, times of publishing, attachments and "
+            "metadata records"
+        )
     copied.parts = parts.paths
     return copied
 

@@ -76,7 +76,12 @@ def export_topics(
     Raises:
         BagError: as `read_signals` for damage, if there is nothing to export, and if `out` exists.
     """
-    out = _new(out, form)
+    if form not in FORMATS:
+        raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
+    if form == "parquet" and find_spec("pyarrow") is None:
+        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv")
+    out = Path(out)
+    refuse_existing(out)
     writer = _Csv if form == "csv" else _Parquet
     left_out: list[str] = []
     wanted = _wanted(bag, signals, left_out)
@@ -307,16 +312,6 @@ def _plain(value: Any) -> Any:
         names = [name for name in vars(value) if name != "__msgtype__"]
         return {name: _plain(getattr(value, name)) for name in names}
     return value
-
-
-def _new(out: Path | str, form: str) -> Path:
-    """The place to write to; BagError if something is there, or for an unknown format."""
-    if form not in FORMATS:
-        raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
-    if form == "parquet" and find_spec("pyarrow") is None:
-        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv")
-    refuse_existing(Path(out))
-    return Path(out)
 
 
 @contextmanager
