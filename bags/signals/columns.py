@@ -6,25 +6,18 @@ together. Memory: one chunk and its index, and what is returned.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, Numbers, Step, UnreadableMessageError
+from bags.recordings.cdr import STAMP, Gatherer, Numbers, Step, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
-
-STAMP: Final = (
-    (Step("header"), Step("stamp"), Step("sec")),
-    (Step("header"), Step("stamp"), Step("nanosec")),
-)
-MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +92,27 @@ def read_columns(
     """
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
+        check_path(bag, signal)
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
-    growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
+    parts: dict[str, list[Columns]] = {topic: [] for topic in topics}
+    orders = {topic: LogOrder() for topic in topics}
     for channel, batch in bag.batches(list(readers), progress=progress):
-        growing[channel.topic].append(channel.key, readers[channel.topic].read(batch))
-    return {topic: growing.pop(topic).columns() for topic in topics}
+        orders[channel.topic].add(channel.key, batch.log_ns)
+        parts[channel.topic].append(readers[channel.topic].read(batch))
+    return {
+        topic: replace(_numbers(parts.pop(topic) or [readers[topic].none]), back=order.back)
+        for topic, order in orders.items()
+    }
+
+
+def _numbers(parts: Sequence[Columns]) -> Columns:
+    """Floats by log time; the sort is stable, so equal log times stay as recorded."""
+    found = joined_columns(parts)
+    if (np.diff(found.log_ns) < 0).any():
+        found = found.select(np.argsort(found.log_ns, kind="stable"))
+    values = {n: v.astype(np.float64, copy=False) for n, v in found.values.items()}
+    return replace(found, values=values)
 
 
 def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
@@ -115,7 +123,7 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
     expanded: list[SignalPath] = []
     for path in paths:
         msgtype, types = bag.types_on(path.topic)
-        _check(bag, path)
+        check_path(bag, path)
         if not path.every:
             expanded.append(path)
             continue
@@ -127,12 +135,10 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
 
 
 class TopicReader:
-    """Turns batches of one topic into columns; BagError for signals that are not on it."""
+    """Turns batches of one topic into columns; the signals are known to be on it."""
 
     def __init__(self, bag: Bag, topic: str, signals: Mapping[str, SignalPath]) -> None:
         msgtype, types = bag.types_on(topic)
-        for signal in signals.values():
-            _check(bag, signal)
         self._where = f"{bag.path}: {topic}"
         self._topic = topic
         self._signals = signals
@@ -143,6 +149,14 @@ class TopicReader:
         targets: list[tuple[Step, ...]] = list(STAMP) if self._stamped else []
         targets += [target for group in self._targets.values() for target in group]
         self._gatherer = Gatherer(msgtype, types, targets)
+
+    @property
+    def none(self) -> Columns:
+        """The columns of no message."""
+        empty = np.empty(0, np.int64)
+        stamps = empty if self._stamped else None
+        values = {name: np.empty(0) for name in self._signals}
+        return Columns(self._topic, empty, empty, stamps, values, empty)
 
     def read(self, batch: Batch) -> Columns:
         """The columns of a batch; BagError if a message cannot be read or an array changed."""
@@ -175,56 +189,10 @@ class TopicReader:
         return np.array(found)
 
 
-def _check(bag: Bag, path: SignalPath) -> None:
+def check_path(bag: Bag, path: SignalPath) -> None:
+    """Raise a BagError that names the bag unless its messages have a number at `path`."""
     try:
         path.check(*bag.types_on(path.topic))
     except BagError as error:
         message = str(error)
         raise BagError(message if str(bag.path) in message else f"{bag.path}: {error}") from error
-
-
-class _Growing:
-    """One topic's columns while they are read: memory for what the bag announces, within reason."""
-
-    def __init__(self, bag: Bag, topic: str, names: Sequence[str]) -> None:
-        announced = sum(channel.count for channel in bag.channels if channel.topic == topic)
-        capacity = min(announced, MAX_ANNOUNCED)
-        self._topic = topic
-        self._names = names
-        self._stamped = is_stamped(*bag.types_on(topic))
-        self._times = np.empty((4 if self._stamped else 3, capacity), dtype=np.int64)
-        self._values = np.empty((len(names), capacity))
-        self._length = 0
-        self._order = LogOrder()
-
-    def append(self, channel: int, part: Columns) -> None:
-        self._order.add(channel, part.log_ns)
-        start, self._length = self._length, self._length + len(part)
-        if self._length > self._times.shape[1]:
-            more = max(self._length, 2 * self._times.shape[1]) - start
-            self._times = np.pad(self._times[:, :start], ((0, 0), (0, more)))
-            self._values = np.pad(self._values[:, :start], ((0, 0), (0, more)))
-        here = slice(start, self._length)
-        self._times[0, here] = part.log_ns
-        self._times[1, here] = part.publish_ns
-        self._times[2, here] = part.sequence
-        if part.stamp_ns is not None:
-            self._times[3, here] = part.stamp_ns
-        for row, name in enumerate(self._names):
-            self._values[row, here] = part.values[name]
-
-    def columns(self) -> Columns:
-        """By log time; the sort is stable, so equal log times stay as recorded."""
-        times, values = self._times[:, : self._length], self._values[:, : self._length]
-        if (np.diff(times[0]) < 0).any():
-            order = np.argsort(times[0], kind="stable")
-            times, values = times[:, order], values[:, order]
-        return Columns(
-            self._topic,
-            times[0],
-            times[1],
-            times[3] if self._stamped else None,
-            dict(zip(self._names, values, strict=True)),
-            times[2],
-            self._order.back,
-        )

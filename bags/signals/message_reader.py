@@ -57,7 +57,7 @@ class _Laid:
         self._least = layout.end
         self._most = layout.end + PADDING if layout.whole else np.inf
         leaves = [
-            (target, at, np.dtype(group.kind), group.is_bool)
+            (target, at, np.dtype(group.kind.of), group.kind.is_bool)
             for group in layout.groups
             for target, at in zip(group.targets.tolist(), group.offsets.tolist(), strict=True)
         ]
