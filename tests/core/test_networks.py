@@ -266,7 +266,7 @@ def test_a_well_damped_loop_is_proved_as_it_is() -> None:
 
 @pytest.mark.slow
 def test_a_tube_of_many_maps_is_proved() -> None:
-    """Three maps, eight corners: one matrix stands for them in the search, the kernel decides all."""
+    """Three maps, eight corners: one matrix stands for them in the search; the kernel decides."""
     train = duffing.trials(AMPLITUDES)
     made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, stages=3))
     found = identify(train, made, comparators=())
