@@ -117,15 +117,13 @@ def info_json(info: BagInfo) -> str:
 
 
 def _topic(topic: TopicInfo) -> dict[str, object]:
-    offered = [profile.document() for profile in topic.offered]
-    said = None if topic.messages is None else asdict(topic.messages)
     return {
         "topic": topic.topic,
         "type": topic.msgtype,
         "count": topic.count,
         **asdict(topic.times),
-        "offered_qos_profiles": offered,
-        "messages": said,
+        "offered_qos_profiles": [profile.document() for profile in topic.offered],
+        "messages": None if topic.messages is None else asdict(topic.messages),
     }
 
 

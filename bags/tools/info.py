@@ -173,13 +173,15 @@ def bag_info(
                     said,
                 )
             )
-        made = {name: ", ".join(said) for name, said in bag.kinds.items()}
         return BagInfo(
             path=bag.path,
             files=len(bag.files),
             size=sum(file.stat().st_size for file in bag.files),
             ending=bag.ending,
-            made=made | {"ros_distro": bag.release},
+            made={
+                **{name: ", ".join(found_in) for name, found_in in bag.kinds.items()},
+                "ros_distro": bag.release,
+            },
             custom=bag.custom,
             topics=tuple(found),
             notes=(*bag.lost, *bag.disagreements),

@@ -49,8 +49,7 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -
         copied = convert([bag], out, nearly=True, progress=progress)
         statements, topics = bag.statements, bag.topics
     counts = {topic: copied.sums.get(topic, (0, 0))[0] for topic in topics}
-    lost = (*copied.notes, *_verify(out, copied.sums))
-    return Recovery(out, counts, lost, statements)
+    return Recovery(out, counts, (*copied.notes, *_verify(out, copied.sums)), statements)
 
 
 def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:

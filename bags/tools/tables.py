@@ -160,8 +160,9 @@ def frame(
     joined = frames[0]
     if period is not None:
         first, last = (end(f.index[k] for f in frames) for end, k in ((min, 0), (max, -1)))
-        grid = pandas.date_range(first, last, freq=pandas.Timedelta(period, "s"), name="time")
-        joined = pandas.DataFrame(index=grid)
+        joined = pandas.DataFrame(
+            index=pandas.date_range(first, last, freq=pandas.Timedelta(period, "s"), name="time")
+        )
     for other in frames[0 if period is not None else 1 :]:
         joined = pandas.merge_asof(joined, other, left_index=True, right_index=True)
     return joined
@@ -256,8 +257,9 @@ class _Topic:
         self._kind = kind = bag.types_on(topic)
         self._signals = columns
         self._decoded = {n: s.path for n, s in columns.items() if s.path.every}
-        flat = {name: s.path for name, s in columns.items() if name not in self._decoded}
-        self._reader = TopicReader(bag, topic, flat)
+        self._reader = TopicReader(
+            bag, topic, {n: s.path for n, s in columns.items() if n not in self._decoded}
+        )
         self._waiting: list[Columns] = []
         self._running: dict[str, Running] = {}
         for name, signal in columns.items():

@@ -11,8 +11,8 @@ import unicodedata
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
-from typing import Final, Generic, NamedTuple, TypeVar
+from itertools import pairwise
+from typing import Final, NamedTuple
 
 from nlsid_core.running.reading import cause
 
@@ -26,8 +26,6 @@ MOST_NODES: Final = 32
 LONGEST_TEXT: Final = 300  # characters of anything that came from outside
 WORDS: Final = ("inside", "warning", "unknown", "assumption violated", "outside")
 MONITORING: Final = ("margin", "assumption", "time_to_exit", "latency")
-
-Item = TypeVar("Item")
 
 
 class Sample(NamedTuple):
@@ -78,36 +76,17 @@ class Verdict:
     text: str
 
 
-class _Feed(Generic[Item]):
-    """The newest of what comes, and how much has come."""
-
-    def __init__(self, most: int) -> None:
-        self._items: deque[Item] = deque(maxlen=most)
-        self._count = 0
-
-    @property
-    def newest(self) -> Item | None:
-        return self._items[-1] if self._items else None
-
-    def add(self, item: Item) -> None:
-        self._items.append(item)
-        self._count += 1
-
-    def after(self, seen: int) -> tuple[int, list[Item]]:
-        """How many have come, and those after the first `seen` ones that are still kept."""
-        fresh = islice(reversed(self._items), self._count - seen)
-        return self._count, list(fresh)[::-1]
-
-
 class Scene:
     """Thread-safe. source: what is watched, in words; monitor: the node whose word counts."""
 
     def __init__(self, source: str, monitor: str) -> None:
         self.source, self.monitor = clean(source), clean(monitor)
         self._lock = threading.Lock()
-        self._samples = _Feed[Sample](MOST_SAMPLES)
-        self._forecasts = _Feed[Sample](MOST_FORECASTS)
-        self._events = _Feed[Event](MOST_EVENTS)
+        self._samples: deque[Sample] = deque(maxlen=MOST_SAMPLES)
+        self._forecasts: deque[Sample] = deque(maxlen=MOST_FORECASTS)
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        # How many samples, forecasts and events there have been.
+        self._sampled = self._foreseen = self._told = 0
         self._nodes: dict[str, Said] = {}
         self._names: tuple[str, ...] = ()
         self._ended = ""
@@ -115,17 +94,20 @@ class Scene:
     def sample(self, stamp_ns: int, numbers: Mapping[str, float]) -> None:
         """A sample was judged."""
         with self._lock:
-            self._samples.add(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+            self._samples.append(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+            self._sampled += 1
 
     def forecast(self, stamp_ns: int, numbers: Mapping[str, float]) -> None:
         """Said of a sample that has not come yet."""
         with self._lock:
-            self._forecasts.add(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+            self._forecasts.append(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+            self._foreseen += 1
 
     def forecasts_after(self, seen: int) -> tuple[int, list[Sample]]:
         """How many there have been, and those after the first `seen` ones that are still kept."""
         with self._lock:
-            return self._forecasts.after(seen)
+            fresh = min(self._foreseen - seen, len(self._forecasts))
+            return self._foreseen, list(self._forecasts)[len(self._forecasts) - fresh :]
 
     def say(
         self, stamp_ns: int, node: str, level: int, text: str, *, names: Sequence[str] = ()
@@ -140,7 +122,8 @@ class Scene:
             if node == self.monitor and names:
                 self._names = tuple(clean(name) for name in names)
             if before is None or (before.level, cause(before.text)) != (level, cause(text)):
-                self._events.add(Event(stamp_ns, level, node, text))
+                self._events.append(Event(stamp_ns, level, node, text))
+                self._told += 1
 
     def end(self, verdict: str) -> None:
         """Nothing more comes: the recording is over."""
@@ -164,20 +147,22 @@ class Scene:
         At most `most`: of each of as many equal parts the one with the least margin.
         """
         with self._lock:
-            count, fresh = self._samples.after(seen)
-        return count, _worst_of_each(fresh, most)
+            fresh = min(self._sampled - seen, len(self._samples))
+            new = [self._samples[i] for i in range(len(self._samples) - fresh, len(self._samples))]
+            return self._sampled, _worst_of_each(new, most)
 
     def events_after(self, seen: int) -> tuple[int, list[Event]]:
         """How many there have been, and those after the first `seen` ones that are still kept."""
         with self._lock:
-            return self._events.after(seen)
+            fresh = min(self._told - seen, len(self._events))
+            return self._told, list(self._events)[len(self._events) - fresh :]
 
     def verdict(self) -> Verdict:
         """The monitor's word while it is fresh; otherwise why it does not count any more."""
         now = time.monotonic()
         with self._lock:
             said = self._nodes.get(self.monitor)
-            newest = self._samples.newest
+            newest = self._samples[-1] if self._samples else None
             ended = self._ended
         if ended:
             return Verdict("recording over", STALE, ended)
