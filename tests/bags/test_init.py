@@ -507,7 +507,9 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
     u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
     assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
     said = nlsid("init", tmp_path, tmp_path / "a", tmp_path / "b", "-u", u, "-y", y)
-    promised = re.search(r"of ([0-9.]+) to ([0-9.]+) % on stretches of time .*: good", said)
+    promised = re.search(
+        r"of ([0-9.]+) to ([0-9.]+) % on stretches of the only excitation .*: good", said
+    )
     assert promised
     assert float(promised[1]) < float(promised[2]) < 2.0
     assert "if a trial begins near half a turn" in said
