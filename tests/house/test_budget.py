@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_830,
+    ("nlsid_core",): 18_831,
     ("bags",): 12_002,
     ("nlsid_ros",): 2_676,
     ("tests",): 23_295,
