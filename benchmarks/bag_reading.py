@@ -1,4 +1,4 @@
-"""Reading selected numbers out of a large bag: messages per second and memory.
+"""Reading a large bag: messages per second and memory, beside peers.
 
 python -m benchmarks.bag_reading [--json] [--messages 2000000] [--data DIR]
 
@@ -7,7 +7,8 @@ generated once and kept in a cache folder, which is printed; one that is in DIR 
 Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
 deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
-machine does not count; the memory is that process's.
+machine does not count; the memory is that process's. Likewise `nlsid bag info` of the whole bag;
+and of one of FRAMED messages a DataFrame, as rosbags-dataframe makes it.
 """
 
 import os
@@ -15,9 +16,11 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import multiprocessing
+import re
 import resource
 import statistics
-import time
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from itertools import cycle, islice
@@ -29,11 +32,13 @@ import numpy as np
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
+from bags.tools.tables import frame
 from benchmarks.cache import cache_folder
 from benchmarks.machine import parser, peers, tell
 
 MESSAGES: Final = 2_000_000
 SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
+FRAMED: Final = 300_000  # messages of the bag that is put into frames
 REPEATS: Final = 3
 JOINTS, ODOM, IMU = "/joint_states", "/odom", "/imu"
 TYPES: Final = {
@@ -78,9 +83,9 @@ def _messages() -> Iterator[tuple[str, bytes]]:
     for k, topic in enumerate(cycle(TYPES)):
         data = templates[topic]
         data[4:12] = np.array(divmod(START_NS + k * PERIOD_NS, 10**9), "<u4").tobytes()
-        for place, numbers in places[topic]:
-            noise = rng.standard_normal(numbers).round(4)
-            data[place : place + 8 * numbers] = noise.tobytes()
+        noise = rng.standard_normal(len(places[topic])).round(4)
+        for place, number in zip(places[topic], noise, strict=True):
+            data[place : place + 8] = number.tobytes()
         yield topic, bytes(data)
 
 
@@ -111,18 +116,9 @@ def _template(topic: str) -> bytes:
     return bytes(standard_types().serialize_cdr(message, TYPES[topic]))
 
 
-def _noisy_places(data: bytes) -> list[tuple[int, int]]:
-    """(offset, numbers) of the runs of ones in a template: what a sensor would have measured."""
-    one = np.ones(1).tobytes()
-    runs: list[tuple[int, int]] = []
-    at = data.find(one)
-    while at >= 0:
-        if runs and runs[-1][0] + 8 * runs[-1][1] == at:
-            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
-        else:
-            runs.append((at, 1))
-        at = data.find(one, at + 8)
-    return runs
+def _noisy_places(data: bytes) -> list[int]:
+    """Where the ones are in a template: what a sensor would have measured."""
+    return [found.start() for found in re.finditer(re.escape(np.ones(1).tobytes()), data)]
 
 
 def read_ours(bag: Path, _messages: int) -> int:
@@ -178,10 +174,32 @@ def _take(decoded: Iterator[tuple[str, Any]], messages: int) -> int:
     return done
 
 
+def info(bag: Path, messages: int) -> int:
+    """The whole command line, as a person runs it."""
+    command = [sys.executable, "-m", "bags.commands.cli", "bag", "info", "--json", str(bag)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return messages
+
+
+def framed(bag: Path, _messages: int) -> int:
+    """Every field of a topic."""
+    return len(frame(bag, [ODOM]))
+
+
+def framed_by_rosbags(bag: Path, _messages: int) -> int:
+    """Some numbers of the topic with rosbags-dataframe."""
+    from rosbags.dataframe import get_dataframe
+    from rosbags.highlevel import AnyReader
+
+    fields = [signal.partition(":")[2] for signal in SIGNALS if signal.startswith(ODOM)]
+    with AnyReader([bag]) as reader:
+        return len(get_dataframe(reader, ODOM, fields))
+
+
 def _timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[float, float]:
-    started = time.process_time()
+    started = sum(os.times()[:4])  # with the processes that it starts
     done = read(bag, messages)
-    seconds = time.process_time() - started
+    seconds = sum(os.times()[:4]) - started
     return done / seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -203,6 +221,8 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
             rates[name].append(rate)
             if name == "ours":
                 peaks.append(peak)
+    small = generated_bag(None, FRAMED)
+    frames = [timed(make, small, FRAMED)[0] for make in (framed, framed_by_rosbags)]
     median = {name: statistics.median(found) for name, found in rates.items()}
     return {
         "messages_per_s": median["ours"],
@@ -211,6 +231,8 @@ def measure(bag: Path, messages: int) -> dict[str, float]:
         "ratio_mcap_ros2": median["ours"] / median["mcap_ros2"],
         "ratio_rosbags": median["ours"] / median["rosbags"],
         "peak_mb": max(peaks),
+        "info_s": messages / timed(info, bag, messages)[0],
+        "frame_ratio_rosbags_dataframe": frames[0] / frames[1],
         "bag_mb": sum(file.stat().st_size for file in bag.iterdir()) / 1e6,
     }
 
@@ -224,7 +246,10 @@ def main() -> None:
     bag = generated_bag(arguments.data, arguments.messages)
     print(f"reading {len(SIGNALS)} numbers of {arguments.messages} messages in {bag}")
     keys = measure(bag, arguments.messages)
-    tell(keys | peers("mcap-ros2-support", "rosbags"), as_json=arguments.json)
+    tell(
+        keys | peers("mcap", "mcap-ros2-support", "rosbags", "rosbags-dataframe"),
+        as_json=arguments.json,
+    )
 
 
 if __name__ == "__main__":

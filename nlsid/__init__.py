@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
     from bags.signals.sampling import Grid
+    from bags.tools.tables import frame
     from nlsid_core.data.trajectory import Dataset, Trajectory
     from nlsid_core.design import (
         ContinuousTracking,
@@ -79,6 +80,7 @@ __all__ = [
     "compose_funnels",
     "design",
     "f1tenth",
+    "frame",
     "identify",
     "integrate_nominal",
     "load",
@@ -103,6 +105,7 @@ _HOMES: Final = {
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),
+    "bags.tools.tables": ("frame",),
     "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
     "nlsid_core.models": ("Signal",),
     "nlsid_core.identification": ("identify", "Fit", *_FAMILIES, *_METHODS),

@@ -10,8 +10,8 @@ import numpy as np
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
-from bags.tools.copying import Copied
-from bags.tools.edit import convert, stretch
+from bags.tools.convert import Copied, convert
+from bags.tools.copies import Into, What
 from nlsid_core.arrays import FloatArray
 
 START_NS = 1_700_000_000_000_000_000
@@ -112,8 +112,8 @@ def number_bag(path: Path, values: Mapping[str, FloatArray], *, period: float) -
     return path
 
 
-def converted(out: Path, *bags: Path, start: float = 0.0) -> Copied:
-    """A new bag of what was logged from `start` s on."""
+def converted(out: Path, *bags: Path, what: What | None = None, into: Into | None = None) -> Copied:
+    """New bags of what is chosen of these."""
     with ExitStack() as stack:
         opened = [stack.enter_context(Bag(bag)) for bag in bags]
-        return convert(opened, [stretch(opened, out, start, None)])
+        return convert(opened, out, what, into)

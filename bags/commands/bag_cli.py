@@ -4,7 +4,6 @@ A command imports what it runs when it is called.
 """
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +21,7 @@ from bags.commands.options import (
     flat,
 )
 from bags.commands.progress import progress_bar
+from bags.tools.copies import Into, Rows, What
 from nlsid_core.errors import BagError, DataError
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
 PICTURE = Path("signals.png")
-PROGRESS_AFTER = 2.0  # s of work before a progress bar appears
 
 bag_app = typer.Typer(
     name="bag",
@@ -41,13 +40,6 @@ bag_app = typer.Typer(
 )
 out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
 err = Console(stderr=True)
-
-
-class Format(StrEnum):
-    """What a table is written as."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
@@ -71,25 +63,32 @@ class Source:
     ] = False
 
 
-@dataclass(frozen=True)
-class Timed(Source):
-    """The same, by which stamps."""
-
-    clock: ClockOption = Clock.HEADER
-
-
 @bag_app.command()
 def info(
-    bags: BagsArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
+    bags: BagsArgument,
+    messages: Annotated[
+        bool,
+        typer.Option("--messages", help="Read every message too: clocks, stamps, losses, sizes."),
+    ] = False,
+    definitions: DefinitionsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Show topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
+    """Show when and how a bag was recorded, and of each topic type, count, rate, jitter and gaps.
+
+    They are read from the bag's indexes.
+    """
     from bags.commands import bag_show
     from bags.recordings.folders import expand_bags
     from bags.tools.info import bag_info
 
     for path in expand_bags(bags):
-        with progress_bar("reading", after=PROGRESS_AFTER) as progress:
-            found = bag_info(path, definitions=_definitions(definitions), progress=progress)
+        with progress_bar("reading") as progress:
+            found = bag_info(
+                path,
+                messages=messages,
+                definitions=_definitions(definitions),
+                progress=progress,
+            )
         if as_json:
             typer.echo(bag_show.info_json(found))
         else:
@@ -110,7 +109,7 @@ def signals(
 
     with (
         Bag(bag, unfinished=True, definitions=_definitions(definitions)) as source,
-        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+        progress_bar("reading") as progress,
     ):
         found = bag_signals(source, progress=progress)
     if as_json:
@@ -123,9 +122,10 @@ def signals(
 @flat
 def plot(
     bag: BagArgument,
-    source: Timed,
+    source: Source,
     signals: SignalsOption = None,
-    picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")] = PICTURE,
+    clock: ClockOption = Clock.HEADER,
+    picture: Annotated[Path, typer.Option("--out", help="A .png or .svg file.")] = PICTURE,
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.report import report_available
@@ -137,13 +137,13 @@ def plot(
     from bags.pictures.signal_plots import draw_signals, write_picture
 
     drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
-    texts = [Grid(clock=source.clock.value).path(text, response=True) for text in drawn]
+    texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
     with (
         _opened(bag, source) as opened,
-        progress_bar("reading", after=PROGRESS_AFTER) as progress,
+        progress_bar("reading") as progress,
     ):
         samples = read_signals(opened, texts, progress=progress)
-    write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
+    write_picture(picture, draw_signals(list(samples.values()), title=str(bag)))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
 
 
@@ -191,7 +191,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
     """
     from bags.tools.recover import recover
 
-    with progress_bar("recovering", after=PROGRESS_AFTER) as progress:
+    with progress_bar("recovering") as progress:
         found = recover(bag, bag_out or _beside(bag, "recovered"), progress=progress)
     for topic, count in found.counts.items():
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
@@ -220,22 +220,25 @@ def export_command(
     bag: BagArgument,
     source: Source,
     target: OutOption = None,
-    form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
+    form: Annotated[str, typer.Option("--format", "-f", help="csv or parquet.")] = "csv",
     signals: Annotated[
-        list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
+        list[str] | None,
+        typer.Option("--signal", "-s", help="Signals, or topics; default: every field of all."),
     ] = None,
 ) -> None:
-    """Write signals as CSV or Parquet, a table per topic in the folder BAG_tables."""
-    from bags.tools.export import export_topics
+    """Write topics as CSV or Parquet, a table of each in the folder BAG_tables.
+
+    Fields keep their types; an array is a list, and `-s '/joints:position[*]'` a column for each
+    element.
+    """
+    from bags.tools.tables import export_topics
 
     target = target or _beside(bag, "tables")
     with (
         _opened(bag, source) as opened,
-        progress_bar("exporting", after=PROGRESS_AFTER) as progress,
+        progress_bar("exporting") as progress,
     ):
-        rows = export_topics(
-            opened, target, form=form.value, signals=signals or (), progress=progress
-        )
+        rows = export_topics(opened, target, form=form, signals=signals or (), progress=progress)
     for file, count in rows.counts.items():
         out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
     for what in rows.left_out:
@@ -243,82 +246,48 @@ def export_command(
     _say_notes(rows.notes)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Which part of a bag is copied, and into what it is cut."""
-
-    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0
-    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None
-    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None
-    every: Annotated[
-        float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
-    ] = None
-
-
-@bag_app.command()
+@bag_app.command("convert")
 @flat
-def convert(
+def convert_command(
     bags: BagsArgument,
-    stretch: Stretch,
+    what: What,
+    into: Into,
     source: Source,
     bag_out: OutOption = None,
 ) -> None:
-    """Copy bags into a new MCAP bag: a stretch of time, some topics, several as one, or in parts.
+    """Copy bags into a new bag, or parts: a stretch of time, some topics, several bags as one.
 
-    Several are merged by log time. Parts are OUT_01, OUT_02, ... The default of --out is
-    BAG_converted.
+    Several are merged by log time. The default of --out is BAG_converted.
     """
     from contextlib import ExitStack
 
     from bags.recordings.folders import expand_bags
-    from bags.tools import edit
+    from bags.tools.convert import convert
 
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
-    every = stretch.every
-    if every is not None and (stretch.start or stretch.end is not None):
-        raise DataError("take the stretch first (--start, --end), then cut that into parts")
     with ExitStack() as stack:
         opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
-        if every is not None:
-            parts = edit.parts_every(opened, target, every)
-        else:
-            parts = [edit.stretch(opened, target, stretch.start, stretch.end)]
-        progress = stack.enter_context(progress_bar("copying", after=PROGRESS_AFTER))
-        copied = edit.convert(opened, parts, topics=stretch.topics or (), progress=progress)
+        progress = stack.enter_context(progress_bar("copying"))
+        copied = convert(opened, target, what, into, progress=progress)
     for part in copied.parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
     out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
     _say_notes(copied.notes)
 
 
-@dataclass(frozen=True)
-class TableRows:
-    """When the rows of tables were."""
-
-    period: Annotated[float | None, typer.Option(help="s between rows.")] = None
-    time_column: Annotated[
-        str | None, typer.Option("--time", help="The column with the rows' times in s.")
-    ] = None
-    drop_repeats: Annotated[
-        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
-    ] = False
-    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0
-
-
 @bag_app.command("import")
 @flat
 def import_command(
     table: Annotated[Path, typer.Argument(help="A CSV file.")],
-    given: TableRows,
+    rows: Rows,
     bag_out: OutOption = None,
     assignments: Annotated[
         list[str] | None,
         typer.Option(
             "--signal",
             "-s",
-            help="signal=column: /joints:position[name=elbow]=angle; default: every column "
-            "as a number on a topic of its name.",
+            help="signal=column: /joints:position[name=elbow]=angle; repeat.",
         ),
     ] = None,
     types: Annotated[
@@ -330,32 +299,20 @@ def import_command(
     ] = None,
 ) -> None:
     """Write columns of a table as a bag of standard messages, named as the table."""
-    from bags.tools.importing import Rows, every_column, import_table, said_units
+    from bags.tools.importing import import_table
 
-    kinds = _pairs(types or (), "--type")
     bag_out = bag_out or Path(table.stem)
-    rows = Rows(given.period, given.time_column, given.drop_repeats, round(given.start * 1e9))
-    if not assignments:
-        rows, assignments, numbers = every_column(table, rows)
-        kinds = numbers | kinds
     imported = import_table(
         table,
         bag_out,
-        assignments,
-        types=kinds,
+        assignments or (),
+        types=_pairs(types or (), "--type"),
         rows=rows,
         custom=_pairs(custom or (), "--custom"),
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
     out.print(imported.times, soft_wrap=True, markup=False)
-    if units := said_units(assignments, kinds):
-        out.print(
-            f"units by the message types, not by the table: {units}; where a column is in another, "
-            "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
-            soft_wrap=True,
-            markup=False,
-        )
 
 
 def _say_notes(notes: "Sequence[str]") -> None:

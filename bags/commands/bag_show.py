@@ -1,39 +1,40 @@
 """What `nlsid bag` prints."""
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bags.tools.fitness import Fitness, Level
-from bags.tools.info import BagInfo, TopicInfo
-from bags.tools.listing import Listed
+if TYPE_CHECKING:
+    from bags.tools.fitness import Fitness
+    from bags.tools.info import BagInfo, Messages, TopicInfo
+    from bags.tools.listing import Listed
 
-WORDS = {Level.GOOD: "good", Level.LOOK: "look", Level.BAD: "bad"}
-STYLES = {Level.GOOD: "green", Level.LOOK: "dark_orange3", Level.BAD: "red"}
-VERDICTS = {
-    Level.GOOD: "fit for identification",
-    Level.LOOK: "usable, with care",
-    Level.BAD: "not fit for identification",
-}
-JITTER_KEY = "jitter: intervals of <0.5 0.5 0.8 0.95 1.05 1.25 2 >5 times the median"
+WORDS = ("good", "look", "bad")  # of the levels of a finding
+STYLES = ("green", "dark_orange3", "red")
+VERDICTS = ("fit for identification", "usable, with care", "not fit for identification")
 
 
 def show_info(console: Console, info: BagInfo) -> None:
     """The bag in a line, its state, its topics in a table, and what is odd about them."""
     files = f"{info.files} file{'s' if info.files != 1 else ''}"
-    console.print(
+    first_ns, last_ns = info.span_ns
+    _say(
+        console,
         f"{info.path}: {info.messages} messages on {len(info.topics)} topics, "
-        f"{info.duration:.3f} s, {files}, {info.size / 1e6:.2f} MB",
-        soft_wrap=True,
-        markup=False,
-        highlight=False,
+        f"{(last_ns - first_ns) / 1e9:.3f} s, {files}, {_size(info.size)}",
     )
+    if info.messages:
+        _say(console, f"from {_date(first_ns)} to {_date(last_ns)} UTC")
+    _say(console, ", ".join(f"{name} {said}" for name, said in info.made.items() if said))
     if info.ending is not None:
         _say(console, f"unfinished: {info.ending}; `nlsid bag recover` makes a whole bag of it")
     for note in info.notes:
@@ -43,28 +44,38 @@ def show_info(console: Console, info: BagInfo) -> None:
         table.add_column(name, overflow="fold")
     for name in ("count", "rate", "jitter", "gaps", "longest", "size"):
         table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("offered")
     for topic in info.topics:
         table.add_row(
             Text(topic.topic),
             Text(topic.msgtype.replace("/msg/", "/")),
             str(topic.count),
             "-" if math.isnan(topic.times.rate) else f"{topic.times.rate:.4g} Hz",
-            topic.times.jitter,
+            "-" if math.isnan(topic.times.jitter) else f"{topic.times.jitter:.3g} s",
             str(topic.times.gaps) if topic.times.gaps else "-",
             "-" if math.isnan(topic.times.longest) else f"{topic.times.longest:.3g} s",
-            _size(topic.size),
+            "-" if topic.messages is None else _size(topic.messages.size),
+            "; ".join(f"{p.reliability} {p.durability}" for p in topic.offered) or "-",
         )
     console.print(table)
     for topic in info.topics:
-        if topic.stamps is not None and (clock := topic.stamps.clock) is not None:
-            latency, spread = 1e3 * clock.latency, 1e3 * clock.spread
-            said = f"{clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)"
-            _say(console, f"{topic.topic}: {said}")
-        for what in topic.odd:
+        for what in [] if topic.messages is None else _said_messages(topic.messages):
             _say(console, f"{topic.topic}: {what}")
     for key, value in info.custom.items():
         _say(console, f"{key}: {value}")
-    console.print(JITTER_KEY, style="dim", highlight=False)
+
+
+def _said_messages(found: Messages) -> list[str]:
+    """How the stamps go beside the log times, and what is odd."""
+    if found.stamps is None or (clock := found.stamps.clock) is None:
+        return found.odd
+    latency, spread = 1e3 * clock.latency, 1e3 * clock.spread
+    return [f"{clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)", *found.odd]
+
+
+def _date(stamp_ns: int) -> str:
+    """A time in UTC to the millisecond."""
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(" ", "milliseconds")[:23]
 
 
 def signals_table(found: Sequence[Listed]) -> Table:
@@ -86,13 +97,17 @@ def signals_table(found: Sequence[Listed]) -> Table:
 
 def info_json(info: BagInfo) -> str:
     """What `show_info` shows, as JSON; times in s, sizes in bytes, null where nothing is known."""
+    first_ns, last_ns = info.span_ns
     return _json(
         {
             "bag": str(info.path),
             "messages": info.messages,
-            "duration": info.duration,
+            "start_ns": first_ns,
+            "end_ns": last_ns,
+            "duration": (last_ns - first_ns) / 1e9,
             "files": info.files,
             "size": info.size,
+            **info.made,
             "unfinished": info.ending,
             "not_as_stated": list(info.notes),
             "custom": dict(info.custom),
@@ -102,23 +117,13 @@ def info_json(info: BagInfo) -> str:
 
 
 def _topic(topic: TopicInfo) -> dict[str, object]:
-    stamps = topic.stamps
     return {
         "topic": topic.topic,
         "type": topic.msgtype,
         "count": topic.count,
-        "size": topic.size,
-        "rate": topic.times.rate,
-        "gaps": topic.times.gaps,
-        "longest_interval": topic.times.longest,
-        "first_log_time_ns": topic.times.first_ns if topic.count else None,
-        "last_log_time_ns": topic.times.last_ns if topic.count else None,
-        "stamps_back": stamps.backward if stamps else 0,
-        "stamps_repeated": stamps.duplicates if stamps else 0,
-        "stamps_zero": stamps is not None and stamps.clock is None,
-        "missing": topic.missing,
-        "clock": asdict(stamps.clock) if stamps and stamps.clock else None,
-        "unreadable": topic.unreadable or None,
+        **asdict(topic.times),
+        "offered_qos_profiles": [profile.document() for profile in topic.offered],
+        "messages": None if topic.messages is None else asdict(topic.messages),
     }
 
 

@@ -261,7 +261,7 @@ def report(
             recordings = []
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
-                recordings.append(bag_info(bag, topics=topics))
+                recordings.append(bag_info(bag, topics=topics, messages=True))
         chosen = to_judge(design, folders)
         replays = show.replayed(design, chosen.judged, settings)
         held = recorded(recordings, replays, chosen.said)

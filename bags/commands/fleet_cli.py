@@ -151,15 +151,15 @@ def monitor(
 ) -> None:
     """Hold every bag against one proved design: which are inside, and what they spend.
 
-    How much of what is assumed each bag spends, the worst ten, what that says of the next bag, and
-    whether the newest month is like the calibration. Status 0 if all are inside with the assumption
+    How much of what is assumed each bag spends, the worst ten, and what that says of the next bag.
+    Status 0 if all are inside with the assumption
     kept, 1 if one is not, 2 if one was not judged whole.
     """
     from bags.commands import show
     from bags.commands.progress import progress_bar
     from bags.designs import documents
     from bags.fleet.bags import COPY, named_bags
-    from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent
+    from bags.fleet.monitor import FleetVerdict, JudgeBag
     from bags.fleet.rows import read_rows, write_parquet
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
@@ -175,8 +175,7 @@ def monitor(
         read = read_rows(
             task, named, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
         )
-    calibration = calibration_spent(folder, design)
-    found = FleetVerdict(read.rows, calibration, frozenset(design.made_with))
+    found = FleetVerdict(read.rows, frozenset(design.made_with))
     if table is not None:
         write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
@@ -215,14 +214,6 @@ def _say_verdicts(found: FleetVerdict) -> None:
             "if they are here, read from elsewhere than for the design",
             soft_wrap=True,
         )
-    out.print(
-        str(
-            found.drift
-            or "drift is not judged: no calibration trials beside the funnel, or too few bags of "
-            "the newest month"
-        ),
-        soft_wrap=True,
-    )
     bad = {row.bag: _since(row) for row in found.rows if row.verdict in BROKEN}
     _say_bags("outside, or what is assumed broken", bad)
     for what, title in (

@@ -138,10 +138,12 @@ def flat(verb: Callable[..., None]) -> Callable[..., None]:
         kind = groups.get(given.name)
         types = hints if kind is None else get_type_hints(kind, include_extras=True)
         inside = [given] if kind is None else signature(kind).parameters.values()
-        parameters += [
-            each.replace(annotation=types[each.name], kind=Parameter.KEYWORD_ONLY)
-            for each in inside
-        ]
+        for each in inside:
+            kind_of = types[each.name]
+            for said in getattr(kind_of, "__metadata__", ()):
+                if isinstance(said, str):  # the help of an option that has nothing else
+                    kind_of = Annotated[kind_of.__origin__, typer.Option(help=said)]
+            parameters.append(each.replace(annotation=kind_of, kind=Parameter.KEYWORD_ONLY))
 
     @wraps(verb)
     def command(**values: Any) -> None:

@@ -6,7 +6,6 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 
 import base64
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -42,7 +41,6 @@ td code { white-space: normal }
   th, td:first-child, td[colspan] { white-space: normal }
   body { max-width: none; margin: 0; font-size: 11pt } }
 """
-ROBOT = re.compile(r"<h1>([^<]*): identified model</h1>")
 FUNNEL_CAPTION = "The funnel: the tube around the motion"
 PICTURES = {
     documents.FREE_RUN_PLOT: "The model in free run",
@@ -85,13 +83,12 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
         for k, (title, text) in enumerate(present)
     )
     name = escape(folder.resolve().name)
-    robot = _robot(folder / documents.REPORT) or name
     return f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{robot}: design</title>
+<html lang="en"><meta charset="utf-8"><title>{name}: design</title>
 <meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>{STYLE}{PRINT}</style>
-<h1>{robot}</h1>
+<h1>{name}</h1>
 <p class="note">Folder {name}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC, nlsid {version("nlsid")}</p>
 <nav>{links}</nav>
 {body}
@@ -122,14 +119,6 @@ def recorded(
         "Recordings held against the funnel": f"{said}{lines}{drawn}",
         "Recordings and their losses": html(say_losses),
     }
-
-
-def _robot(report: Path) -> str:
-    """What the configuration calls the robot, as the model's own page has it; or nothing."""
-    if not report.is_file():
-        return ""
-    found = ROBOT.search(report.read_text(encoding="utf-8", errors="replace"))
-    return found[1] if found else ""
 
 
 def _decided(path: Path) -> Verdict | str:

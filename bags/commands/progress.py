@@ -7,12 +7,14 @@ from contextlib import contextmanager
 
 from nlsid_core.progress import Progress
 
+PATIENCE = 1.0  # s
+
 
 @contextmanager
-def progress_bar(task: str, *, after: float = 0.0) -> Iterator[Progress]:
+def progress_bar(task: str) -> Iterator[Progress]:
     """Yield `progress(what, fraction)`; the bar disappears when the work is done.
 
-    It is shown only to a terminal. after: s of work before it appears.
+    It is shown only to a terminal, and only of work that takes longer than PATIENCE.
     """
     from rich.console import Console
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -25,12 +27,10 @@ def progress_bar(task: str, *, after: float = 0.0) -> Iterator[Progress]:
     identifier = bar.add_task(task, total=1.0)
 
     def show(what: str, fraction: float) -> None:
-        if time.monotonic() - started >= after:
+        if time.monotonic() - started >= PATIENCE:
             bar.start()
             bar.update(identifier, description=what, completed=fraction)
 
-    if after <= 0.0:
-        bar.start()
     try:
         yield show
     finally:

@@ -1,4 +1,4 @@
-"""Every bag of a fleet held against one design: who left it, when, and is the fleet what it was."""
+"""Every bag of a fleet held against one design: who left it, and when."""
 
 import hashlib
 import math
@@ -9,25 +9,16 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
-from scipy.stats import mannwhitneyu
-
-from bags.chain.training import load_held_back, load_training
-from bags.designs import documents
 from bags.fleet.rows import Row, iso
 from bags.monitoring.replay import Definitions, Replay, replay_bag
 from bags.recordings.definitions import texts_of
 from bags.signals.reader import bag_origin
 from nlsid_core import files
-from nlsid_core.data.calibration import recording
-from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.designs import AnyDesign
-from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading
 
 RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
-LEAST = 3  # bags of a month, and calibration trials, that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,38 +95,14 @@ def most_spent(readings: Sequence[Reading]) -> Reading | None:
     return max(measured, key=lambda reading: reading.assumption, default=None)
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Is the newest month what the calibration was? The rank test of Wilcoxon, Mann and Whitney of
-    what was spent, two-sided; a small p speaks against exchangeable ones, a large one for nothing.
-
-    larger: the part of pairs in which the month's bag spends more than the calibration trial.
-    """
-
-    month: str
-    bags: int
-    trials: int
-    p: float
-    larger: float
-
-    def __str__(self) -> str:
-        return (
-            f"drift: of {self.bags} bags of {self.month} and {self.trials} calibration trials, a "
-            f"bag spends more than a trial in {100 * self.larger:.0f} % of the pairs. Were they "
-            f"exchangeable, they would differ as much with p = {self.p:.2g} (rank test)"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class FleetVerdict:
     """What the rows of a fleet say together.
 
-    calibration: what each trial that scaled the design spent. made_of: digests of the recordings
-    that designed or scaled it.
+    made_of: digests of the recordings that designed or scaled the design.
     """
 
     rows: tuple[Row, ...]
-    calibration: tuple[float, ...]
     made_of: frozenset[str]
 
     @property
@@ -173,55 +140,6 @@ class FleetVerdict:
             f"with these {m}"
             for rank in ranks
         ]
-
-    @property
-    def drift(self) -> Drift | None:
-        """Of the newest month; None if it or the calibration has fewer than LEAST."""
-        month = max((row.start[:7] for row in self.others), default="")
-        newest = [row.numbers["spent"] for row in self.others if row.start.startswith(month)]
-        if not month or min(len(newest), len(self.calibration)) < LEAST:
-            return None
-        test = mannwhitneyu(newest, self.calibration, alternative="two-sided")
-        pairs = len(newest) * len(self.calibration)
-        return Drift(
-            month,
-            len(newest),
-            len(self.calibration),
-            float(test.pvalue),
-            float(test.statistic) / pairs,
-        )
-
-
-def calibration_spent(folder: Path, design: AnyDesign) -> tuple[float, ...]:
-    """What each trial that scaled the design spends of what it assumes; empty if none is there.
-
-    They are found by their digests in training.npz and held_back.npz in the design's folder.
-    """
-    if not isinstance(design.funnel, TubeFunnel):
-        return ()
-    wanted = {digest for _, digest in design.funnel.tubes[0].measured_on}
-    training = folder / documents.TRAINING
-    digest = files.digest(design.model.document())
-    held_back = load_held_back(folder / documents.HELD_BACK, model=digest)
-    trials: list[Trajectory] = [trial for data in held_back.values() for trial in data]
-    if training.exists():
-        trials += load_training(training, digest=design.model.training)
-    monitor = design.monitor(Centre.COMMAND)
-    own = [trial for trial in trials if recording(trial) in wanted]
-    most = [most_spent(_readings(monitor, trial)) for trial in own]
-    return tuple(reading.assumption for reading in most if reading is not None)
-
-
-def _readings(monitor: Monitor, trial: Trajectory) -> list[Reading]:
-    """What the monitor says of a trial, sample by sample, in a run of its own."""
-    monitor.restart()
-    single = trial.y.shape[1] == trial.u.shape[1] == 1
-    samples = zip(trial.t.tolist(), trial.y, trial.u, strict=True)
-    said = [
-        monitor.update(t, float(y[0]), float(u[0])) if single else monitor.update(t, y, u)
-        for t, y, u in samples
-    ]
-    return [reading for reading in said if reading.status is not Status.UNKNOWN]
 
 
 def in_percent(part: float) -> str:

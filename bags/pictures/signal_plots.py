@@ -1,6 +1,5 @@
 """Pictures of recorded signals (extra `report`: matplotlib)."""
 
-import html
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,20 +35,9 @@ def draw_signals(samples: Sequence[Samples], *, title: str) -> Figure:
     return figure
 
 
-def write_picture(path: Path | str, figure: Figure, *, title: str) -> None:
-    """A .png, .svg or .html file, by its ending; DataError for another one."""
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        content = png(figure)
-    elif suffix == ".svg":
-        content = svg(figure).encode()
-    elif suffix in (".html", ".htm"):
-        name = html.escape(title)
-        content = (
-            f"<!DOCTYPE html><html lang='en'><meta charset='utf-8'><title>{name}</title>"
-            f"<body>{svg(figure)}</body></html>\n"
-        ).encode()
-    else:
-        raise DataError(f"{path}: a picture is a .png, .svg or .html file")
-    write_atomically(path, content)
+def write_picture(path: Path | str, figure: Figure) -> None:
+    """A .png or .svg file, by its ending; DataError for another one."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".png", ".svg"):
+        raise DataError(f"{path}: a picture is a .png or .svg file")
+    write_atomically(Path(path), png(figure) if suffix == ".png" else svg(figure).encode())

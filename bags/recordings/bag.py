@@ -19,7 +19,8 @@ from bags.recordings.message_types import are_same, ros2_definition, types_in_ba
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.quality import Profile
 from bags.recordings.remote import place
-from bags.recordings.storage import Channel, Raw, Storage, defined
+from bags.recordings.storage import ALWAYS, Channel, Raw, Spans, Storage, defined
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
@@ -64,9 +65,8 @@ class Bag:
         if not self._described.finished:
             self.ending = f"it has no {METADATA}: the recording was not closed"
         self._storage = Storage(self.files, salvage=salvage)
-        release = self._described.release or self._storage.release
         self._storage.channels = [
-            defined(self._encoded(channel), definitions or {}, release)
+            defined(self._encoded(channel), definitions or {}, self.release)
             for channel in self._storage.channels
         ]
         if self._storage.ending is not None:  # of a bag that is one file that is said already
@@ -111,6 +111,16 @@ class Bag:
     def custom(self) -> dict[str, str]:
         """The bag's own metadata: `custom_data` of the MCAP files and, before it, metadata.yaml."""
         return {**self._storage.custom, **self._described.custom}
+
+    @property
+    def release(self) -> str:
+        """The release of ROS 2 that recorded it, as it says; empty if it does not."""
+        return self._described.release or self._storage.release
+
+    @property
+    def kinds(self) -> dict[str, list[str]]:
+        """`storage`: what its files are. `compression`: how their chunks are compressed."""
+        return self._storage.kinds
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -234,6 +244,11 @@ class Bag:
             done += len(batch)
             progress("reading", done / total)
 
+    def log_times(self, topics: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
+        """(topic, log times in ns) part by part; of MCAP from its indexes, without a message."""
+        for key, log_ns in self._storage.log_times(self._keys(topics)):
+            yield self.channels[key].topic, log_ns
+
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""
         order = LogOrder()
@@ -256,12 +271,19 @@ class Bag:
                 raise BagError(f"{self.path}: {channel.topic}: {raw.error}")
             yield Message(channel.topic, channel.msgtype, raw.log_ns, raw.data, raw.publish_ns)
 
-    def raws(self, topics: Sequence[str] | None = None, *, nearly: bool = False) -> Iterator[Raw]:
+    def raws(
+        self,
+        topics: Sequence[str] | None = None,
+        *,
+        nearly: bool = False,
+        spans: Spans = ALWAYS,
+    ) -> Iterator[Raw]:
         """As `messages`, with all that is recorded of them, and those that cannot be unpacked.
 
-        nearly: where more chunks overlap in time than memory is meant for, do not refuse.
+        nearly: where more chunks overlap in time than memory is meant for, do not refuse. spans:
+        only what was logged in one of them; nothing else is read.
         """
-        return self._storage.messages(self._keys(topics), nearly=nearly)
+        return self._storage.messages(self._keys(topics), nearly=nearly, spans=spans)
 
     def _keys(self, topics: Sequence[str] | None) -> list[int]:
         wanted = None if topics is None else set(topics)

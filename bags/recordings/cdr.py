@@ -12,6 +12,7 @@ four-byte encapsulation header.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import repeat
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from nlsid_core.errors import BagError
 
 NUMBERS: Final = {
     "bool": "u1",
-    "byte": "i1",
+    "byte": "u1",
     "char": "u1",
     "int8": "i1",
     "uint8": "u1",
@@ -73,14 +74,25 @@ class Step:
 
 
 Target = Sequence[Step]
+STAMP: Final = (
+    (Step("header"), Step("stamp"), Step("sec")),
+    (Step("header"), Step("stamp"), Step("nanosec")),
+)
 Numbers = NDArray[Any]  # (N,) of any type of number
+
+
+class Kind(NamedTuple):
+    """What a target is: a number of NumPy's type `of`, or an array of `length` of them."""
+
+    of: str
+    is_bool: bool
+    length: int | None = None
 
 
 class Group(NamedTuple):
     """Wanted numbers of one kind: which targets they are, and where they are in a message."""
 
-    kind: str
-    is_bool: bool
+    kind: Kind
     targets: IntArray
     offsets: IntArray
 
@@ -90,10 +102,12 @@ class Layout(NamedTuple):
 
     words: (W,) offsets of the lengths that another message must share, expected: (W,) what they
     are. spans: other bytes it must share, (offset, bytes). end: bytes it must at least have; with
-    `whole`, and PADDING at most more, because its last field was reached.
+    `whole`, and PADDING at most more, because its last field was reached. texts: targets that are
+    texts, which are among these bytes, and so the same in all.
     """
 
     groups: tuple[Group, ...]
+    texts: tuple[tuple[int, object], ...]
     words: IntArray
     expected: Any
     spans: tuple[tuple[int, bytes], ...]
@@ -184,12 +198,19 @@ class UnreadableMessageError(BagError):
 
 
 def _taken(layout: Layout, batch: Batch) -> list[Numbers]:
-    """The wanted numbers of messages of this layout, in the order of the targets."""
+    """What is wanted of messages of this layout, in the order of the targets."""
+    n = len(batch)
     columns: dict[int, Numbers] = {}
-    for kind, is_bool, targets, offsets in layout.groups:
-        found = _view(batch.buffer, kind)[offsets[:, None] + batch.start]
+    for (of, is_bool, length), targets, offsets in layout.groups:
+        places = offsets[:, None] + batch.start
+        if length is not None:
+            places = places[:, :, None] + np.dtype(of).itemsize * np.arange(length)
+        found = _view(batch.buffer, of)[places] if places.size else np.empty(places.shape, of)
         found = found != 0 if is_bool else found.astype(found.dtype.newbyteorder("="), copy=False)
-        columns.update(zip(targets.tolist(), found, strict=True))
+        for target, column in zip(targets.tolist(), found, strict=True):
+            columns[target] = column if length is None else np.fromiter(column, object, n)
+    for target, text in layout.texts:
+        columns[target] = np.fromiter(repeat(text, n), object, n)
     return [columns[target] for target in range(len(columns))]
 
 
@@ -219,6 +240,14 @@ def _view(buffer: Buffer, kind: str) -> Any:
     return np.ndarray((max(0, len(buffer) - dtype.itemsize + 1),), dtype, buffer, strides=(1,))
 
 
+def is_strings(description: FieldDesc) -> bool:
+    """Whether it is an array of strings."""
+    if description[0] not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return False
+    element: FieldDesc = description[1][0]
+    return element[0] == Nodetype.BASE and element[1][0] == "string"
+
+
 class _Walk:
     """One message, walked from its start as far as its layout matters."""
 
@@ -231,7 +260,8 @@ class _Walk:
         self._at = ENCAPSULATION
         self._words: list[int] = []
         self._spans = [(0, data[:2])]
-        self._leaves: list[tuple[int, str, bool] | None] = [None] * len(gatherer.targets)
+        self._leaves: dict[int, tuple[int, Kind]] = {}
+        self._texts: dict[int, object] = {}
         self._missing = len(gatherer.targets)
         self._steps = 0
 
@@ -245,18 +275,16 @@ class _Walk:
             )
         words = np.array(self._words, dtype=np.int64)
         expected = _view(self._data, "<u4")[words]
-        return Layout(self._groups(), words, expected, tuple(self._spans), self._at, whole)
+        texts = tuple(self._texts.items())
+        return Layout(self._groups(), texts, words, expected, tuple(self._spans), self._at, whole)
 
     def _groups(self) -> tuple[Group, ...]:
         """The leaves by kind, in the order of the targets."""
-        by_kind: dict[tuple[str, bool], list[tuple[int, int]]] = {}
-        for target, leaf in enumerate(self._leaves):
-            assert leaf is not None
-            offset, kind, is_bool = leaf
-            by_kind.setdefault((kind, is_bool), []).append((target, offset))
+        by_kind: dict[Kind, list[tuple[int, int]]] = {}
+        for target, (offset, kind) in self._leaves.items():
+            by_kind.setdefault(kind, []).append((target, offset))
         return tuple(
-            Group(self._order + kind, is_bool, *np.array(leaves, dtype=np.int64).T)
-            for (kind, is_bool), leaves in by_kind.items()
+            Group(kind, *np.array(leaves, dtype=np.int64).T) for kind, leaves in by_kind.items()
         )
 
     def _struct(self, msgtype: str, wanted: list[tuple[int, int]]) -> bool:
@@ -268,8 +296,13 @@ class _Walk:
             here = [(i, depth, hop) for i, depth, hop in hops if hop.field == name]
             if not self._missing and not self._of.is_static(description):
                 return False
-            if name in key_fields:
+            if name in key_fields or (here and is_strings(description)):
                 keys[name] = self._strings(description)
+                for i, _, hop in here:
+                    found: Any = keys[name]
+                    if hop.picks:
+                        found = found[self._place(hop, len(found), keys)]
+                    self._tell(i, found)
             elif not self._field(description, here, keys):
                 return False
         return True
@@ -287,7 +320,7 @@ class _Walk:
             return True
         element, length = description[1]
         count = int(str(length)) if description[0] == Nodetype.ARRAY else self._word()
-        places: dict[int, list[tuple[int, int]]] = {}
+        places: dict[int | None, list[tuple[int, int]]] = {}
         for i, depth, hop in here:
             try:
                 place = self._place(hop, count, keys)
@@ -311,7 +344,8 @@ class _Walk:
             self._count_step()
         return True
 
-    def _place(self, hop: Step, count: int, keys: dict[str, list[str]]) -> int:
+    def _place(self, hop: Step, count: int, keys: dict[str, list[str]]) -> int | None:
+        """The element that is meant; None for the whole array."""
         if hop.length is not None and count != hop.length:
             raise BagError(
                 f"'{hop.field}' has {count} elements, the first message has {hop.length}"
@@ -323,18 +357,26 @@ class _Walk:
             if wanted not in there:
                 raise BagError(f"'{beside}' has no '{wanted}'; it has: {', '.join(there)}")
             place = there.index(wanted)
-        assert place is not None
-        if place >= count:
+        if place is not None and place >= count:
             raise BagError(f"'{hop.field}' has {count} elements")
         return place
 
     def _base(self, name: str, wanted: list[int]) -> None:
         if name == "string":
-            self._string()
+            text = self._string()
+            for i in wanted:
+                self._spans.append((self._at - len(text) - 1, text + b"\0"))
+                self._tell(i, text.decode("utf-8", "replace"))
             return
         self._numbers(name, 1, {0: [(i, 0) for i in wanted]})
 
-    def _numbers(self, name: str, count: int, places: dict[int, list[tuple[int, int]]]) -> None:
+    def _tell(self, target: int, text: object) -> None:
+        self._texts[target] = text
+        self._missing -= 1
+
+    def _numbers(
+        self, name: str, count: int, places: dict[int | None, list[tuple[int, int]]]
+    ) -> None:
         if name not in NUMBERS:
             raise BagError(f"a '{self._of.msgtype}' holds a {name}, which cannot be read")
         kind = NUMBERS[name]
@@ -342,8 +384,9 @@ class _Walk:
         if count:
             self._align(size)
         for place, wanted in places.items():
+            of = Kind(self._order + kind, name == "bool", count if place is None else None)
             for i, _ in wanted:
-                self._leaves[i] = (self._at + place * size, kind, name == "bool")
+                self._leaves[i] = (self._at + (place or 0) * size, of)
                 self._missing -= 1
         self._at += count * size
         self._check_end()
@@ -384,13 +427,10 @@ class _Walk:
 
     def _check_end(self) -> None:
         if self._at > len(self._data):
-            raise self._too_short()
-
-    def _too_short(self) -> BagError:
-        return BagError(
-            f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
-            f"one with its lengths has at least {self._at}"
-        )
+            raise BagError(
+                f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
+                f"one with its lengths has at least {self._at}"
+            )
 
     def _count_step(self) -> None:
         self._steps += 1

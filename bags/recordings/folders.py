@@ -4,7 +4,6 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -21,7 +20,6 @@ ACTIVE: Final = ".active"  # what ROS 1 calls a bag that is being recorded
 JOURNAL: Final = "-wal"  # what SQLite has not moved into a file yet
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
-MOST_LOOKED_AT: Final = 1000  # names, for bags that lie deeper than what was given
 MOST_PARTS: Final = 10_000  # of one recording; a greater number is a date
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 
@@ -75,7 +73,8 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
         )
         if not inside:
             raise BagError(
-                f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)}){_deeper(path)}"
+                f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)}); of folders "
+                f"in folders give a pattern, '{path}/*/*', in quotes"
             )
         found += inside
     return list(dict.fromkeys(found))
@@ -86,16 +85,6 @@ def _matches(path: Path) -> list[Path]:
     if not found:
         raise BagError(f"nothing matches {path}; name a rosbag2 folder or an .mcap file")
     return found
-
-
-def _deeper(folder: Path) -> str:
-    """That folders in it hold bags, as one pattern for those that lie as deep as the first."""
-    for stars in ("*", "*/*", "*/*/*"):
-        for path in islice(folder.glob(f"{stars}/*"), MOST_LOOKED_AT):
-            if path.suffix in DATA_FILES:
-                files = "" if _is_bag(path.parent) else f"/*{path.suffix}"
-                return f"; folders in it do: give the pattern '{folder}/{stars}{files}', in quotes"
-    return ""
 
 
 def trial_name(path: Path) -> str:

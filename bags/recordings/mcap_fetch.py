@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from bags.recordings.batch import Buffer
-from bags.recordings.mcap_records import Block, index_entries
+from bags.recordings.mcap_records import Block, index_offsets
 from bags.recordings.remote import GAP_BYTES, RemotePath
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
@@ -133,7 +133,7 @@ class Fetching:
         found: dict[int, IntArray] = {}
         for channel, (at, length) in (block.index or {}).items() if not block.compression else ():
             where = f"the message index at byte {at}"
-            listed = index_entries(self._path.read_range(at, at + length), channel, where)
+            listed = index_offsets(self._path.read_range(at, at + length), channel, where)
             if len(listed) and listed.max() >= block.size:
                 raise BagError(f"{where} points outside its chunk")
             found[channel] = listed

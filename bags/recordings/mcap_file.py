@@ -30,7 +30,8 @@ from bags.recordings.mcap_records import (
     Block,
     Contents,
     counted,
-    index_entries,
+    index_offsets,
+    index_times,
     messages_at,
     parse,
     rest_said,
@@ -173,7 +174,26 @@ class McapFile:
             return walk_chunk(content)[1]
         where = f"the message index of the chunk at byte {block.offset}"
         wanted = [c for c in channels if c in block.index]
-        return {c: index_entries(self._read(*block.index[c]), c, where) for c in wanted}
+        return {c: index_offsets(self._read(*block.index[c]), c, where) for c in wanted}
+
+    def log_times(self, channels: Collection[int]) -> Iterator[tuple[int, IntArray]]:
+        """Read (channel id, log times in ns), chunk by chunk, from indexes where there are some.
+
+        Raises BagError if an index, or a block without one, is damaged.
+        """
+        blocks = [block for block in self.contents.blocks if block.has(channels)]
+        if isinstance(self.path, RemotePath):
+            self.path.fetch((block.end, block.last) for block in blocks if block.index is not None)
+        for block in blocks:
+            if block.index is None:
+                yield from ((c, batch.log_ns) for c, batch in self._batches([block], channels))
+                continue
+            where = f"the message index of the chunk at byte {block.offset}"
+            indexes = self._read(block.end, block.last - block.end)
+            for channel in block.index.keys() & set(channels):
+                at, length = block.index[channel]
+                record = indexes[at - block.end :][:length]
+                yield channel, index_times(record, channel, where)
 
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""

@@ -24,6 +24,7 @@ from nlsid_core.errors import BagError
 MAGIC: Final = b"\x89MCAP0\r\n"
 CUSTOM_DATA: Final = "custom_data"  # the Metadata record with a bag's own key-value pairs
 ROSBAG2: Final = "rosbag2"  # the Metadata record that names the release of ROS 2
+NEVER: Final = 2**63 - 1  # ns: after every message
 MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message
 RECORD: Final = struct.Struct("<BQ")
 CHUNK_FIXED: Final = RECORD.size + 40  # of a chunk's record, before the name of its compression
@@ -48,8 +49,9 @@ Record = TypeVar("Record")
 class Block:
     """A chunk, or a run of records outside chunks, which reads like an uncompressed one.
 
-    offset, size: bytes of its content in the file. index: the channels that it has messages of, and
-    what finds them: in MCAP (offset, bytes) of the message index record in the file. None: unknown.
+    offset, size: bytes of its content in the file. start_ns, end_ns: no log time is outside.
+    index: the channels that it has messages of, and what finds them: in MCAP (offset, bytes) of the
+    message index record in the file. None: unknown.
     """
 
     offset: int
@@ -58,6 +60,7 @@ class Block:
     uncompressed_size: int = 0
     crc: int = 0
     start_ns: int = 0
+    end_ns: int = NEVER
     index: dict[int, tuple[int, int]] | None = None
 
     @property
@@ -211,8 +214,8 @@ def messages_at(
     )
 
 
-def index_entries(record: bytes, channel: int, where: str) -> IntArray:
-    """Offsets of a channel's messages in a chunk, from its message index record.
+def index_entries(record: bytes, channel: int, where: str) -> Any:
+    """Read INDEX_ENTRY of each message that a channel has in a chunk, from its index record.
 
     Raises BagError if that is damaged.
     """
@@ -222,9 +225,18 @@ def index_entries(record: bytes, channel: int, where: str) -> IntArray:
     fits = INDEX.size + size <= len(record) and INDEX.size + size <= RECORD.size + length
     if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or size % INDEX_ENTRY.itemsize:
         raise BagError(f"{where} is damaged")
-    listed: Any = np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
-    offsets: IntArray = listed["offset"].astype(np.int64)
+    return np.frombuffer(record, INDEX_ENTRY, size // INDEX_ENTRY.itemsize, INDEX.size)
+
+
+def index_offsets(record: bytes, channel: int, where: str) -> IntArray:
+    """Read where the same messages begin in the chunk."""
+    offsets: IntArray = index_entries(record, channel, where)["offset"].astype(np.int64)
     return offsets
+
+
+def index_times(record: bytes, channel: int, where: str) -> IntArray:
+    """Read their log times in ns."""
+    return _time(index_entries(record, channel, where)["log"], where)
 
 
 def counted(statistics: Statistics) -> dict[int, int] | None:

@@ -151,5 +151,6 @@ def _listed(chunk: ChunkIndex, limit: int) -> Block:
         chunk.compression,
         chunk.uncompressed_size,
         start_ns=chunk.message_start_time,
+        end_ns=chunk.message_end_time,
         index={c: (at, after - at) for (c, at), after in zip(places, edges[1:], strict=True)},
     )

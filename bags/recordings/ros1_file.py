@@ -7,16 +7,17 @@ Source: the ROS bag format, version 2.0, http://wiki.ros.org/Bags/Format/2.0.
 """
 
 import bz2
-import mmap
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import lz4.frame
 import numpy as np
 from mcap.records import Channel, Schema
+from rosbags.rosbag1.reader import Header, ReaderError, read_uint32
 
 from bags.recordings.batch import Batch, batch_of
 from bags.recordings.mcap_records import MAX_CHUNK_BYTES, Block, Contents, rest_said
@@ -26,11 +27,7 @@ from nlsid_core.errors import BagError
 ROS1_MAGIC: Final = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 LOOSE: Final = ""  # the compression of messages outside chunks
-_LENGTH: Final = struct.Struct("<I")
-_TIME: Final = struct.Struct("<II")
 _INDEX_ENTRY: Final = np.dtype([("seconds", "<u4"), ("nanoseconds", "<u4"), ("offset", "<u4")])
-
-Fields = Mapping[bytes, bytes]
 
 
 class Ros1File:
@@ -45,8 +42,8 @@ class Ros1File:
         self.path = path
         self.contents = Contents()
         self._salvage = salvage
-        with path.open("rb") as stream:
-            self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._size = path.stat().st_size
+        self._stream = path.open("rb")
         try:
             self._walk()
             self._look_into_chunks()
@@ -56,7 +53,7 @@ class Ros1File:
 
     def close(self) -> None:
         """Close the file."""
-        self._content.close()
+        self._stream.close()
 
     def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """The messages of one block, one batch per channel that has any."""
@@ -64,10 +61,10 @@ class Ros1File:
             return
         content = self._unpacked(block)
         found: dict[int, list[tuple[int, int, int]]] = {}
-        for fields, start, end in _records(content, 0, len(content)):
-            if _number(fields, b"op") == MESSAGE:
-                place = start, end - start, _time(fields)
-                found.setdefault(_number(fields, b"conn"), []).append(place)
+        for fields, start, end in _records(BytesIO(content), len(content)):
+            if fields.get_uint8("op") == MESSAGE:
+                place = start, end - start, fields.get_time("time")
+                found.setdefault(fields.get_uint32("conn"), []).append(place)
         counts = {number: len(places) for number, places in found.items()}
         if counts != {number: count for number, (_, count) in (block.index or {}).items() if count}:
             raise BagError(f"the chunk at byte {block.offset} does not hold what its index says")
@@ -76,17 +73,22 @@ class Ros1File:
                 start, size, log_ns = np.array(found[channel], np.int64).T
                 yield channel, batch_of(content, start, size, log_ns)
 
+    def _read(self, start: int, end: int) -> bytes:
+        self._stream.seek(start)
+        return self._stream.read(end - start)
+
     def _walk(self) -> None:
         found = self.contents
-        header: Fields = {}
+        header = Header()
         good_bytes = len(ROS1_MAGIC)
         try:
-            for fields, start, end in _records(self._content, len(ROS1_MAGIC), len(self._content)):
-                kind = _number(fields, b"op")
+            self._stream.seek(good_bytes)
+            for fields, start, end in _records(self._stream, self._size):
+                kind = fields.get_uint8("op")
                 if kind == HEADER:
                     header = fields
                 elif kind == CONNECTION:
-                    self._add_connection(fields, self._content[start:end])
+                    self._add_connection(fields, self._read(start, end))
                 elif kind == CHUNK:
                     found.blocks.append(_chunk(fields, start, end))
                 elif kind == INDEX:
@@ -94,17 +96,17 @@ class Ros1File:
                 elif kind == MESSAGE:
                     self._add_loose(good_bytes, end)
                 good_bytes = end
-        except BagError as error:
+        except (BagError, ReaderError) as error:
             found.ending = str(error)
-        if header.get(b"encryptor"):
+        if header.get("encryptor"):
             raise BagError("it is encrypted")
-        if found.ending is None and not _number(header, b"index_pos"):
+        if found.ending is None and not header.get("index_pos", b"").strip(b"\0"):
             found.ending = "it was not closed: it has no index"
         chunks = sum(block.compression != LOOSE for block in found.blocks)
-        if found.ending is None and chunks != _number(header, b"chunk_count"):
+        if found.ending is None and chunks != header.get_uint32("chunk_count"):
             found.ending = f"it has {chunks} chunks, and says another number at its start"
         if found.ending is not None:
-            found.ending += rest_said(len(self._content) - good_bytes)
+            found.ending += rest_said(self._size - good_bytes)
 
     def _add_loose(self, start: int, end: int) -> None:
         """A message outside chunks: of the chunk in which a recorder was killed."""
@@ -114,28 +116,28 @@ class Ros1File:
         else:
             self.contents.blocks.append(Block(start, end - start, LOOSE, end - start))
 
-    def _add_connection(self, fields: Fields, data: bytes) -> None:
-        number, said = _number(fields, b"conn"), _fields(data)
-        topic = fields.get(b"topic", b"").decode("utf-8", "replace")
-        kind = said.get(b"type", b"").decode("utf-8", "replace")
-        profiles = {KEY: offered_text([LATCHED])} if said.get(b"latching") == b"1" else {}
-        schema = Schema(number, said.get(b"message_definition", b""), "ros1msg", kind)
+    def _add_connection(self, fields: Header, data: bytes) -> None:
+        number, said = fields.get_uint32("conn"), _fields(data)
+        topic = fields.get("topic", b"").decode("utf-8", "replace")
+        kind = said.get("type", b"").decode("utf-8", "replace")
+        profiles = {KEY: offered_text([LATCHED])} if said.get("latching") == b"1" else {}
+        schema = Schema(number, said.get("message_definition", b""), "ros1msg", kind)
         declared = self.contents.declared
         declared.schemas.setdefault(number, schema)
         declared.channels.setdefault(number, Channel(number, topic, "ros1", profiles, number))
 
-    def _add_index(self, fields: Fields, start: int, end: int) -> None:
-        count = _number(fields, b"count")
+    def _add_index(self, fields: Header, start: int, end: int) -> None:
+        count = fields.get_uint32("count")
         if not self.contents.blocks or count * _INDEX_ENTRY.itemsize != end - start:
             raise BagError(f"the index at byte {start} is damaged")
-        entries = np.frombuffer(self._content[start:end], _INDEX_ENTRY)
+        entries = np.frombuffer(self._read(start, end), _INDEX_ENTRY)
         block = self.contents.blocks[-1]
         times = entries["seconds"].astype(np.int64) * 10**9 + entries["nanoseconds"]
         first_ns = int(times.min()) if count else block.start_ns
         self.contents.blocks[-1] = replace(
             block,
             start_ns=min(block.start_ns, first_ns) if block.index else first_ns,
-            index={**(block.index or {}), _number(fields, b"conn"): (start, count)},
+            index={**(block.index or {}), fields.get_uint32("conn"): (start, count)},
         )
 
     def _look_into_chunks(self) -> None:
@@ -146,7 +148,7 @@ class Ros1File:
             told = block.index is not None and block.index.keys() <= found.declared.channels.keys()
             try:
                 kept.append(block if told and not self._salvage else self._indexed(block))
-            except BagError as error:
+            except (BagError, ReaderError) as error:
                 if not self._salvage and found.ending is None:
                     raise
                 found.lost.append(str(error))
@@ -161,12 +163,12 @@ class Ros1File:
         counts: dict[int, int] = {}
         times = []
         content = self._unpacked(block)
-        for fields, start, end in _records(content, 0, len(content)):
-            if _number(fields, b"op") == CONNECTION:
+        for fields, start, end in _records(BytesIO(content), len(content)):
+            if fields.get_uint8("op") == CONNECTION:
                 self._add_connection(fields, content[start:end])
-            elif _number(fields, b"op") == MESSAGE:
-                times.append(_time(fields))
-                number = _number(fields, b"conn")
+            elif fields.get_uint8("op") == MESSAGE:
+                times.append(fields.get_time("time"))
+                number = fields.get_uint32("conn")
                 counts[number] = counts.get(number, 0) + 1
         index = {number: (0, count) for number, count in counts.items()}
         return replace(block, start_ns=min(times, default=0), index=index)
@@ -175,7 +177,7 @@ class Ros1File:
         where, size = f"the chunk at byte {block.offset}", block.uncompressed_size
         if size > MAX_CHUNK_BYTES:
             raise BagError(f"{where} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES} are read")
-        raw = self._content[block.offset : block.end]
+        raw = self._read(block.offset, block.end)
         if block.compression in (LOOSE, "none"):
             return raw
         decompressors = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
@@ -199,53 +201,26 @@ def _counts(blocks: Sequence[Block]) -> dict[int, int]:
     return found
 
 
-def _chunk(fields: Fields, start: int, end: int) -> Block:
-    compression = fields.get(b"compression", b"").decode("utf-8", "replace")
-    return Block(start, end - start, compression, _number(fields, b"size"))
+def _chunk(fields: Header, start: int, end: int) -> Block:
+    compression = fields.get("compression", b"").decode("utf-8", "replace")
+    return Block(start, end - start, compression, fields.get_uint32("size"))
 
 
-def _records(content: bytes | mmap.mmap, at: int, end: int) -> Iterator[tuple[Fields, int, int]]:
+def _records(stream: BinaryIO, end: int) -> Iterator[tuple[Header, int, int]]:
     """(header, first byte of the data, their end) of each record; BagError if one is cut."""
-    while at < end:
-        header, header_end = _span(content, at, end)
-        start, at = _span(content, header_end, end)
-        yield _fields(content[header:header_end]), start, at
+    while (at := stream.tell()) < end:
+        try:
+            header = Header.read(stream)
+            start = stream.tell() + 4
+            last = start + read_uint32(stream)
+        except ReaderError as error:
+            raise BagError(f"what starts at byte {at} runs past the end") from error
+        if last > end:
+            raise BagError(f"what starts at byte {at} runs past the end")
+        yield header, start, last
+        stream.seek(last)
 
 
-def _span(content: bytes | mmap.mmap, at: int, end: int) -> tuple[int, int]:
-    """First byte and end of what follows its length."""
-    start = at + _LENGTH.size
-    if start <= end:
-        length: int = _LENGTH.unpack_from(content, at)[0]
-        if start + length <= end:
-            return start, start + length
-    raise BagError(f"what starts at byte {at} runs past the end")
-
-
-def _fields(header: bytes) -> Fields:
-    found, at = {}, 0
-    while at < len(header):
-        start = at + _LENGTH.size
-        if start > len(header):
-            raise BagError("a record's header is damaged")
-        at = start + _LENGTH.unpack_from(header, at)[0]
-        name, equals, value = header[start:at].partition(b"=")
-        if not equals or at > len(header):
-            raise BagError("a record's header is damaged")
-        found[name] = value
-    return found
-
-
-def _number(fields: Fields, name: bytes) -> int:
-    """A number of a record's header, of as many bytes as it has there."""
-    if name not in fields:
-        raise BagError(f"a record without '{name.decode()}'")
-    return int.from_bytes(fields[name], "little")
-
-
-def _time(fields: Fields) -> int:
-    stamp = fields.get(b"time", b"")
-    if len(stamp) != _TIME.size:
-        raise BagError("a message without a time")
-    seconds, nanoseconds = _TIME.unpack(stamp)
-    return int(seconds) * 10**9 + int(nanoseconds)
+def _fields(data: bytes) -> Header:
+    """What a connection says of itself, which is written like a header."""
+    return Header.read(BytesIO(struct.pack("<I", len(data)) + data))

@@ -9,8 +9,7 @@ import os
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -25,9 +24,17 @@ from bags.recordings.quality import KEY
 from nlsid_core.errors import BagError
 
 BESIDE: Final = ("-wal", "-journal")
-SALVAGED_BYTES: Final = 2**16  # of messages that are lost together where a page is damaged
+SALVAGED_BYTES: Final = 2**13  # of messages that are lost together where a page is damaged
 WAL_HEADER, WAL_PAGE_HEADER = 32, 24  # bytes, by the format of SQLite's files
-ROWS: Final = "SELECT id, topic_id, timestamp, length(data) FROM messages"
+IS_MESSAGE: Final = "(typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')"
+ROWS: Final = (
+    "SELECT topic_id, timestamp, data FROM messages "
+    f"WHERE id BETWEEN ? AND ? AND {IS_MESSAGE} ORDER BY id"
+)
+COUNTS: Final = (
+    f"SELECT topic_id, sum({IS_MESSAGE}), min(CASE WHEN {IS_MESSAGE} THEN timestamp END), "
+    f"sum(NOT {IS_MESSAGE}) FROM messages WHERE id BETWEEN ? AND ? GROUP BY topic_id"
+)
 OLD_RELEASE: Final = "galactic"  # which, like those before it, names no release in its files
 
 
@@ -74,13 +81,9 @@ class SqliteFile:
         if not block.has(channels):
             return
         rows: dict[int, list[tuple[int, bytes]]] = {}
-        query = (
-            "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
-        )
         try:
-            for topic, log_ns, data in self._base.execute(query, (block.offset, block.end)):
-                if self._is_message(log_ns, data):
-                    rows.setdefault(topic, []).append((log_ns, data))
+            for topic, log_ns, data in self._base.execute(ROWS, (block.offset, block.end - 1)):
+                rows.setdefault(topic, []).append((log_ns, data))
         except sqlite3.Error as error:
             if not self._salvage:
                 raise
@@ -108,12 +111,7 @@ class SqliteFile:
             release = str(next(iter(self._rows("SELECT ros_distro FROM schema")), ("",))[0])
         self.contents.metadata.append(Metadata(ROSBAG2, {"ROS_DISTRO": release}))
         self._add_channels()
-        try:
-            self._add_blocks(self._base.execute(f"{ROWS} ORDER BY id"))
-        except sqlite3.Error as error:
-            if not self._salvage:
-                raise
-            self._add_behind_damage(error)
+        self._add_blocks()
 
     def _add_channels(self) -> None:
         definitions: dict[str, tuple[str, str]] = {}
@@ -136,60 +134,52 @@ class SqliteFile:
                 number, topic["name"], topic["serialization_format"], said, number
             )
 
-    def _add_blocks(self, rows: Iterable[tuple[int, int, int, int]]) -> None:
-        """Runs of messages with about BATCH_BYTES; rows: (id, topic, ns, bytes) of each message."""
+    def _add_blocks(self) -> None:
+        """Runs of messages by their ids, each of about BATCH_BYTES if they are of one size."""
+        first, last = self._ids()
         most = SALVAGED_BYTES if self._salvage else BATCH_BYTES
-        run: list[tuple[int, int, int, int]] = []
-        size = 0
+        count = max(1, (last - first) * most // max(self.path.stat().st_size, 1))
         left_out = 0
-        try:
-            for row in rows:
-                if size > most:
-                    self._add_block(run)
-                    run, size = [], 0
-                if self._is_message(row[2], b"" if isinstance(row[3], int) else None):
-                    run.append(row)
-                    size += row[3]
-                else:
-                    left_out += 1
-        finally:
-            self._add_block(run)
+        for begin in range(first, last + 1, count):
+            try:
+                found = self._base.execute(COUNTS, (begin, begin + count - 1)).fetchall()
+            except sqlite3.Error as error:
+                if not self._salvage:
+                    raise
+                self.contents.lost.append(f"messages {begin} to {begin + count - 1}: {error}")
+                continue
+            left_out += sum(bad for *_, bad in found)
+            counts = Counter({topic: good for topic, good, _, _ in found if good})
+            for topic in counts.keys() - self.contents.declared.channels.keys():
+                self._lose(f"{counts.pop(topic)} messages of topic {topic}, which nothing declares")
+            if counts:
+                index = {topic: (0, good) for topic, good in counts.items()}
+                start_ns = min(log_ns for _, good, log_ns, _ in found if good)
+                block = Block(begin, count, start_ns=start_ns, index=index)
+                self.contents.blocks.append(block)
+                self.contents.counts = dict(Counter(self.contents.counts) + counts)
         if left_out:
-            self.contents.lost.append(f"{left_out} messages have no time or no data")
+            self._lose(f"{left_out} messages have no time or no data")
 
-    def _is_message(self, log_ns: object, data: object) -> bool:
-        """Whether a row has a time and data; BagError if not, unless it is salvaged."""
-        if isinstance(data, bytes) and isinstance(log_ns, int) and log_ns >= 0:
-            return True
+    def _ids(self) -> tuple[int, int]:
+        """The first and the last id, as far as they can be read."""
+        ends = []
+        for order in ("ASC", "DESC"):
+            try:
+                for (end,) in self._base.execute(f"SELECT id FROM messages ORDER BY id {order}"):
+                    ends.append(end)  # of a damaged file the last ones before the damage count
+                    if not self._salvage:
+                        break
+            except sqlite3.Error:
+                if not self._salvage:
+                    raise
+        return min(ends, default=0), max(ends, default=-1)
+
+    def _lose(self, what: str) -> None:
+        """Take note of what cannot be read; BagError unless it is to be salvaged."""
         if not self._salvage:
-            raise BagError(f"a message with log time {log_ns} ns and {type(data).__name__} as data")
-        return False
-
-    def _add_block(self, run: Sequence[tuple[int, int, int, int]]) -> None:
-        counts = Counter(topic for _, topic, _, _ in run)
-        for topic in counts.keys() - self.contents.declared.channels.keys():
-            if not self._salvage:
-                raise BagError(f"messages on topic {topic}, which nothing declares")
-            self.contents.lost.append(f"{counts.pop(topic)} messages of unknown topic {topic}")
-        if counts:
-            first, last = run[0][0], run[-1][0]
-            index = {topic: (0, count) for topic, count in counts.items()}
-            start_ns = min(log_ns for _, _, log_ns, _ in run)
-            block = Block(first, last + 1 - first, start_ns=start_ns, index=index)
-            self.contents.blocks.append(block)
-            self.contents.counts = dict(Counter(self.contents.counts) + counts)
-
-    def _add_behind_damage(self, error: sqlite3.Error) -> None:
-        """The messages behind a damaged page, which are found from the end."""
-        blocks = self.contents.blocks
-        begin = blocks[-1].end if blocks else 0
-        rows: list[tuple[int, int, int, int]] = []
-        with suppress(sqlite3.Error):
-            for row in self._base.execute(f"{ROWS} WHERE id >= {begin} ORDER BY id DESC"):
-                rows.append(row)  # noqa: PERF402 - those before the error count
-        self._add_blocks(reversed(rows))
-        end = f"before {rows[-1][0]}" if rows else "the end"
-        self.contents.lost.append(f"messages from {begin} to {end}: {error}")
+            raise BagError(what)
+        self.contents.lost.append(what)
 
     def _columns(self, table: str) -> list[str]:
         return [row[1] for row in self._rows(f"PRAGMA table_info({table})")]

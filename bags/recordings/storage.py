@@ -4,12 +4,14 @@ What a file is, its first bytes say, not its name. Whatever it is, its messages 
 those of ROS 1 are translated, those that rosbag2 compressed one by one are unpacked.
 """
 
-import heapq
 import shutil
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -22,7 +24,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from bags.recordings.batch import Batch, joined
 from bags.recordings.definitions import Definition
 from bags.recordings.mcap_file import Batches, McapFile
-from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, ROSBAG2, Block
+from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, NEVER, ROSBAG2, Block
 from bags.recordings.message_types import JAZZY, ros2_definition, standard_types, types_in_bag
 from bags.recordings.quality import KEY, Profile, offered
 from bags.recordings.remote import RemotePath
@@ -41,9 +43,12 @@ ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_OVERLAP_BYTES: Final = 256 * 2**20  # chunks that overlap in time are sorted in memory
 MOST_PADDING: Final = 3  # bytes that rosserial leaves after a message
 UNPACKED_BYTES: Final = 2**20  # of a file that was compressed whole, at once
-NEVER: Final = 2**63 - 1  # ns: after every message
+ALWAYS: Final = ((0, NEVER),)
+
+Spans = Sequence[tuple[int, int]]  # ns: from the first to before the second
 
 DataFile = McapFile | SqliteFile | Ros1File
+KINDS: Final = {McapFile: "mcap", SqliteFile: "sqlite3", Ros1File: "ros1"}
 
 
 @dataclass(frozen=True)
@@ -263,6 +268,17 @@ class Storage:
         return next(filter(None, named), "")
 
     @property
+    def kinds(self) -> dict[str, list[str]]:
+        """What the files are, and how what is in them is compressed."""
+        return {
+            "storage": sorted({KINDS[type(file)] for file in self.files}),
+            "compression": sorted(
+                {block.compression for file in self.files for block in file.contents.blocks}
+                - {"", "none"}
+            ),
+        }
+
+    @property
     def start_ns(self) -> int:
         """The first log time; 0 if there are no messages."""
         first = min(map(_first_ns, self.files), default=NEVER)
@@ -306,40 +322,53 @@ class Storage:
                         yield wanted[number], self._plain(wanted[number], batch), earliest
                     earliest = later[n, block.offset]
 
+    def log_times(self, keys: Collection[int]) -> Iterator[tuple[int, IntArray]]:
+        """(channel key, log times in ns), in the order of the files; from indexes if there are."""
+        for file, known in zip(self.files, self._keys, strict=True):
+            wanted = {number: key for number, key in known.items() if key in keys}
+            with reading(file.path):
+                if isinstance(file, McapFile):
+                    yield from ((wanted[c], log_ns) for c, log_ns in file.log_times(wanted))
+                    continue
+                for _, batches in _runs(file, wanted):
+                    yield from ((wanted[c], batch.log_ns) for c, batch in batches)
+
     def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages in the order of the files."""
         for n, file in enumerate(self.files):
             for i in range(len(file.contents.blocks)):
-                yield from sorted(self._raws(n, i, keys), key=lambda raw: raw.place)
+                yield from sorted(self._raws(n, i, keys), key=attrgetter("place"))
 
-    def messages(self, keys: Collection[int], *, nearly: bool = False) -> Iterator[Raw]:
-        """The messages by log time; equal log times as recorded.
+    def messages(
+        self, keys: Collection[int], *, nearly: bool = False, spans: Spans = ALWAYS
+    ) -> Iterator[Raw]:
+        """The messages that were logged in one of `spans`, by log time; equal ones as recorded.
 
-        Raises BagError if so many chunks overlap in time that sorting needs MAX_OVERLAP_BYTES;
-        with `nearly` they are sorted as far as that goes.
+        Chunks outside the spans are not read. Raises BagError if so many chunks overlap in time
+        that sorting needs MAX_OVERLAP_BYTES; with `nearly` they are sorted as far as that goes.
         """
         order = sorted(
             (block.start_ns, n, i)
             for n, file in enumerate(self.files)
             for i, block in enumerate(file.contents.blocks)
+            if any(block.start_ns < end and start <= block.end_ns for start, end in spans)
         )
         waiting: list[Raw] = []
-        held = 0
-        for start_ns, n, i in order:
-            while waiting and (waiting[0].log_ns < start_ns or held > MAX_OVERLAP_BYTES):
-                raw = heapq.heappop(waiting)
-                held -= len(raw.data)
-                yield raw
-            for raw in self._raws(n, i, keys):
-                heapq.heappush(waiting, raw)
-                held += len(raw.data)
-            if held > MAX_OVERLAP_BYTES and not nearly:
-                raise BagError(
-                    f"{self.files[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes overlap "
-                    "in time; sort the file first (`mcap sort`)"
-                )
-        while waiting:
-            yield heapq.heappop(waiting)
+        for (_, n, i), (later_ns, *_) in pairwise([*order, (NEVER,)]):
+            waiting += self._raws(n, i, keys)
+            waiting.sort()
+            ready = bisect_left(waiting, later_ns, key=attrgetter("log_ns"))
+            if sum(len(raw.data) for raw in waiting[ready:]) > MAX_OVERLAP_BYTES:
+                if not nearly:
+                    raise BagError(
+                        f"{self.files[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes "
+                        "overlap in time; sort the file first (`mcap sort`)"
+                    )
+                ready = len(waiting)
+            for raw in waiting[:ready]:
+                if any(start <= raw.log_ns < end for start, end in spans):
+                    yield raw
+            waiting = waiting[ready:]
 
     def _raws(self, n: int, i: int, keys: Collection[int]) -> Iterator[Raw]:
         file = self.files[n]

@@ -26,6 +26,12 @@ SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
 CHUNK_BYTES: Final = 2**20
 
 
+def refuse_existing(path: Path) -> None:
+    """Raise a BagError if something is at `path`."""
+    if path.exists():
+        raise BagError(f"{path} exists already; take another name or move it away")
+
+
 def topic_like(channel: Channel) -> Topic:
     """A topic to which another bag's messages are copied as they are."""
     definition = channel.definition
@@ -49,7 +55,7 @@ def topic_like(channel: Channel) -> Topic:
 
 
 class BagWriter:
-    """A bag being written: NAME/NAME.mcap in zstd chunks, and NAME/metadata.yaml.
+    """A bag being written: NAME/NAME.mcap in compressed chunks, and NAME/metadata.yaml.
 
     Normally everything is written to a temporary folder beside `path`, which gets its name when
     the bag is closed; leaving a `with` block by an exception removes it. With `in_place=True` the
@@ -70,6 +76,7 @@ class BagWriter:
         *,
         custom: Mapping[str, str] | None = None,
         in_place: bool = False,
+        compression: str = "zstd",
     ) -> None:
         self.path = Path(path)
         self.counts: dict[str, int] = {}
@@ -81,8 +88,9 @@ class BagWriter:
         self._custom: dict[str, str] = {}
         self._span_ns: tuple[int, int] | None = None
         self._in_place = in_place
-        if self.path.exists():
-            raise BagError(f"{self.path} exists already; name another bag or move it away")
+        if compression.upper() not in CompressionType.__members__:
+            raise BagError(f"no compression '{compression}'; there are zstd, lz4 and none")
+        refuse_existing(self.path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if in_place:
             self._folder = self.path
@@ -102,11 +110,16 @@ class BagWriter:
         self._mcap: Any = Writer(
             self._output,  # type: ignore[arg-type]  # all that it uses of a stream
             chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
+            compression=CompressionType[compression.upper()],
         )
         self._mcap.start(profile="ros2", library="nlsid")
         self.annotate(custom or {})
         self.close_chunk()
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far, but for the chunk at hand."""
+        return self._output.size
 
     @property
     def full(self) -> str:

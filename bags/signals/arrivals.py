@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
+from bags.signals.timing import SOON
 
 GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
-SOON: Final = 100  # messages: a publisher does not begin anew twice in so many
 SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
 SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
 

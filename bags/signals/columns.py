@@ -12,7 +12,7 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, LogOrder
-from bags.recordings.cdr import Gatherer, Numbers, Step, UnreadableMessageError
+from bags.recordings.cdr import STAMP, Gatherer, Numbers, Step, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.publishers import counted_in_turn, two_curves
 from bags.signals.signal import SignalPath
@@ -20,10 +20,6 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
-STAMP: Final = (
-    (Step("header"), Step("stamp"), Step("sec")),
-    (Step("header"), Step("stamp"), Step("nanosec")),
-)
 MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
 
 
@@ -99,6 +95,7 @@ def read_columns(
     """
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
+        check_path(bag, signal)
         topics.setdefault(signal.topic, {})[name] = signal
     readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
     growing = {topic: _Growing(bag, topic, list(wanted)) for topic, wanted in topics.items()}
@@ -115,7 +112,7 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
     expanded: list[SignalPath] = []
     for path in paths:
         msgtype, types = bag.types_on(path.topic)
-        _check(bag, path)
+        check_path(bag, path)
         if not path.every:
             expanded.append(path)
             continue
@@ -127,12 +124,10 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
 
 
 class TopicReader:
-    """Turns batches of one topic into columns; BagError for signals that are not on it."""
+    """Turns batches of one topic into columns; the signals are known to be on it."""
 
     def __init__(self, bag: Bag, topic: str, signals: Mapping[str, SignalPath]) -> None:
         msgtype, types = bag.types_on(topic)
-        for signal in signals.values():
-            _check(bag, signal)
         self._where = f"{bag.path}: {topic}"
         self._topic = topic
         self._signals = signals
@@ -175,7 +170,8 @@ class TopicReader:
         return np.array(found)
 
 
-def _check(bag: Bag, path: SignalPath) -> None:
+def check_path(bag: Bag, path: SignalPath) -> None:
+    """Raise a BagError that names the bag unless its messages have a number at `path`."""
     try:
         path.check(*bag.types_on(path.topic))
     except BagError as error:

@@ -24,11 +24,12 @@ values in a sample.
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from rosbags.typesys.store import Typestore
@@ -241,41 +242,38 @@ class Running:
         return value
 
 
-class _Step(Protocol):
+class _Step(ABC):
     """An operation on all numbers (N,) with their stamps at once, or on one after the other."""
 
-    def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray: ...
+    def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray:
+        found = map(self.update, stamp_ns.tolist(), values.tolist())
+        return np.fromiter(found, np.float64, len(values))
 
+    @abstractmethod
     def update(self, stamp_ns: int, value: float) -> float: ...
 
 
 @dataclass
-class _Scaled:
+class _Scaled(_Step):
     factor: float
     shift: float
-
-    def all(self, values: FloatArray, _stamp_ns: IntArray) -> FloatArray:
-        return values * self.factor + self.shift
 
     def update(self, _stamp_ns: int, value: float) -> float:
         return value * self.factor + self.shift
 
 
-class _Unwrapped:
+class _Unwrapped(_Step):
     def __init__(self, turn: float) -> None:
         self._turn, self._turns, self._last = turn, 0.0, 0.0
 
-    def all(self, values: FloatArray, _stamp_ns: IntArray) -> FloatArray:
-        turns = np.cumsum(_turns(np.diff(values, prepend=0.0), self._turn))
-        return values - self._turn * turns
-
     def update(self, _stamp_ns: int, value: float) -> float:
-        self._turns += float(_turns(np.array(value - self._last), self._turn))
+        if math.isfinite(step := (value - self._last) / self._turn):
+            self._turns += round(step)
         self._last = value
         return value - self._turn * self._turns
 
 
-class _Slope:
+class _Slope(_Step):
     def __init__(self, window: float) -> None:
         self._window = window
         self._window_ns = round(window * 1e9)
@@ -299,7 +297,7 @@ class _Slope:
         return float(_slopes(stamps[None] - stamp_ns, values[None])[0])
 
 
-class _Washout:
+class _Washout(_Step):
     """What each step of the numbers added, fading with time constant `window` s.
 
     q = 0 at the first finite value p, then q⁺ = exp(-Δt/window) q + (p⁺ - p): a first-order high
@@ -317,8 +315,7 @@ class _Washout:
 
     def all(self, values: FloatArray, stamp_ns: IntArray) -> FloatArray:
         _require_increasing(stamp_ns, "washout")
-        moved = map(self.update, stamp_ns.tolist(), values.tolist())
-        return np.fromiter(moved, np.float64, len(values))
+        return super().all(values, stamp_ns)
 
     def update(self, stamp_ns: int, value: float) -> float:
         if not math.isfinite(value):
@@ -381,12 +378,6 @@ def _slopes(before_ns: IntArray, values: FloatArray) -> FloatArray:
 def turn_of(unit: str) -> float:
     """A whole turn in `unit`; numbers whose unit nobody states are in rad."""
     return TURNS.get(unit, 2.0 * np.pi)
-
-
-def _turns(step: FloatArray, turn: float) -> FloatArray:
-    """Whole turns by which an angle jumped in each `step`; none for NaN."""
-    turns: FloatArray = np.nan_to_num(np.rint(step / turn))
-    return turns
 
 
 def _operation(part: str, text: str) -> Operation:

@@ -39,11 +39,10 @@ class MessageReader:
         found = self._layout.numbers(data)
         if len(found) == len(self._paths):
             return found
-        values, at = [], 0
+        values, left = [], iter(found)
         for path, group in zip(self._paths, self._targets, strict=True):
-            parts = [np.array([number]) for number in found[at : at + len(group)]]
+            parts = [np.array([next(left)]) for _ in group]
             values.append(float(path.combine(parts)[0]))
-            at += len(group)
         return values
 
 
@@ -57,7 +56,7 @@ class _Laid:
         self._least = layout.end
         self._most = layout.end + PADDING if layout.whole else np.inf
         leaves = [
-            (target, at, np.dtype(group.kind), group.is_bool)
+            (target, at, np.dtype(group.kind.of), group.kind.is_bool)
             for group in layout.groups
             for target, at in zip(group.targets.tolist(), group.offsets.tolist(), strict=True)
         ]

@@ -145,7 +145,7 @@ class SignalPath:
             if step.field in ANGLES and not hasattr(message, step.field):
                 parts = [[getattr(message, letter)] for letter in "xyzw"]
                 return float(quaternion_angle(step.field, np.array(parts, dtype=np.float64))[0])
-            owner, message = message, getattr(message, _attribute(step.field))
+            owner, message = message, getattr(message, attribute(step.field))
             if step.picks:
                 place = self._place(step, owner, message)
                 if place < 0:
@@ -158,19 +158,19 @@ class SignalPath:
         self.value(message)
         *outer, last = self.steps
         for step in outer:
-            owner, message = message, getattr(message, _attribute(step.field))
+            owner, message = message, getattr(message, attribute(step.field))
             if step.picks:
                 message = message[self._place(step, owner, message)]
         if last.field in ANGLES and not hasattr(message, last.field):
             raise BagError(f"{self} is made of four numbers; assign to those")
         if not last.picks:
-            kind = type(getattr(message, _attribute(last.field)))
-            setattr(message, _attribute(last.field), kind(value))
+            kind = type(getattr(message, attribute(last.field)))
+            setattr(message, attribute(last.field), kind(value))
         else:
-            array = getattr(message, _attribute(last.field))
+            array = getattr(message, attribute(last.field))
             if isinstance(array, np.ndarray) and not array.flags.writeable:
                 array = array.copy()  # a decoded message's array is a view of its bytes
-                setattr(message, _attribute(last.field), array)
+                setattr(message, attribute(last.field), array)
             array[self._place(last, message, array)] = value
 
     def _is_angle(self, msgtype: str, types: Typestore) -> bool:
@@ -193,7 +193,7 @@ class SignalPath:
                 f"{step.length}"
             )
         if step.key is not None:
-            key = _attribute(step.key[0])
+            key = attribute(step.key[0])
             if not hasattr(owner, key):  # it is in the elements
                 inside = [getattr(element, key) for element in array]
                 return inside.index(step.key[1]) if step.key[1] in inside else -1
@@ -290,14 +290,14 @@ def quaternion_angle(angle: str, xyzw: FloatArray) -> FloatArray:
 
 def _elements(before: Sequence[Step], step: Step, message: Any) -> list[Step]:
     for earlier in before:
-        message = getattr(message, _attribute(earlier.field))
+        message = getattr(message, attribute(earlier.field))
         if earlier.index is not None:
             message = message[earlier.index]
-    length = len(getattr(message, _attribute(step.field)))
+    length = len(getattr(message, attribute(step.field)))
     return [Step(step.field, index, length=length) for index in range(length)]
 
 
-def _attribute(field: str) -> str:
+def attribute(field: str) -> str:
     """The decoded message's attribute: both decoders append _ to a field that is a keyword."""
     return f"{field}_" if keyword.iskeyword(field) else field
 

@@ -13,6 +13,7 @@ SAME_CLOCK: Final = 1.0  # s; latencies stay below, an offset between clocks rar
 DRIFT_SIGNIFICANT: Final = 5.0  # times the scatter of the segments about the line
 OWN_PACE: Final = 1e-3  # s per s; two real clocks differ by less
 DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency says nothing
+SOON: Final = 100  # messages: a publisher does not begin anew twice in so many
 STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
 ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
 
@@ -101,3 +102,17 @@ def _drift(t: FloatArray, ahead: FloatArray) -> float:
     if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter):
         return 0.0
     return float(slope)
+
+
+def missing(sequence: IntArray) -> int | None:
+    """Numbers left out by a recorder that counted up from message to message; None otherwise.
+
+    A publisher that came back counts anew: far below, by more than messages overtake each other,
+    and then for itself.
+    """
+    anew = np.flatnonzero(np.diff(sequence) < -SOON) + 1
+    counts = [np.diff(np.sort(part)) for part in np.split(sequence, anew)]
+    steps = np.concatenate(counts)
+    if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
+        return None
+    return int(np.maximum(steps - 1, 0).sum())

@@ -26,7 +26,6 @@ from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
 from bags.signals.timing import clock_relation, held
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.repeats import same_excitation
 from nlsid_core.errors import BagError, DataError
 
 JITTER_LOOK: Final = 0.05  # of the period: up to here samples are used as they are (the grid's)
@@ -60,7 +59,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Fitness:
-    """The findings about one bag; repeats: other bags of the same excitation."""
+    """The findings about one bag."""
 
     bag: Path
     findings: tuple[Finding, ...]
@@ -121,10 +120,7 @@ def check_fitness(
         except BagError as error:
             look.findings.append(Finding(Level.BAD, "readable", str(error)))
         looks.append(look)
-    return [
-        Fitness(look.bag, (*look.findings, *_constant(look, looks), *_repeats(look, looks)))
-        for look in looks
-    ]
+    return [Fitness(look.bag, (*look.findings, *_constant(look, looks))) for look in looks]
 
 
 def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: _Look) -> None:
@@ -350,19 +346,3 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> Ite
                 f"(correlation {best.correlation:+.2f})"
             )
             yield Finding(level, "delay", what)
-
-
-def _repeats(look: _Look, looks: Sequence[_Look]) -> Iterator[Finding]:
-    """The bags whose first command is the same."""
-    mine = next(iter(look.commands.values()), None)
-    same = [
-        other.bag.name
-        for other in looks
-        for theirs in [next(iter(other.commands.values()), None)]
-        if other is not look
-        and mine is not None
-        and theirs is not None
-        and same_excitation(mine, theirs)
-    ]
-    if same:
-        yield Finding(Level.GOOD, "repeats", f"the same excitation as {', '.join(same)}")

@@ -5,7 +5,7 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,38 +17,19 @@ from bags.recordings.cdr import Step
 from bags.recordings.message_types import fields_of, is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
-from bags.signals.expressions import Expression
 from bags.signals.reader import stamp_text
 from bags.signals.signal import SignalPath
 from bags.signals.units import UNITS
+from bags.tools.copies import Rows
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
-TIMES: Final = ("t", "time", "stamp", "timestamp", "seconds")  # columns that say when
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
-_TITLE: Final = re.compile(r"(?P<name>.+?)(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """When the rows of a table were recorded: `period` s apart, or at the times of a column.
-
-    Attributes:
-        period: s.
-        time: the column, and its unit, `stamp|unit(ms)`. Without a unit it is what the title says,
-            `t_ms` or `t [ms]`; of times since 1970, which of s, ms, us and ns can be meant; else s.
-        drop_repeats: of rows with one time keep the first.
-        start_ns: of time 0, since 1970.
-    """
-
-    period: float | None = None
-    time: str | None = None
-    drop_repeats: bool = False
-    start_ns: int = 0
+_TITLE: Final = re.compile(r".+?(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
 
 
 @dataclass(frozen=True)
@@ -130,25 +111,6 @@ def _assigned(text: str) -> tuple[SignalPath, str]:
     return path, column.strip()
 
 
-def every_column(file: Path | str, rows: Rows) -> tuple[Rows, list[str], dict[str, str]]:
-    """The rows with their time column, and every other column as a number on a topic of its name.
-
-    Returns the rows, the assignments and the topics' types. Raises DataError if two columns would
-    be one topic.
-    """
-    tables = read_table(file)
-    if rows.time is None and rows.period is None:
-        time = next((name for name in tables if _says_when(name)), None)
-        rows = replace(rows, time=time)
-    said = None if rows.time is None else _unit_of(rows.time)[0]
-    columns = [name for name in tables if name != said]
-    topics = [f"/{re.sub(r'^(?=[0-9])|[^A-Za-z0-9_]', '_', name)}" for name in columns]
-    if twice := next((topic for topic in topics if topics.count(topic) > 1), None):
-        raise DataError(f"two columns would be {twice}; name them with --signal")
-    assignments = [f"{t}:data={name}" for t, name in zip(topics, columns, strict=True)]
-    return rows, assignments, dict.fromkeys(topics, "std_msgs/msg/Float64")
-
-
 def import_table(
     file: Path | str,
     out: Path | str,
@@ -190,19 +152,15 @@ def import_table(
     if not topics:
         raise BagError("nothing is assigned, so there is nothing to write")
     times, unit = _times(tables, rows)
-    kept = np.arange(len(times))
-    if rows.time is not None and rows.drop_repeats:
-        kept = kept[np.diff(times, prepend=-np.inf) > 0]
-    stamps = _stamps(times[kept], rows.start_ns)
+    stamps = _stamps(times, round(rows.start * 1e9))
     streams = []
     for topic, columns in topics.items():
         if topic not in types:
             raise BagError(
                 f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
             )
-        columns = {path: column[kept] for path, column in columns.items()}
         streams.append(_Stream(topic, types[topic], columns))
-    said = _said_times(times[kept], rows, unit)
+    said = _said_times(times, rows, unit)
     with BagWriter(out, custom=custom) as writer:
         for row, stamp in enumerate(stamps.tolist()):
             for stream in streams:
@@ -210,11 +168,6 @@ def import_table(
                 times_ns = {"log_time_ns": stamp, "publish_time_ns": stamp}
                 writer.write(stream.topic, stream.msgtype, data, **times_ns)
         return Imported(dict(writer.counts), said)
-
-
-def _says_when(title: str) -> bool:
-    match = _TITLE.fullmatch(title)
-    return (match["name"] if match else title).strip().lower() in TIMES
 
 
 def _unit_of(time: str) -> tuple[str, str]:
@@ -258,17 +211,6 @@ def _said_times(seconds: FloatArray, rows: Rows, unit: str) -> str:
     by = "" if rows.time is None else f" by the column {_unit_of(rows.time)[0]}, taken as {unit}"
     rate = f", {(len(seconds) - 1) / duration:.4g} Hz" if duration > 0 else ""
     return f"{len(seconds)} rows over {duration:.4g} s{rate}{by}"
-
-
-def said_units(assignments: Sequence[str], types: Mapping[str, str]) -> str:
-    """The unit that the message type gives to each signal of `import_table`, in words.
-
-    Empty if none of them has one.
-    """
-    store = standard_types()
-    paths = [_assigned(text)[0] for text in assignments]
-    units = [(path, Expression(path).unit(types[path.topic], store)) for path in paths]
-    return ", ".join(f"{path} {unit}" for path, unit in units if unit)
 
 
 class _Stream:
@@ -316,7 +258,7 @@ def _stamps(times: FloatArray, start_ns: int) -> IntArray:
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
             f"time does not increase after row {back[0]}: {stamp_text(stamps[back[0]])} "
-            f"({len(back)} such rows); --drop-repeats keeps the first of rows with one time"
+            f"({len(back)} such rows); keep one of the rows with one time"
         )
     return stamps
 

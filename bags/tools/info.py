@@ -1,6 +1,7 @@
-"""What is in a bag: topics, rates, jitter, gaps, clocks, losses, sizes.
+"""What is in a bag: topics, rates, jitter, gaps; and of its messages clocks, losses and sizes.
 
-Memory: two integers a message, and one chunk.
+The first is read from summaries and indexes where there are some, in 8 bytes a message; the second
+from every message, in two more integers each and one chunk.
 """
 
 from collections.abc import Collection, Mapping
@@ -12,19 +13,16 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
-from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.cdr import STAMP, Gatherer, UnreadableMessageError
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
-from bags.signals.arrivals import SOON
-from bags.signals.columns import STAMP
-from bags.signals.timing import ClockRelation, clock_relation
+from bags.recordings.quality import Profile
+from bags.signals.timing import ClockRelation, clock_relation, missing
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
 GAP: Final = 5.0  # median intervals without a message
-BINS: Final = np.array([0.0, 0.5, 0.8, 0.95, 1.05, 1.25, 2.0, 5.0, np.inf])  # median intervals
-BARS: Final = " ▁▂▃▄▅▆▇█"
 LOST: Final = " lost"  # how the recorder's counts of lost messages end, after the topic
 
 
@@ -32,29 +30,17 @@ LOST: Final = " lost"  # how the recorder's counts of lost messages end, after t
 class LogTimes:
     """When messages were logged, in ns; of the intervals, in s, NaN with fewer than two messages.
 
-    interval: the median. histogram: intervals per bin of BINS, which are in median intervals.
+    rate: Hz, how many intervals there are by how long they last together. interval: the median.
+    jitter: s, by which 95 % of them differ from it at most. gaps: intervals above GAP medians.
     """
 
     first_ns: int = 0
     last_ns: int = 0
+    rate: float = float("nan")
     interval: float = float("nan")
-    histogram: tuple[int, ...] = ()
+    jitter: float = float("nan")
     gaps: int = 0
     longest: float = float("nan")
-
-    @property
-    def rate(self) -> float:
-        """Hz, from the median interval."""
-        return 1.0 / self.interval if self.interval > 0 else float("nan")
-
-    @property
-    def jitter(self) -> str:
-        """The histogram as a line of bars, from half the median interval to five times it."""
-        most = max(self.histogram, default=0)
-        if not most:
-            return ""
-        height = [np.ceil((len(BARS) - 1) * n / most) for n in self.histogram]
-        return "".join(BARS[int(h)] for h in height)
 
 
 @dataclass(frozen=True)
@@ -67,24 +53,21 @@ class Stamps:
 
 
 @dataclass(frozen=True, eq=False)
-class TopicInfo:
-    """One topic. stamps: None without headers, or if they cannot be read.
+class Messages:
+    """What the messages of a topic say. size: bytes. stamps: None without headers.
 
-    missing: sequence numbers left out, None where nobody counted.
+    missing: sequence numbers left out, None where nobody counted. unreadable: why some cannot be
+    read; empty if all can.
     """
 
-    topic: str
-    msgtype: str
-    count: int
-    size: int
-    times: LogTimes = LogTimes()
+    size: int = 0
     stamps: Stamps | None = None
     missing: int | None = None
     unreadable: str = ""
 
     @property
     def odd(self) -> list[str]:
-        """What is wrong with its messages and stamps, in words."""
+        """What is wrong with them and with their stamps, in words."""
         odd = []
         if self.stamps is not None and self.stamps.clock is None:
             odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
@@ -101,28 +84,33 @@ class TopicInfo:
 
 
 @dataclass(frozen=True, eq=False)
+class TopicInfo:
+    """One topic. offered: by its publishers. messages: None if they were not read."""
+
+    topic: str
+    msgtype: str
+    count: int
+    times: LogTimes
+    offered: tuple[Profile, ...] = ()
+    messages: Messages | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class BagInfo:
     """A bag and its topics. ending: why it stops early, None if it is whole.
 
-    notes: where what it states and what is there differ, and records that are no messages.
+    made: storage, compression and release of ROS 2, as far as it says them. notes: where what it
+    states and what is there differ, and records that are no messages.
     """
 
     path: Path
     files: int
     size: int
     ending: str | None
+    made: Mapping[str, str]
     custom: Mapping[str, str]
     topics: tuple[TopicInfo, ...]
     notes: tuple[str, ...] = ()
-
-    def lost(self, topic: TopicInfo) -> int | None:
-        """Messages lost, by the recorder's count or sequence numbers; None if neither counts."""
-        said = self.custom.get(topic.topic + LOST, "")
-        if said and not said.isdecimal():
-            return None  # of several publishers
-        counts = [int(said)] if said else []
-        counts += [] if topic.missing is None else [topic.missing]
-        return max(counts, default=None)
 
     @property
     def messages(self) -> int:
@@ -130,42 +118,72 @@ class BagInfo:
         return sum(topic.count for topic in self.topics)
 
     @property
-    def duration(self) -> float:
-        """s from the first to the last log time."""
-        filled = [topic for topic in self.topics if topic.count]
-        if not filled:
-            return 0.0
-        first = min(topic.times.first_ns for topic in filled)
-        last = max(topic.times.last_ns for topic in filled)
-        return (last - first) / 1e9
+    def span_ns(self) -> tuple[int, int]:
+        """The first and the last log time; zeros without a message."""
+        ends = [(t.times.first_ns, t.times.last_ns) for t in self.topics if t.count]
+        firsts, lasts = zip(*ends or [(0, 0)], strict=True)
+        return min(firsts), max(lasts)
 
 
 def bag_info(
     path: Path | str,
     *,
+    messages: bool = False,
     topics: Collection[str] | None = None,
     definitions: Mapping[str, Definition] | None = None,
     progress: Progress = silent,
 ) -> BagInfo:
-    """Read the whole bag once, or these topics; an unfinished one as far as it goes.
+    """Look into a bag; into an unfinished one as far as it goes.
 
-    Raises BagError as `Bag` does.
+    Args:
+        path: where it is.
+        messages: read every message, too.
+        topics: only these (None: all).
+        definitions: of message types that the bag does not define.
+        progress: told how far it is.
+
+    Raises:
+        BagError: as `Bag`.
     """
     with Bag(path, unfinished=True, definitions=definitions) as bag:
-        found = {
-            topic: _Collector(bag, topic, msgtype)
-            for topic, msgtype in bag.topics.items()
-            if topics is None or topic in topics
-        }
-        for channel, batch in bag.batches(list(found), progress=progress):
-            found[channel.topic].add(batch, bag.strand(channel))
+        wanted = [topic for topic in bag.topics if topics is None or topic in topics]
+        looked: dict[str, _Collector] = {}
+        times: dict[str, list[IntArray]] = {topic: [] for topic in wanted}
+        if messages:
+            looked = {topic: _Collector(bag, topic) for topic in wanted}
+            for channel, batch in bag.batches(wanted, progress=progress):
+                looked[channel.topic].add(batch, bag.strand(channel))
+                times[channel.topic].append(batch.log_ns)
+        else:
+            for topic, log_ns in bag.log_times(wanted):
+                times[topic].append(log_ns)
+        found = []
+        for topic, parts in times.items():
+            log_ns = np.concatenate([np.empty(0, np.int64), *parts])
+            order = np.argsort(log_ns, kind="stable")
+            log_ns = log_ns[order]
+            said = looked[topic].messages(order, log_ns) if messages else None
+            found.append(
+                TopicInfo(
+                    topic,
+                    bag.topics[topic],
+                    len(log_ns),
+                    _log_times(log_ns),
+                    bag.offered(topic),
+                    said,
+                )
+            )
         return BagInfo(
             path=bag.path,
             files=len(bag.files),
             size=sum(file.stat().st_size for file in bag.files),
             ending=bag.ending,
+            made={
+                **{name: ", ".join(found_in) for name, found_in in bag.kinds.items()},
+                "ros_distro": bag.release,
+            },
             custom=bag.custom,
-            topics=tuple(collector.info() for collector in found.values()),
+            topics=tuple(found),
             notes=(*bag.lost, *bag.disagreements),
         )
 
@@ -174,9 +192,7 @@ def bag_info(
 class _Collector:
     bag: Bag
     topic: str
-    msgtype: str
     size: int = 0
-    log_ns: list[IntArray] = field(default_factory=list)
     stamp_ns: list[IntArray] = field(default_factory=list)
     sequence: dict[int, list[IntArray]] = field(default_factory=dict)
     unreadable: str = ""
@@ -192,7 +208,6 @@ class _Collector:
 
     def add(self, batch: Batch, strand: int) -> None:
         self.size += int(batch.size.sum())
-        self.log_ns.append(batch.log_ns)
         self.sequence.setdefault(strand, []).append(batch.sequence)
         if batch.unreadable and not self.unreadable:
             self.unreadable = next(iter(batch.unreadable.values()))
@@ -206,43 +221,32 @@ class _Collector:
             return
         self.stamp_ns.append(seconds * 10**9 + nanoseconds)
 
-    def info(self) -> TopicInfo:
-        count = sum(map(len, self.log_ns))
-        if not count:
-            return TopicInfo(self.topic, self.msgtype, 0, self.size, unreadable=self.unreadable)
-        log_ns = np.concatenate(self.log_ns)
-        order = np.argsort(log_ns, kind="stable")
-        log_ns = log_ns[order]
+    def messages(self, order: IntArray, log_ns: IntArray) -> Messages:
+        """What was found; order: of the messages by their log times."""
         counted = [missing(np.concatenate(parts)) for parts in self.sequence.values()]
         known = [count for count in counted if count is not None]
         stamps = None
-        if self._gatherer is not None:
+        if self._gatherer is not None and len(log_ns):
             stamps = _stamps(np.concatenate(self.stamp_ns)[order], log_ns)
-        return TopicInfo(
-            self.topic,
-            self.msgtype,
-            count,
-            self.size,
-            _log_times(log_ns),
-            stamps,
-            sum(known) if known else None,
-            self.unreadable,
-        )
+        return Messages(self.size, stamps, sum(known) if known else None, self.unreadable)
 
 
 def _log_times(log_ns: IntArray) -> LogTimes:
-    """What log times (N,) show, ascending, N > 0."""
+    """What log times (N,) show, ascending."""
+    if not len(log_ns):
+        return LogTimes()
     first_ns, last_ns = int(log_ns[0]), int(log_ns[-1])
     if len(log_ns) == 1:
         return LogTimes(first_ns, last_ns)
     intervals = np.diff(log_ns) / 1e9
-    median = float(np.median(intervals))
+    median = float(np.quantile(intervals, 0.5))  # np.median imports a slow part of NumPy
     scale = median if median > 0 else float(np.max(intervals)) or 1.0
     return LogTimes(
         first_ns,
         last_ns,
+        1e9 * len(intervals) / (last_ns - first_ns) if last_ns > first_ns else float("nan"),
         median,
-        tuple(np.histogram(intervals / scale, BINS)[0].tolist()),
+        float(np.quantile(np.abs(intervals - median), 0.95)),
         int((intervals > GAP * scale).sum()),
         float(np.max(intervals)),
     )
@@ -252,20 +256,3 @@ def _stamps(stamp_ns: IntArray, log_ns: IntArray) -> Stamps:
     steps = np.diff(stamp_ns)
     clock = clock_relation(stamp_ns, log_ns) if stamp_ns.any() else None
     return Stamps(int((steps < 0).sum()), int((steps == 0).sum()), clock)
-
-
-def missing(sequence: IntArray) -> int | None:
-    """Numbers left out by a recorder that counted up from message to message; None otherwise.
-
-    A publisher that came back counts anew: far below, and then for itself.
-    """
-    counts = [np.diff(np.sort(part)) for part in np.split(sequence, anew(sequence))]
-    steps = np.concatenate(counts)
-    if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
-        return None
-    return int(np.maximum(steps - 1, 0).sum())
-
-
-def anew(sequence: IntArray) -> IntArray:
-    """Where a count goes back by more than messages overtake each other."""
-    return np.flatnonzero(np.diff(sequence) < -SOON) + 1

@@ -3,16 +3,15 @@
 Memory: one chunk, and two numbers a signal.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
-from bags.recordings.cdr import Step
+from bags.recordings.cdr import Step, is_strings
 from bags.recordings.message_types import decode, fields_of
 from bags.signals.columns import TopicReader
 from bags.signals.signal import ANGLES, QUATERNION, SignalPath, numeric_paths
@@ -164,21 +163,11 @@ def _named(
     """The elements by the strings beside them, if each has one of its own: joints by name."""
     if not path.every or len(path.steps) != 1 or not 0 < len(elements) <= MAX_NAMED:
         return []
-    for name, (kind, inner) in _kinds(fields_of(msgtype, types)).items():
+    for name, description in fields_of(msgtype, types).items():
         if name == path.steps[0].field:
             break
-        texts = list(getattr(message, name)) if kind and inner == "string" else []
+        texts = list(getattr(message, name)) if is_strings(description) else []
         if len(texts) == len(elements) == len(set(texts)) and all(texts):
             steps = [Step(path.steps[0].field, key=(name, text)) for text in texts]
             return [replace(path, steps=(step,)) for step in steps if "]" not in str(step)[:-1]]
     return []
-
-
-def _kinds(fields: Mapping[str, Any]) -> dict[str, tuple[bool, str]]:
-    """Field -> (whether it is an array, the name of its elements' type)."""
-    found = {}
-    for name, description in fields.items():
-        array = description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-        element = description[1][0] if array else description
-        found[name] = (array, str(element[1][0] if element[0] == Nodetype.BASE else element[1]))
-    return found

@@ -11,11 +11,10 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.description import METADATA
-from bags.recordings.message_types import decode, types_in_bag
-from bags.recordings.storage import Channel
-from bags.recordings.writer import RESERVE, BagWriter
-from bags.tools.copying import copy_messages
-from bags.tools.info import missing
+from bags.recordings.message_types import decode
+from bags.recordings.writer import RESERVE
+from bags.signals.timing import missing
+from bags.tools.convert import convert
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -46,14 +45,11 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -
     back and compared. Raises BagError if nothing can be read or if `out` exists.
     """
     path, out = Path(path), Path(out)
-    with Bag(path, salvage=True) as bag, BagWriter(out, custom=bag.custom) as writer:
-        copied = copy_messages([bag], [writer], lambda _: writer, nearly=True, progress=progress)
-        statements = bag.statements
-        if not copied.messages and copied.notes:
-            raise BagError(f"{path}: no message can be read: {'; '.join(copied.notes[:5])}")
-        counts = dict(writer.counts)
-    lost = (*copied.notes, *_verify(out, copied.sums))
-    return Recovery(out, counts, lost, statements)
+    with Bag(path, salvage=True) as bag:
+        copied = convert([bag], out, nearly=True, progress=progress)
+        statements, topics = bag.statements, bag.topics
+    counts = {topic: copied.sums.get(topic, (0, 0))[0] for topic in topics}
+    return Recovery(out, counts, (*copied.notes, *_verify(out, copied.sums)), statements)
 
 
 def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
@@ -66,7 +62,7 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             topic = channel.topic
             if channel.encoding == "cdr" and channel.key not in looked_into:
                 looked_into.add(channel.key)
-                if why := _unreadable(channel, batch.data(0)):
+                if why := _unreadable(bag, topic, batch.data(0)):
                     yield f"{topic}: its messages are kept, and cannot be read: {why}"
             count, total = found.get(topic, (0, 0))
             total += sum(zlib.crc32(batch.data(k)) for k in range(len(batch)))
@@ -80,14 +76,14 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             yield f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
 
 
-def _unreadable(channel: Channel, data: bytes) -> str:
+def _unreadable(bag: Bag, topic: str, data: bytes) -> str:
     """Why a message is none of its type; empty if it is, or if its type is not known."""
     try:
-        types = types_in_bag(channel.msgtype, channel.definition)
+        kind = bag.types_on(topic)
     except BagError:
         return ""
     try:
-        decode(data, channel.msgtype, types)
+        decode(data, *kind)
     except BagError as error:
         return str(error)
     return ""
@@ -110,8 +106,8 @@ def repair(bag: Path) -> int:
         raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
     with tempfile.TemporaryDirectory(dir=bag.parent, prefix=f".{bag.name}.repair.") as folder:
         whole = Path(folder) / bag.name
-        with Bag(bag, salvage=True) as old, BagWriter(whole, custom=old.custom) as writer:
-            copied = copy_messages([old], [writer], lambda _: writer, nearly=True)
+        with Bag(bag, salvage=True) as old:
+            copied = convert([old], whole, nearly=True)
         for name in (f"{bag.name}.mcap", METADATA):  # without metadata.yaml it is still unfinished
             (whole / name).replace(bag / name)
     (bag / RESERVE).unlink(missing_ok=True)

@@ -85,11 +85,11 @@ class Scene:
         self._samples: deque[Sample] = deque(maxlen=MOST_SAMPLES)
         self._forecasts: deque[Sample] = deque(maxlen=MOST_FORECASTS)
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        # How many samples, forecasts and events there have been.
+        self._sampled = self._foreseen = self._told = 0
         self._nodes: dict[str, Said] = {}
         self._names: tuple[str, ...] = ()
         self._ended = ""
-        # How many samples, forecasts and events there have been.
-        self._sampled = self._foreseen = self._told = 0
 
     def sample(self, stamp_ns: int, numbers: Mapping[str, float]) -> None:
         """A sample was judged."""

@@ -5,8 +5,9 @@ one excitation, stretches of time are held out instead. Each fold is simulated b
 others, every stretch from a start that is found on its first samples, which are not scored. Taken
 is the simplest model that is within one standard error of the best.
 
-What a person may expect is promised by the same errors, and by none that chose: for each fold the
-model is chosen by the other folds alone, and its error on that fold counts.
+What a person may expect is promised by the same errors: for each fold the model is chosen by the
+other folds alone, of what was tried, and its error on that fold counts. Which attempts were tried
+closely enough to be chosen is not held out: a glance at one fold, and the best so far, decide that.
 Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Section
 3.4.3 (the rule of one standard error).
 """
@@ -118,7 +119,7 @@ class HeldOut:
         """DataError if there is too little of it."""
         groups = by_excitation(data)
         if len(groups) == 1:
-            on, folds = "stretches of time", list(_folds_in_time(data))
+            on, folds = "stretches of the only excitation", list(_folds_in_time(data))
         else:
             on, folds = "excitations", list(_folds_of(groups))
         spread = np.concatenate([trial.y for trial in data]).std(axis=0)

@@ -239,7 +239,7 @@ def _inferred(model: Model, tube: Members) -> str:
         return ""
     shares = [1 - part * peak / width for _, width, (part, peak) in rows]
     shown = " and ".join(
-        f"{signal.name} {text.above(share, 2)}"
+        f"{signal.name} {text.below(share, 2)}"
         for (signal, _, _), share in zip(rows, shares, strict=True)
     )
     nearly = f", {NEARLY}" if max(shares) < LITTLE else ""

@@ -6,7 +6,6 @@ import os
 import struct
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +13,24 @@ import numpy as np
 import pytest
 import typer
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from typer.testing import CliRunner
 
 from bags.commands.bag_cli import bag_app
 from bags.commands.cli import app
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import definitions_from
 from bags.recordings.folders import expand_bags
+from bags.recordings.message_types import types_in_bag
 from bags.recordings.writer import BagWriter
 from bags.samples import schunk
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
+from bags.tools.copies import Rows
 from bags.tools.fitness import Level, check_fitness
-from bags.tools.importing import Rows, import_table
+from bags.tools.importing import import_table
 from bags.tools.info import bag_info
+from nlsid import frame
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.identification import Polynomial, identify
 from tests.bag_messages import (
@@ -118,22 +122,24 @@ def test_info_states_counts_rates_clocks_and_losses(tmp_path: Path) -> None:
             data = odometry(stamp - 5 * 10**9, float(k))
             times = {"log_time_ns": stamp, "publish_time_ns": stamp}
             writer.write(ODOM, ODOM_TYPE, data, **times, sequence=k + 3 * (k > 100))
-    info = bag_info(tmp_path / "x", topics={ODOM})
-    [topic] = info.topics
-    assert info.lost(topic) == 3
-    assert replace(info, custom={f"{ODOM} lost": "5"}).lost(topic) == 5
-    assert replace(info, custom={}).lost(replace(topic, missing=None)) is None
     assert not bag_info(tmp_path / "x", topics=()).topics
-    assert topic.stamps is not None
-    assert (topic.count, topic.missing) == (200, 3)
-    assert (topic.stamps.backward, topic.stamps.duplicates) == (0, 0)
-    assert topic.times.rate == pytest.approx(40.0)
-    assert topic.stamps.clock is not None
-    assert topic.stamps.clock.offset == pytest.approx(-5.0)
-    assert sum(topic.times.histogram) == 199
-    output = run("info", tmp_path / "x")
-    for part in ("200", "40 Hz", "-5.000 s", "3 sequence numbers are missing", "robot: car"):
-        assert part in output
+    for read in (False, True):
+        [topic] = bag_info(tmp_path / "x", messages=read).topics
+        assert topic.count == 200
+        assert topic.times.rate == pytest.approx(40.0)
+        assert topic.times.jitter == pytest.approx(0.0)
+        assert (topic.messages is not None) == read
+        output = run("info", tmp_path / "x", *["--messages"] * read)
+        for part in (
+            "200",
+            "40 Hz",
+            "storage mcap, compression zstd",
+            "2023-11-14 22:13",
+            "robot: car",
+        ):
+            assert part in output
+        for part in ("-5.000 s", "3 sequence numbers are missing"):
+            assert (part in output) == read
 
 
 def test_info_reads_what_there_is_of_an_unfinished_bag(bag: Path) -> None:
@@ -232,7 +238,7 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path:
 
 
 @pytest.mark.pictures
-@pytest.mark.parametrize("name", ["a.png", "a.html", "a.svg"])
+@pytest.mark.parametrize("name", ["a.png", "a.svg"])
 def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
     run("plot", bag, "--out", tmp_path / name, "-s", SPEED, "-s", f"{SPEED}|derivative(0.2 s)")
     content = (tmp_path / name).read_bytes()
@@ -242,7 +248,7 @@ def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: Path) -> None:
-    run("convert", bag, "--out", tmp_path / "part", "--start", "1", "--end", "2", "-t", ODOM)
+    run("convert", bag, "--out", tmp_path / "part", "--start", "1", "--end", "2", "--topics", "/o*")
     with Bag(tmp_path / "part") as part, Bag(bag) as whole:
         expected = [
             m
@@ -253,22 +259,89 @@ def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: P
         assert len(expected) == 40
     with pytest.raises(BagError, match="exists already"):
         run("convert", bag, "--out", tmp_path / "part")
-    with pytest.raises(BagError, match="has no message there"):
+    with pytest.raises(BagError, match="no message can be read there"):
         run("convert", bag, "--out", tmp_path / "none", "--start", "99")
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.parametrize(("every", "count"), [("3", 3), ("2.2", 5)])
+@pytest.mark.parametrize(("how", "count"), [(("--every", "30"), 4), (("--max-size", "0.02"), 4)])
 def test_parts_of_a_bag_merge_to_the_whole(
-    bag: Path, tmp_path: Path, every: str, count: int
+    tmp_path: Path, how: tuple[str, str], count: int
 ) -> None:
-    """The bag lasts 9.975 s; a rest of less than half a part is no part of its own."""
-    run("convert", bag, "--out", tmp_path / "part", "--every", every)
+    bag = speed_bag(tmp_path / "long", np.arange(4000.0), np.arange(4000.0))
+    run("convert", bag, "--out", tmp_path / "part", *how)
     parts = sorted(tmp_path.glob("part_*"))
     assert len(parts) == count
     run("convert", *reversed(parts), "--out", tmp_path / "again")
     with Bag(tmp_path / "again") as again, Bag(bag) as whole:
         assert list(again.messages()) == list(whole.messages())
+
+
+CHOSEN: dict[tuple[str, ...], tuple[int, float]] = {  # messages of the trial, from s on
+    ("--end", "2"): (160, 0.0),
+    ("--start", "2023-11-14T22:13:29.5"): (40, 9.5),
+    ("--start", str((START_NS + 95 * 10**8) // 10**9)): (80, 9.0),
+    ("--around", "5", "--before", "0.1", "--after", "0.05"): (14, 4.9),
+    ("--around", ODOM, "--before", "0", "--after", "0"): (800, 0.0),
+}
+
+
+@pytest.mark.parametrize("options", CHOSEN)
+def test_a_moment_is_s_or_a_date_and_an_event_a_moment_or_a_topic(
+    bag: Path, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    run("convert", bag, "--out", tmp_path / "part", *options)
+    with Bag(tmp_path / "part") as part:
+        times = [message.log_time_ns for message in part.messages()]
+    count, first = CHOSEN[options]
+    assert (len(times), times[0]) == (count, START_NS + round(first * 1e9))
+
+
+def test_names_and_times_change_and_what_does_not_fit_is_refused(bag: Path, tmp_path: Path) -> None:
+    speed = SPEED.replace(ODOM, "/robot/odom")
+    named = ["--rename", f"{ODOM}=/robot/odom"]
+    run("convert", bag, "--out", tmp_path / "moved", "--restamp", "+10", *named)
+    moved = read_signals(tmp_path / "moved", [speed])[speed]
+    before = read_signals(bag, [SPEED])[SPEED]
+    np.testing.assert_array_equal(moved.values, before.values)
+    np.testing.assert_array_equal(moved.stamp_ns, before.stamp_ns + 10 * 10**9)
+    with BagWriter(tmp_path / "late") as writer:
+        for k in range(3):
+            data = odometry(START_NS + k, float(k))
+            writer.write(ODOM, ODOM_TYPE, data, log_time_ns=7 + k, publish_time_ns=7 + k)
+    for rule, expected in (("header", START_NS), ("log", 7)):
+        run("convert", tmp_path / "late", "--out", tmp_path / rule, "--restamp", rule)
+        with Bag(tmp_path / rule) as copy:
+            logged = next(iter(copy.messages())).log_time_ns
+        stamped = read_signals(tmp_path / rule, [SPEED])[SPEED].stamp_ns[0]
+        assert (logged, stamped) == (expected, expected)
+    for wrong in (
+        ["--topics", "/none*"],
+        ["--rename", f"{ODOM}={CMD}"],
+        ["--rename", f"{ODOM}=/one", "--rename", f"{CMD}=/one"],
+        *(["--restamp", rule] for rule in ("soon", "nan", "inf", "1e300", "+3e9", "-3e9")),
+        *(["--start", moment] for moment in ("noon", "nan", "-inf", "1e300", "2024-13-01")),
+        ["--max-size", "0"],
+        ["--max-size", "nan"],
+        ["--storage", "hdf5"],
+        ["--compression", "zip"],
+        ["--every", "0"],
+    ):
+        with pytest.raises(BagError):
+            run("convert", bag, "--out", tmp_path / "wrong", *wrong)
+        assert not (tmp_path / "wrong").exists()
+
+
+@pytest.mark.parametrize(("storage", "name"), [("sqlite3", "copy"), ("ros1", "copy.bag")])
+def test_other_storages_hold_the_same_numbers(
+    bag: Path, tmp_path: Path, storage: str, name: str
+) -> None:
+    said = run("convert", bag, "--out", tmp_path / "copy", "--storage", storage)
+    assert f"{storage} keeps no sequence numbers" in said
+    assert storage in run("info", tmp_path / name)
+    copy, before = (read_signals(b, [SPEED])[SPEED] for b in (tmp_path / name, bag))
+    np.testing.assert_array_equal(copy.values, before.values)
+    np.testing.assert_array_equal(copy.stamp_ns, before.stamp_ns)
 
 
 def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
@@ -313,35 +386,60 @@ def test_exported_topics_hold_the_bags_numbers_bit_for_bit(
     samples = read_signals(bag, [SPEED])[SPEED]
     np.testing.assert_array_equal(table["twist.twist.linear.x"], samples.values)
     np.testing.assert_array_equal(np.asarray(table["stamp_ns"], dtype=np.int64), samples.stamp_ns)
-    assert len(table["pose.covariance[35]"]) == 400
+    covariance = table["pose.covariance"][399]
+    assert list(json.loads(covariance) if form == "csv" else covariance) == [0.0] * 36
+    assert set(table["header.frame_id"]) == set(frame(bag, [ODOM])["header.frame_id"])
 
 
 def table_in(path: Path) -> Any:
     if path.suffix == ".csv":
         with path.open() as stream:
             rows = list(csv.DictReader(stream))
-        return {
-            name: [float(row[name]) for row in rows]
-            if "ns" not in name
-            else [int(row[name]) for row in rows]
-            for name in rows[0]
-        }
+        columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+        columns["twist.twist.linear.x"] = list(map(float, columns["twist.twist.linear.x"]))
+        return columns
     from pyarrow import parquet
 
     table = parquet.read_table(path)
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def test_an_array_of_changing_length_is_left_out_and_named(tmp_path: Path) -> None:
-    from tests.bag_messages import joints
+def test_what_changes_its_length_and_what_is_nested_are_lists_of_true_types(tmp_path: Path) -> None:
+    text = "byte[] codes\nbool on\nstring word\nstring[] words\ngeometry_msgs/Point[] points\n"
+    defined = definitions_from({"my/msg/All": text})["my/msg/All"]
+    embedded = MessageDefinition(MessageDefinitionFormat.MSG, defined.text)
+    types = types_in_bag("my/msg/All", embedded)
+    point = types.types["geometry_msgs/msg/Point"]
+    with BagWriter(tmp_path / "all") as writer:
+        writer.add_topic("/all", "my/msg/All", definition=defined)
+        for k in range(40):
+            codes = np.full(k % 3, 200, np.uint8)
+            words, points = ["a"] * (k % 2), [point(float(k), 0.0, 0.0)] * (k % 2 + 1)
+            message: Any = types.types["my/msg/All"](codes, k > 5, f"w{k}", words, points)
+            data = bytes(types.serialize_cdr(message, "my/msg/All"))
+            writer.write("/all", "my/msg/All", data, log_time_ns=k, publish_time_ns=k)
+    rows = frame(tmp_path / "all", ["/all"])
+    assert rows["on"].dtype == bool
+    assert rows["word"].tolist() == [f"w{k}" for k in range(40)]
+    assert [list(codes) for codes in rows["codes"][:3]] == [[], [200], [200, 200]]
+    assert rows["words"].tolist()[:2] == [[], ["a"]]
+    assert rows["points"].iloc[1] == [{"x": 1.0, "y": 0.0, "z": 0.0}] * 2
+    run("export", tmp_path / "all", "--out", tmp_path / "tables")
+    with (tmp_path / "tables" / "all.csv").open() as stream:
+        cells = list(csv.DictReader(stream))
+    assert [json.loads(row["codes"]) for row in cells[:3]] == [[], [200], [200, 200]]
+    assert (cells[7]["on"], cells[7]["word"], cells[7]["words"]) == ("True", "w7", '["a"]')
 
-    with BagWriter(tmp_path / "arm") as writer:
-        for k in range(4):
-            data = joints(START_NS + k, [0.5] * (1 + k % 2))
-            writer.write("/arm", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
-    output = run("export", tmp_path / "arm", "--out", tmp_path / "tables")
-    assert "left out: /arm:position[*]" in output
-    assert "4 rows" in output
+
+def test_a_frame_has_one_time_base(bag: Path) -> None:
+    whole = frame(bag, [SPEED, CMD])
+    assert whole.index.is_monotonic_increasing
+    assert len(whole) == 400
+    assert whole.index[0].value == START_NS
+    fifth = frame(bag, [f"{SPEED}|to(km/h)", CMD], period=0.5, clock="log")
+    assert fifth.index[1].value - fifth.index[0].value == 500_000_000
+    with pytest.raises(BagError, match="has no topic /nothing"):
+        frame(bag, ["/nothing"])
 
 
 def test_a_good_recording_is_called_fit_and_bad_ones_say_why(tmp_path: Path) -> None:
@@ -364,7 +462,6 @@ def test_a_good_recording_is_called_fit_and_bad_ones_say_why(tmp_path: Path) -> 
     assert "excitation" in reasons["still"]
     assert {"saturation", "quantisation"} <= reasons["coarse"]
     assert "regularity" in reasons["ragged"]
-    assert any("same excitation as again" in f.what for f in found["good"].findings)
     output = run("check", good, "-u", COMMAND, "-y", SPEED)
     assert "fit for identification" in output
     assert "not fit" in run("check", still, "-u", COMMAND, "-y", SPEED, status=1)
@@ -433,7 +530,7 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     table = rng.standard_normal((50, 2))
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="cmd,speed", comments="")
-    said = run(
+    run(
         "import",
         tmp_path / "log.csv",
         "--out",
@@ -453,7 +550,6 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
         "--custom",
         "robot=car",
     )
-    assert f"by the message types, not by the table: {COMMAND} m/s, {SPEED} m/s; where" in said
     read = read_signals(tmp_path / "bag", [COMMAND, SPEED])
     written = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(read[COMMAND].values, written[:, 0])
@@ -499,8 +595,7 @@ SEVENTIES = r"since 1970 \(1 such rows\)"
 TABLES: list[tuple[str, Rows, list[float] | str]] = [
     ("t,speed\n0,0\n25,1\n50,2\n", BY_S, [0.0, 1.0, 2.0]),
     ("t,speed\n0,0\n25,1\n50,2\n", BY_T, r"are 25 apart, 3 rows over 50: .*--time 't\|unit\(ms\)'"),
-    ("t,speed\n0,1\n0.1,2\n0.1,2.5\n0.2,3\n", Rows(time="t", drop_repeats=True), [1.0, 2.0, 3.0]),
-    ("t,speed\n0,1\n0.1,2\n0.1,2.5\n", BY_T, "does not increase after row 1: .*--drop-repeats"),
+    ("t,speed\n0,1\n0.1,2\n0.1,2.5\n", BY_T, "does not increase after row 1"),
     ('t,"speed",mode\n0.0,1.5,auto\n0.1,3,"by, hand"\n', BY_T, [1.5, 3.0]),
     ("t,speed\n0,1\n,2\n1,3\n", BY_T, r"^no time in row 1 \(1 such rows\)$"),
     ("t,speed\n0,1\n0.1,fast\n0.2,2\n", BY_T, "'fast' in line 3, column 'speed' is no number$"),
@@ -518,7 +613,7 @@ TABLES: list[tuple[str, Rows, list[float] | str]] = [
         BY_T,
         f"^the time of row 1 is 2147483648 s {SEVENTIES}",
     ),
-    ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start_ns=10**8), [1.0, 2.0]),
+    ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start=0.1), [1.0, 2.0]),
 ]
 
 

@@ -152,7 +152,6 @@ def test_the_split_bag_of_five_files_is_one_with_stamps_2_ns_apart() -> None:
             assert len(bag.files) == 5
     info = bag_info(PY / "mcap" / "wbag")
     assert {topic.times.interval for topic in info.topics} == {2e-9}
-    assert all(topic.times.rate == pytest.approx(5e8) for topic in info.topics)
 
 
 @needs_resources
@@ -195,15 +194,16 @@ def test_bags_without_messages_metadata_or_files(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not COUGARS.is_dir(), reason="needs cougars_auv in ../shared/data")
 def test_the_replayed_bag_of_a_real_vehicle() -> None:
-    info = {topic.topic: topic for topic in bag_info(COUGARS).topics}
+    info = {topic.topic: topic for topic in bag_info(COUGARS, messages=True).topics}
     assert sum(topic.count for topic in info.values()) == 18558
     command = info["/coug2/controls/command"]
     assert (command.msgtype, command.count) == ("frost_interfaces/msg/UCommand", 1494)
     assert command.times.rate == pytest.approx(12.5, abs=0.01)
     for name in ("/coug2/controls/command", "/coug2/depth_data", "/coug2/dvl/velocity"):
-        stamps = info[name].stamps
-        assert stamps is not None
-        clock = stamps.clock
+        said = info[name].messages
+        assert said is not None
+        assert said.stamps is not None
+        clock = said.stamps.clock
         assert clock is not None
         assert clock.offset == pytest.approx(-514_944, abs=0.1)
         assert clock.drift == 0.0

@@ -258,6 +258,7 @@ def fuzz(folder: str, first: int, contents: list[bytes]) -> dict[str, int]:
 
 def _info(file: Path, _: Path) -> None:
     bag_info(file)
+    bag_info(file, messages=True)
 
 
 def _read(file: Path, _: Path) -> None:

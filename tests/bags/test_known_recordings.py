@@ -171,9 +171,8 @@ def test_what_else_the_known_recordings_are_to_say(tmp_path: Path) -> None:
     run("export", CASES / "order_of_files" / "c.bag", "--out", out, "-s", derived)
     [steps] = [v for k, v in table(out, "s").items() if "derivative" in k]
     np.testing.assert_allclose([float(v) for v in steps[4:]], 50.0)
-    nothing = run("export", CASES / "small_things" / "strings.mcap", "--out", tmp_path / "s")
-    assert nothing[0] == 2
-    assert "nothing was exported: /status" in nothing[1]
+    run("export", CASES / "small_things" / "strings.mcap", "--out", tmp_path / "s")
+    assert "data" in table(tmp_path / "s", "status")
     run("export", CASES / "small_things" / "empty.mcap", "--out", tmp_path / "e")
     assert list(table(tmp_path / "e", "go")) == ["log_time_ns", "publish_time_ns"]
 
@@ -189,7 +188,7 @@ def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path)
         assert set(values["/t:a"].values) == {1.0}
         assert set(values["/t:b"].values) == {2.0}
     run("convert", source, "--out", tmp_path / "all")
-    assert "parts with different definitions" in run("info", tmp_path / "all")[1]
+    assert "parts with different definitions" in run("info", "--messages", tmp_path / "all")[1]
 
 
 @needs_cases
@@ -197,7 +196,7 @@ def test_each_half_keeps_the_definition_that_it_was_written_with(tmp_path: Path)
 def test_a_copy_keeps_all_that_is_no_message(tmp_path: Path, how: str, more: list[str]) -> None:
     run(how, CASES / "what_a_copy_loses" / "a.mcap", "--out", tmp_path / "copy", *more)
     copy = tmp_path / ("copy_01" if more else "copy")
-    said = run("info", copy)[1]
+    said = run("info", "--messages", copy)[1]
     for word in ("/quiet", "3 sequence numbers are missing", "robot: x"):
         assert word in said
     with Bag(CASES / "what_a_copy_loses" / "a.mcap") as before, Bag(copy) as after:
@@ -367,7 +366,7 @@ def test_a_message_that_cannot_be_unpacked_is_named_and_left_out_of_copies(tmp_p
     )
     with pytest.raises(BagError, match=r"/x: message 3 cannot be read"):
         read_signals(bag, ["/x:data"])
-    assert "cannot be read" in run("info", bag)[1]
+    assert "cannot be read" in run("info", "--messages", bag)[1]
     status, said = run("export", bag, "--out", tmp_path / "out")
     assert (status, table(tmp_path / "out", "y")["data"]) == (0, ["7.0"])
     assert "left out" in said
@@ -563,7 +562,10 @@ def test_one_damaged_topic_of_ros_1_does_not_spoil_the_others(tmp_path: Path) ->
     good = ros1_bag(tmp_path / "good.bag", [(0, struct.pack("<d", k)) for k in range(10)])
     bad = ros1_bag(tmp_path / "bad.bag", [(0, b"\0" * 3)] * 10)
     assert "10 messages" in run("info", bad)[1]
-    assert "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1" in run("info", bad)[1]
+    assert (
+        "speed: cannot be read: not a 'std_msgs/msg/Float64' of ROS 1"
+        in run("info", "--messages", bad)[1]
+    )
     status, said = run("export", bad, "--out", tmp_path / "out")
     assert (status, "nothing was exported" in said) == (2, True)
     run("convert", good, bad, "--out", tmp_path / "all")
@@ -647,10 +649,8 @@ def test_numbers_keep_their_types_in_arrays_and_nested_messages(tmp_path: Path) 
     assert {name: values[0] for name, values in columns.items() if "time" not in name} == {
         "i.u": str(2**64 - 1),
         "i.s": "-3",
-        "n[0]": str(2**53 + 1),
-        "n[1]": str(-(2**53) - 1),
-        "on[0]": "True",
-        "on[1]": "False",
+        "n": str([2**53 + 1, -(2**53) - 1]),
+        "on": "[true, false]",
     }
 
 
@@ -753,12 +753,12 @@ def test_a_copy_of_a_copy_still_tells_what_was_lost(tmp_path: Path) -> None:
     assert channel[0] == "/cmd"
     run("convert", file, "--out", tmp_path / "one")
     run("convert", tmp_path / "one", "--out", tmp_path / "two")
-    assert "4 sequence numbers are missing" in run("info", tmp_path / "two")[1]
+    assert "4 sequence numbers are missing" in run("info", "--messages", tmp_path / "two")[1]
     with Bag(tmp_path / "two") as bag:
         assert len(list(bag.kept_beside)) == 2
     merged = shutil.copytree(tmp_path / "one", tmp_path / "again")
     run("convert", tmp_path / "one", merged, "--out", tmp_path / "both")
-    assert "8 sequence numbers are missing" in run("info", tmp_path / "both")[1]
+    assert "8 sequence numbers are missing" in run("info", "--messages", tmp_path / "both")[1]
 
 
 def test_what_only_a_file_says_of_its_bag_is_kept(tmp_path: Path) -> None:
@@ -845,7 +845,7 @@ def unknown_connection(file: Path) -> Path:
 
 # how it is made, status of `recover`, messages there, what is said, what `convert` says (status 2)
 TOLD = [
-    (without_data, 1, 19, "1 messages have no time or no data", "NoneType as data"),
+    (without_data, 1, 19, "1 messages have no time or no data", "have no time or no data"),
     (torn_wal, 1, 19, "the last 1 pages in a-wal are damaged", ""),
     (flipped_loose, 1, 20, "the checksum of all differs", "the checksum of all differs"),
     (late_chunk, 0, 20, "nothing was lost", ""),
@@ -896,7 +896,7 @@ def test_of_a_damaged_sqlite_file_both_ends_come_back(tmp_path: Path) -> None:
         read_signals(file, ["/x:data"])
     found = recover(file, tmp_path / "whole")
     assert 2500 < found.messages < 3000
-    assert "messages from" in found.lost[0]
+    assert "malformed" in found.lost[0]
     values = read_signals(tmp_path / "whole", ["/x:data"])["/x:data"].values
     assert {0.0, 2999.0} < set(values) < set(ramp(3000))
     file.write_bytes(content[: middle - 100])

@@ -21,7 +21,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Recent
-from bags.tools.edit import convert, parts_every
+from bags.tools.copies import Into
 from bags.tools.recover import recover, repair
 from nlsid_core.errors import BagError
 from tests.bag_messages import START_NS, converted, speed_bag
@@ -120,8 +120,8 @@ def test_copies_keep_what_was_offered_and_every_reader_finds_every_message(
 
 
 def test_parts_of_a_split_keep_what_was_offered(tmp_path: Path) -> None:
-    with Bag(ros2_bag(tmp_path / "bag")) as bag:
-        first, second = convert([bag], parts_every([bag], tmp_path / "part", 10.0)).parts
+    bag = ros2_bag(tmp_path / "bag")
+    first, second = converted(tmp_path / "part", bag, into=Into(every=10.0)).parts
     assert_kept(first, 10)
     assert_kept(second, 10)  # without a message of the latched topic
 

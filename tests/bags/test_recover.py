@@ -130,15 +130,11 @@ def test_nothing_to_recover_is_an_error_and_leaves_nothing(tmp_path: Path) -> No
 def test_an_interrupted_copy_leaves_nothing_half_written(tmp_path: Path) -> None:
     bag = speed_bag(tmp_path / "run", np.arange(3000.0), np.arange(3000.0))
     script = (
-        "import os, signal, sys\n"
-        "from bags.tools import recover\n"
+        "import os, signal\n"
+        "from bags.tools.recover import recover\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # some shells ignore it
-        "original = recover.copy_messages\n"
-        "def copy(*a, **k):\n"
-        "    original(*a, **k)\n"
-        "    os.kill(os.getpid(), signal.SIGINT)\n"
-        "recover.copy_messages = copy\n"
-        f"recover.recover({str(bag)!r}, {str(tmp_path / 'whole')!r})\n"
+        "def interrupt(*_): os.kill(os.getpid(), signal.SIGINT)\n"
+        f"recover({str(bag)!r}, {str(tmp_path / 'whole')!r}, progress=interrupt)\n"
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
     assert run.returncode in (-signal.SIGINT, 130, 1)

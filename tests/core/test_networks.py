@@ -234,22 +234,20 @@ def test_a_slide_that_comes_to_rest_in_dry_friction_is_found_and_proved() -> Non
 
 @pytest.fixture(scope="module")
 def oscillator() -> Fit[CellNetwork]:
-    return identify(duffing.trials(AMPLITUDES), OSCILLATOR, comparators=(Sem(),))
+    return identify(duffing.trials(AMPLITUDES), OSCILLATOR)
 
 
 @pytest.mark.slow
 def test_a_duffing_oscillator_is_found_and_proved(oscillator: Fit[CellNetwork]) -> None:
-    """The loop to its noise, unproved; unrolled and proved, 5 % where linear models have 20 %."""
+    """Unrolled and proved, 5 % where linear models have 20 %."""
     fresh, louder = duffing.trials([0.12, 0.22], seed=1), duffing.trials([0.28], seed=2)
-    loop, proved = oscillator["sem"], oscillator["sem_certified"]
-    assert loop.proof is None
-    assert loop.error_percent(fresh) < 150 * duffing.NOISE
+    proved = oscillator.chosen
     assert proved.error_percent(fresh) < 5.0
     assert proved.error_percent(louder) < 12.0
     train = duffing.trials(AMPLITUDES)
     straight = identify(train, Polynomial(3), method=Sem(), comparators=())
     assert straight.chosen.error_percent(fresh) > 20.0
-    first, second, _ = oscillator.history.steps
+    first, second = oscillator.history.steps
     assert second.value < 0.7 * first.value
     document = oscillator.proof.document(oscillator.model, "m.json")
     document["claim"]["rate"] = 0.5
@@ -268,11 +266,11 @@ def test_a_well_damped_loop_is_proved_as_it_is() -> None:
 
 @pytest.mark.slow
 def test_a_tube_of_many_maps_is_proved() -> None:
-    """Five maps, 32 corners: one matrix stands for them in the search, the kernel decides all."""
+    """Three maps, eight corners: one matrix stands for them in the search; the kernel decides."""
     train = duffing.trials(AMPLITUDES)
-    made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, stages=5))
+    made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, stages=3))
     found = identify(train, made, comparators=())
-    assert len(found.model.maps) >= 3
+    assert len(found.model.maps) == 3
     tube = design(OutputTube(found.model, train, duffing.trials(AMPLITUDES, seed=3)))
     assert "for ever" in str(tube.verdict)
 

@@ -96,11 +96,9 @@ def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> N
 def test_a_folder_whose_folders_hold_bags_says_the_pattern(tmp_path: Path) -> None:
     fleet(tmp_path / "cars", 4)
     (tmp_path / "cars" / "empty").mkdir()
-    with pytest.raises(BagError, match=r"give the pattern '.*/cars/\*/\*\.mcap', in quotes"):
+    with pytest.raises(BagError, match=r"give a pattern, '.*/\*/\*', in quotes"):
         named_bags([tmp_path / "cars"])
-    with pytest.raises(BagError, match=r"the pattern '.*/\*/\*/\*\.mcap'"):
-        named_bags([tmp_path])
-    with pytest.raises(BagError, match=r"holds none \(no .mcap or .db3 or .bag\)$"):
+    with pytest.raises(BagError, match=r"holds none \(no .mcap or .db3 or .bag\)"):
         named_bags([tmp_path / "cars" / "empty"])
     assert len(named_bags([tmp_path / "cars" / "*" / "*.mcap"])) == 4
 

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType
 from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
 from bags.recordings.mcap_file import McapFile
-from bags.recordings.mcap_records import index_entries, walk_records
+from bags.recordings.mcap_records import index_offsets, walk_records
 from bags.recordings.remote import Entry, RemotePath, is_url, place
 from bags.samples import f1tenth
 from bags.signals.reader import bag_origin, read_signals
@@ -391,7 +391,7 @@ def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: P
         block = file.contents.blocks[0]
         command = next(c.id for c in file.contents.declared.channels.values() if c.topic == CMD)
         record = file._read(*(block.index or {})[command])
-        at = block.offset + int(index_entries(record, command, "")[0])
+        at = block.offset + int(index_offsets(record, command, "")[0])
     content = bytearray(local.read_bytes())
     length = int.from_bytes(content[at + 1 : at + 9], "little")
     content[at + 1 : at + 9] = (length + 1).to_bytes(8, "little")

@@ -5,7 +5,6 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,7 @@ from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
 from bags.fleet.check import CheckBag
-from bags.fleet.monitor import FleetVerdict, JudgeBag, calibration_spent
+from bags.fleet.monitor import FleetVerdict, JudgeBag
 from bags.fleet.rows import Row, read_rows, write_parquet
 from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
@@ -46,8 +45,7 @@ def held_against(funnel: Path, bags: Mapping[str, Path]) -> FleetVerdict:
     """The bags of a fleet, judged in this process."""
     design = documents.load(funnel)
     read = read_rows(JudgeBag(design, Centre.COMMAND, {}), bags, workers=Workers())
-    spent = calibration_spent(funnel.parent, design)
-    return FleetVerdict(read.rows, spent, frozenset(design.made_with))
+    return FleetVerdict(read.rows, frozenset(design.made_with))
 
 
 def checked(bags: Mapping[str, Path]) -> tuple[Row, ...]:
@@ -77,15 +75,6 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
         assert row.start == start.isoformat()
 
 
-def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
-    """The level is the square of the factor times the most that a calibration trial spent."""
-    proved = documents.load(design)
-    spent = calibration_spent(design.parent, proved)
-    tube = proved.funnel.tubes[0]
-    assert len(spent) == len(tube.measured_on) == 16
-    assert max(spent) == pytest.approx(1.0 / tube.safety_factor**2, rel=1e-3)
-
-
 @pytest.mark.slow
 def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) -> None:
     bags = {path.name: path for path in f1tenth()}
@@ -93,31 +82,13 @@ def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) ->
     tests = load_config(CONFIG).split.test
     assert {row.bag for row in found.others} == set(tests)
     assert "probability 1/9 = 0.112 at most" in found.ranks[0]
-    assert found.drift is not None
-    assert (found.drift.bags, found.drift.trials, found.drift.month) == (8, 16, "2022-01")
 
 
 def test_ranks_of_a_thousand_bags_say_two_things() -> None:
     rows = tuple(judged(k / 1000) for k in range(1000))
-    first, second = FleetVerdict(rows, (), frozenset()).ranks
+    first, second = FleetVerdict(rows, frozenset()).ranks
     assert "more than 99.9 % of what is assumed with probability 1/1001 = 0.001 at most" in first
     assert "more than 99 % of what is assumed with probability 10/1001 = 0.01 at most" in second
-
-
-def test_drift_is_the_rank_test_of_all_orders() -> None:
-    """p by the definition: how many ways of dealing the ranks are as uneven."""
-    newest, older = [0.9, 0.8, 0.7], (0.1, 0.2, 0.3, 0.4)
-    rows = (*(judged(s, "2026-02") for s in newest), judged(0.99, "2026-01"))
-    drift = FleetVerdict(rows, older, frozenset()).drift
-    every = [*newest, *older]
-    sums = [sum(sorted(every).index(s) for s in dealt) for dealt in permutations(every, 3)]
-    mean, own = sum(sums) / len(sums), sum(sorted(every).index(s) for s in newest)
-    as_uneven = sum(abs(s - mean) >= abs(own - mean) for s in sums) / len(sums)
-    assert drift is not None
-    assert drift.p == pytest.approx(as_uneven)
-    assert drift.larger == 1.0
-    assert "100 % of the pairs" in str(drift)
-    assert FleetVerdict(rows[:2], older, frozenset()).drift is None
 
 
 def test_the_command_says_who_was_outside_and_that_one_was_not_read(
@@ -160,7 +131,7 @@ def test_bags_of_the_design_that_are_not_recognised_are_said(
 ) -> None:
     rows = tuple(Row(name, "inside", marks=(name,), numbers={"spent": 0.5}) for name in "ab")
     for made_of, is_said in (("xy", True), ("bx", False), ("", False)):
-        fleet_cli._say_verdicts(FleetVerdict(rows, (), frozenset(made_of)))
+        fleet_cli._say_verdicts(FleetVerdict(rows, frozenset(made_of)))
         assert ("none of these is known" in capsys.readouterr().out) is is_said
 
 
