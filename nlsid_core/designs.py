@@ -204,8 +204,8 @@ class Design(Generic[D, P, F, S]):
         for stage in self.stages:
             trained |= {digest for _, digest in getattr(stage.model, "bags", ())}
             for tube in stage.funnel.tubes if isinstance(stage.funnel, TubeFunnel) else ():
-                trained |= {digest for _, digest in tube.designed_on}
-                calibrated |= {digest for _, digest in tube.measured_on}
+                trained |= {digest for _, digest in tube.measured.designed_on}
+                calibrated |= {digest for _, digest in tube.measured.measured_on}
         parts = {"training": trained, "calibration": calibrated}
         return {
             digest: " and ".join(use for use, part in parts.items() if digest in part)

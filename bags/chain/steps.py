@@ -360,6 +360,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTu
             trials.calibration,
             reaction_time=options.reaction_time,
             safety_factor=options.safety_factor,
+            false_alarms=options.false_alarms,
             horizon=options.horizon,
             level=options.level,
             box=getattr(config.identification.model_class, "box", None),

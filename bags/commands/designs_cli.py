@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Given:
-    """What a funnel is designed for in the place of a model."""
+    """What a funnel is designed for in the place of a model, and how often it may be wrong."""
 
     problem: Annotated[
         Path | None,
@@ -45,6 +45,15 @@ class Given:
     safety_factor: Annotated[
         float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
     ] = 1.5
+    false_alarms: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Of a model: in which part of further trials a sound robot may set off an alarm, "
+            "in place of funnel.safety_factor.",
+        ),
+    ] = None
     compose: Annotated[
         list[Path] | None,
         typer.Option(help="Bind the funnels of these folders, in the order of time; repeat."),
@@ -88,7 +97,11 @@ def funnel(
 
     path = config_of(folder, config)
     if not is_tracking(path):
-        tube(folder, load_config(path))
+        settings = load_config(path)
+        if given.false_alarms is not None and settings.funnel is not None:
+            asked = settings.funnel.model_copy(update={"false_alarms": given.false_alarms})
+            settings = settings.model_copy(update={"funnel": asked})
+        tube(folder, settings)
         return
     if not bags:
         raise typer.BadParameter("give the bags on which the disturbance is measured")

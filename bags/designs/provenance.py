@@ -1,10 +1,10 @@
 """What an assumption was measured on: printed beside a verdict, and no part of what is proved.
 
 The numbers are the file's word. What is looked at here is whether they agree with each other: a
-level is not below what was measured, and no sample both chose a tube and scaled it. The largest of
-m + 1 exchangeable numbers is the last with probability at most 1/(m + 1), if model and tube were
-fixed before they were seen. Source: V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a
-Random World, Section 2.2.
+level is not below what was measured, and no sample both chose a tube and scaled it. Of m + 1
+exchangeable numbers the last is among the r largest with probability at most r/(m + 1), if model
+and tube were fixed before they were seen; one number scales all levels of a tube. Source: V.
+Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World, Section 2.2.
 """
 
 import json
@@ -85,11 +85,6 @@ def of_funnel(model: Json, funnel: Json) -> Provenance:
             pairs = zip(peak["at_most"], peak["measured"], strict=True)
             bounds += [("a peak", Fraction(bound), most * Fraction(seen)) for bound, seen in pairs]
         found.append(_judged(f"innovation energy of tube {i}", given, fitted, bounds))
-    if response := funnel.get("response"):
-        given = response["assumption"]
-        most = Fraction(given["safety_factor"]) * Fraction(given["measured"])
-        bounds = [("its half-widths' part 1", Fraction(1), most)]
-        found.append(_judged("output error, watched as well", given, fitted, bounds))
     said = [line for line, _ in found]
     return Provenance(tuple(said), tuple(line for _, lines in found for line in lines))
 
@@ -110,8 +105,9 @@ def _judged(
         for name, bound, needed in bounds
         if bound < needed
     ]
-    if given["safety_factor"] < 1:
-        wrong.append(f"{what}: the safety factor is below 1")
+    rank = given.get("rank", 1)
+    if min(given["safety_factor"], rank) < 1:
+        wrong.append(f"{what}: the safety factor or the rank is below 1")
     if not trials:
         wrong.append(f"{what}: it was measured on no trial")
     if any(trial.shares(other) for trial in trials for other in before):
@@ -120,11 +116,15 @@ def _judged(
     count = distinct(trials)
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}{'s' if count != 1 else ''}"
-    line = (
-        f"{what}: largest of {those} {text.above(measured)}, safety factor {text.below(factor)}; "
-        f"{_worth(trials, count, fitted)}"
+    scale = f"{text.above(measured)} by the scale of {those}"
+    says = "breaks an assumption or sets off any other alarm of this funnel"
+    if "rank" not in given:
+        scale, says = f"largest of {those} {text.above(measured)}", "exceeds their largest"
+    worth = _worthless(trials, fitted) or (
+        f"a next trial that is exchangeable with them {says} with probability at most "
+        f"{rank}/{count + 1}"
     )
-    return line, wrong
+    return f"{what}: {scale}, safety factor {text.below(factor)}; {worth}", wrong
 
 
 def distinct(trials: Iterable[Recorded]) -> int:
@@ -138,8 +138,8 @@ def distinct(trials: Iterable[Recorded]) -> int:
     return count
 
 
-def _worth(trials: list[Recorded], count: int, fitted: list[Json] | None) -> str:
-    """How often a next trial exceeds the largest, if that can be said."""
+def _worthless(trials: list[Recorded], fitted: list[Json] | None) -> str:
+    """Why nothing can be said of how often a next trial exceeds them; empty if it can."""
     none = "no probability is stated of a next trial, as "
     if any(trial.end < LONGEST for trial in trials):
         return none + "windows of one recording are hardly exchangeable"
@@ -147,9 +147,4 @@ def _worth(trials: list[Recorded], count: int, fitted: list[Json] | None) -> str
         return none + "the model does not name what it was fitted to"
     bags = [Recorded.of(bag["digest"]) for bag in fitted]
     seen = sum(any(trial.shares(bag) for bag in bags) for trial in set(trials))
-    if seen:
-        return f"{none}the model was fitted to {seen} of them"
-    return (
-        "a next trial that is exchangeable with them exceeds their largest with probability at "
-        f"most 1/{count + 1}"
-    )
+    return f"{none}the model was fitted to {seen} of them" if seen else ""

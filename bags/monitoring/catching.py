@@ -328,7 +328,7 @@ def what_it_catches(
     threshold raised until it does not.
     """
     monitor, p = design.monitor(Centre.COMMAND), len(ranges)
-    factor = design.funnel.tubes[0].safety_factor
+    factor = design.funnel.tubes[0].measured.safety_factor
     half_widths = design.funnel.half_widths.tolist()
     first = held_back.trajectories[0]
     scaling = [_run(monitor, _untouched(trial), p) for trial in calibration]

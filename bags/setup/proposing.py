@@ -34,7 +34,7 @@ from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
-SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
+SAFETY: Final = 1.2  # on the disturbance's amplitude, the funnel's own default
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
 OTHERS: Final = 3  # commands that are named besides

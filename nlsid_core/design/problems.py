@@ -23,7 +23,9 @@ class OutputTube:
     train: the trials that observer and storage are chosen on. calibration: others, on which the
     level is measured (None: every second recording of `train`, of a single one windows).
     reaction_time: s, how far ahead the forecast is to be narrow (None: ten samples). safety_factor:
-    of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
+    of the innovations' amplitude over the largest measured, at least 1. false_alarms: in place of
+    the factor, the probability that a next trial, exchangeable with the calibration's, alarms
+    without a fault, at most (None: 1/(m + 1) of m trials, and the factor). horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
     the range of the training trials and a tenth of it on both sides). level: "constant", or
@@ -41,7 +43,8 @@ class OutputTube:
     train: Dataset
     calibration: Dataset | None = None
     reaction_time: float | None = None
-    safety_factor: float = 1.5
+    safety_factor: float = 1.2
+    false_alarms: float | None = None
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
     level: LevelKind = "auto"
@@ -54,6 +57,8 @@ class OutputTube:
             if getattr(self, key) is not None:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
+        if self.false_alarms is not None and not 0.0 < self.false_alarms < 1.0:
+            raise OptionError("false_alarms", self.false_alarms, "above 0 and below 1, or None")
         require_at_least(self, "inlet", 0.0)
         if self.profile is not None and len(self.profile) < 2:
             raise OptionError("profile", self.profile, "two or more corners (s, output)")

@@ -8,11 +8,12 @@ semidefinite programs, on the training trials; the level is measured on other tr
 Source: docs/certificate_tube.md.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import product
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -31,7 +32,7 @@ from nlsid_core.design.tube_program import TAU_ROOM, Found, Pair, gramian, slowe
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
-from nlsid_core.funnels.tube import Cusum, Peak, Response, Tube, TubeFunnel
+from nlsid_core.funnels.tube import Cusum, Measured, Peak, Tube, TubeFunnel
 from nlsid_core.kernel import Rejected
 from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
 from nlsid_core.policies.tube import TubePolicy
@@ -50,6 +51,11 @@ LONGEST_SETTLING = 0.25  # of the shortest trial
 SLOWER = (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)  # parts of L that are tried
 NEAR = 1.1  # times the response: a tube that is as narrow is narrow enough
 TINY = float(np.finfo(float).tiny)
+# Room at first, and growth, of what one number scales: a headline's peaks, which are most of its
+# width; other peaks and energies; those of a tube that follows the commands, whose width varies
+# less from trial to trial; and CUSUM's sums, which vary most. Chosen on eight recordings
+# (docs/decisions/0071); what is promised of a next trial is the same for any numbers.
+PEAK, BESIDE, FOLLOWING, SUMS = (1.0, 1.0), (1.2, 1.25), (1.2, 0.5), (2.0, 6.0)
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
 OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
@@ -61,12 +67,13 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     Raises DataError on options or trials that do not fit, Infeasible if no tube is found or proved.
     """
     model, train, horizon, level = problem.model, problem.train, problem.horizon, problem.level
-    profile, inlet, safety_factor = problem.profile, problem.inlet, problem.safety_factor
+    profile, inlet = problem.profile, problem.inlet
+    safety_factor = problem.safety_factor if problem.false_alarms is None else 1.0
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
     least = least_window(model, train, horizon)
     trials = calibration_trials(train, problem.calibration, least=least)
-    train = trials.design
+    train, rank = trials.design, _rank(problem.false_alarms, len(trials.calibration))
     y_box, u_box = _box(model, stepper, train, problem.box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
     K: FloatArray | None = None
@@ -90,10 +97,7 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
             tau=design.tau,
             half_widths=np.ones(len(design.tau)),
             level=1.0,
-            measured=0.0,
-            safety_factor=safety_factor,
-            designed_on=trials.designed_on,
-            measured_on=trials.measured_on,
+            measured=Measured(0.0, safety_factor, trials.designed_on, trials.measured_on, rank),
             samples=samples,
             inlet=inlet**2 / float(np.linalg.inv(design.P)[0, 0]) if inlet else 0.0,
             peak=peak,
@@ -155,7 +159,7 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
             spent = [energy(part[:, design.at], tube)[:, None] for part in e]
             tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
         tubes.append(tube)
-    response = alarm = None
+    alarm = None
     if profile is None:  # what is assumed around a plan is what is held there
         slow = [innovations(model, _slower(found[0].L), trial, settling) for trial in train]
         headline, peak = _headline(form, found[0], slow, amplitudes, decided)
@@ -164,96 +168,99 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
         elif headline is not found[0]:
             found.append(headline)
             tubes.append(tube_of(headline, None, peak))
-        errors = [part[:, -1] for part in slow]
-        rule = None
-        if level != "constant":
-            rule = followed([part**2 for part in errors], u, always=level == "commands")
-        response = Response(
-            np.ones(len(amplitudes)),
-            0.0,
-            safety_factor,
-            trials.designed_on,
-            trials.measured_on,
-            rule,
-        )
         own = np.concatenate([part[:, found[0].at] for part in e])
-        alarm = Cusum(np.maximum(own.std(axis=0), np.finfo(float).tiny), DRIFT, DRIFT)
-    funnel = replace(around(*tubes), response=response, cusum=alarm)
+        alarm = Cusum(np.maximum(own.std(axis=0), TINY), DRIFT, DRIFT)
+    funnel = replace(around(*tubes), cusum=alarm)
     funnel = calibrated(funnel, model, train, trials.calibration)
     refuse_far(model, funnel, trials.calibration)
     return proved(funnel, found)
 
 
-class Largest(NamedTuple):
-    """The most of each statistic over trials. E: of each tube. peaks: (tubes, p). response: (p,).
+def _rank(false_alarms: float | None, trials: int) -> int:
+    """How many of so many trials and one more may exceed their levels, the one more included."""
+    if false_alarms is None:
+        return 1
+    rank = math.floor(false_alarms * (trials + 1) * (1.0 + 1e-12))
+    if rank < 1:
+        raise DataError(
+            f"false alarms in {false_alarms:g} of the trials at most: {trials} calibration trials "
+            f"promise 1/{trials + 1} at best; allow more, or calibrate on "
+            f"{math.ceil(1.0 / false_alarms * (1.0 - 1e-12)) - 1} trials or more"
+        )
+    return rank
 
-    fast: (N, p) innovations of the first tube's observer, of each trial.
+
+def statistics(funnel: TubeFunnel, model: StableModel, trial: Trajectory) -> FloatArray:
+    """(S,) the most along a trial of all that alarms: of each tube √E and its peaks, then CUSUM.
+
+    Of the funnel's rules, whatever its levels are.
     """
-
-    E: FloatArray
-    peaks: FloatArray
-    response: FloatArray
-    fast: list[FloatArray]
-
-    @classmethod
-    def of(cls, funnel: TubeFunnel, model: StableModel, trials: Dataset) -> "Largest":
-        """Of the funnel's rules, whatever its levels are."""
-        gains = np.stack([*(tube.L for tube in funnel.tubes), np.zeros_like(funnel.tubes[0].L)])
-        settling, response, found = funnel.settling, funnel.response, []
-        for trial in trials:
-            e = innovations(model, gains, trial, settling)
-            spent, peaks = [], []
-            for j, tube in enumerate(funnel.tubes):
-                g = np.ones(len(e))
-                if tube.follows is not None:
-                    g = tube.follows.along(trial.u)[settling:, 0]
-                spent.append(float((energy(e[:, j], tube) / g)[: tube.samples].max()))
-                peaks.append((np.abs(e[:, j]) / np.sqrt(np.maximum(g, 1.0))[:, None]).max(axis=0))
-            rows: FloatArray = np.ones(1)
-            if response is not None and response.follows is not None:
-                rows = response.follows.along(trial.u)[settling:]
-            away = (np.abs(e[:, -1]) / np.sqrt(rows)).max(axis=0)
-            found.append((spent, peaks, away, e[:, 0]))
-        E, peaks, away, fast = zip(*found, strict=True)
-        most = (np.maximum(np.max(part, axis=0), TINY) for part in (E, peaks, away))
-        return cls(*most, list(fast))
+    settling, alarm, found = funnel.settling, funnel.cusum, []
+    e = innovations(model, np.stack([tube.L for tube in funnel.tubes]), trial, settling)
+    for j, tube in enumerate(funnel.tubes):
+        g: FloatArray = np.ones(len(e))
+        if tube.follows is not None:
+            g = tube.follows.along(trial.u)[settling:, 0]
+        found.append(np.sqrt((energy(e[:, j], tube) / g)[: tube.samples].max(keepdims=True)))
+        if tube.peak is not None:
+            found.append((np.abs(e[:, j]) / np.sqrt(np.maximum(g, 1.0))[:, None]).max(axis=0))
+    if alarm is not None:
+        factor = funnel.tubes[0].measured.safety_factor
+        sums = cusum(factor * e[:, 0] / alarm.deviation)
+        found.append(np.maximum(sums.max(keepdims=True), DRIFT))
+    return np.asarray(np.maximum(np.concatenate(found), TINY))
 
 
 def calibrated(
     funnel: TubeFunnel, model: StableModel, design: Dataset, calibration: Dataset
 ) -> TubeFunnel:
-    """The funnel with all its levels: the largest of the calibration's trials, rounded up.
+    """The funnel with all its levels, which one number scales: level_s = at_first_s scale^growth_s.
 
-    Of several outputs the design's trials fix the ratios of their peaks and of the response, and
-    one number scales them, so that one trial exceeds all of them with the probability of one.
+    The design's trials fix at_first and growth. Scale is the least at which a calibration trial
+    keeps all levels, and of these the largest, or that of the tube's rank. So a next trial exceeds
+    any of the levels with the probability of one number: rank/(m + 1) at most.
+    Source: docs/theory.md, "One scale".
     """
-    before, seen = (Largest.of(funnel, model, part) for part in (design, calibration))
-    tubes = tuple(
-        _scaled(tube, float(seen.E[j]), (before.peaks[j], seen.peaks[j]))
-        for j, tube in enumerate(funnel.tubes)
+    before, seen = (
+        np.log([statistics(funnel, model, trial) for trial in part])
+        for part in (design, calibration)
     )
-    factor, response, alarm = tubes[0].safety_factor, funnel.response, funnel.cusum
-    if response is not None:
-        scale = float((seen.response / before.response).max())
-        widths = np.array([_rounded_up(_above(float(w))) for w in factor * scale * before.response])
-        used = _above(float((seen.response / widths).max()))
-        response = replace(response, half_widths=widths, measured=used)
+    room, growth = _rooms(funnel).T
+    at_first = before.max(axis=0) + np.log(room)
+    scales = np.sort(((seen - at_first) / growth).max(axis=1))[::-1]
+    levels = np.exp(at_first + growth * scales[funnel.tubes[0].measured.rank - 1])
+    tubes, used = [], 0
+    for tube in funnel.tubes:
+        end = used + (1 if tube.peak is None else 1 + len(tube.R))
+        tubes.append(_scaled(tube, float(levels[used]) ** 2, levels[used + 1 : end]))
+        used = end
+    alarm = funnel.cusum
     if alarm is not None:
-        sums = (float(cusum(factor * e / alarm.deviation).max()) for e in seen.fast)
-        alarm = replace(alarm, threshold=max(DRIFT, *sums))
-    return replace(funnel, tubes=tubes, response=response, cusum=alarm)
+        alarm = replace(alarm, threshold=_above(float(levels[-1])))
+    return replace(funnel, tubes=tuple(tubes), cusum=alarm)
 
 
-def _scaled(tube: Tube, E: float, peaks: tuple[FloatArray, FloatArray]) -> Tube:
-    """With level, peaks and half-widths; peaks: of the design's trials, and measured."""
-    measured, peak = _above(E), tube.peak
-    level = _above(tube.safety_factor**2 * measured)
+def _rooms(funnel: TubeFunnel) -> FloatArray:
+    """(S, 2) room at first, and growth, of all `statistics`."""
+    found = []
+    for tube in funnel.tubes:
+        beside = BESIDE if tube.follows is None else FOLLOWING
+        found.append(beside)
+        if tube.peak is not None:
+            found += [PEAK if tube is funnel.tubes[-1] else beside] * len(tube.R)
+    return np.array(found if funnel.cusum is None else [*found, SUMS])
+
+
+def _scaled(tube: Tube, E: float, peaks: FloatArray) -> Tube:
+    """With level, peaks and half-widths, where E and the peaks are those at factor 1."""
+    given, peak = tube.measured, tube.peak
+    most = _above(E)
+    level = _above(given.safety_factor**2 * most)
     if peak is not None:
-        most = float((peaks[1] / peaks[0]).max()) * peaks[0]
-        seen, factor = np.nextafter(peaks[1], np.inf), tube.safety_factor
-        most = factor * np.maximum(most, seen) * (1.0 + 1e-12)
-        peak = replace(peak, at_most=np.nextafter(most, np.inf), measured=seen)
-    tube = replace(tube, measured=measured, level=level, peak=peak)
+        seen = np.array([_above(float(each)) for each in peaks])
+        at_most = np.array([_above(given.safety_factor * float(each)) for each in seen])
+        peak = replace(peak, at_most=at_most, measured=seen)
+    tube = replace(tube, measured=replace(given, largest=most), level=level, peak=peak)
     return replace(tube, half_widths=np.array([_rounded_up(float(w)) for w in _widths(tube)]))
 
 
@@ -290,21 +297,14 @@ def _headline(
     r = np.diag(np.linalg.inv(fast.R)) * (1.0 + TAU_ROOM)
     nothing = np.zeros(len(amplitudes))
     tried: list[tuple[float, Found, Peak]] = []
-    for i, s in enumerate(SLOWER):
+    # R of several outputs was fitted to the innovations at s = 1, which are the smaller for it.
+    for i, s in list(enumerate(SLOWER))[len(amplitudes) > 1 :]:
         found, peak = slowed(form, fast, s), np.maximum(sizes[i], TINY)
         level = max(float(energy(part[:, i], fast).max()) for part in slow)
         a, room = 1.0 / found.tau, np.maximum(level * r - peak**2, TINY)
         rest = np.minimum(1.0, peak * np.sqrt(a / (r * room)))
         share = a + rest**2 * r
         width = np.sqrt(level * share) + (1.0 - rest) * peak
-        if i == 0:
-            tried.append(
-                (
-                    float(np.sum(np.sqrt(level / fast.tau) / amplitudes)),
-                    fast,
-                    Peak(peak, nothing, nothing),
-                )
-            )
         tried.append(
             (
                 float(np.sum(width / amplitudes)),
@@ -316,7 +316,7 @@ def _headline(
     for _, found, peak in sorted(tried, key=lambda entry: max(entry[0], enough)):
         if not decided(found, peak):
             return found, peak
-    return fast, tried[0][2]
+    return fast, Peak(np.maximum(sizes[0], TINY), nothing, nothing)
 
 
 def _gain(model: StableModel, weights: tuple[float, float] | None) -> FloatArray:

@@ -166,7 +166,7 @@ def slowed(form: Form, found: Found, s: float) -> Found:
             worst[j] = max(worst[j], h @ np.linalg.solve(supply + cross + cross.T, h))
     if not form.m:
         worst = np.einsum("ji,ij->j", form.H, np.linalg.solve(supply, form.H.T))
-    scaled = [[scales * N for N in Ns] for Ns in leaves]
+    scaled: list[list[FloatArray]] = [[scales * N for N in Ns] for Ns in leaves]
     return replace(
         found,
         L=s * found.L,

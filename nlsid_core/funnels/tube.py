@@ -41,18 +41,42 @@ class Peak:
             raise DataError(f"the peaks are {self.at_most.tolist()}; they should be positive")
 
 
+@dataclass(frozen=True)
+class Measured:
+    """What a tube's level rests on: safety_factor² · largest is at most the level.
+
+    largest: E at the scale that the trials `measured_on` were given, all but rank - 1 of them
+    within it; `designed_on` are those that observer and storage were chosen on. Each trial is
+    (name, digest).
+    """
+
+    largest: float
+    safety_factor: float
+    designed_on: tuple[tuple[str, str], ...]
+    measured_on: tuple[tuple[str, str], ...]
+    rank: int = 1
+
+    def document(self) -> Json:
+        """Its members of a tube's assumption."""
+        return {
+            "measured": self.largest,
+            "rank": self.rank,
+            "safety_factor": self.safety_factor,
+            "designed_on": _named(self.designed_on),
+            "measured_on": _named(self.measured_on),
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class Tube:
     """|y_j - y°_j| <= half_widths_j while E <= level, E+ = rho E + e'R e from 0.
 
     y° is the model's simulation, e = y - ŷ the innovation of the observer with gain L (n, p).
     P: (n, n), R: (p, p), tau, half_widths: (p,), the latter in the outputs' units. samples: the
-    number of samples for which an energy (rho = 1) is assumed; None with rho < 1, for ever. level =
-    safety_factor² · measured, the largest E on the trials `measured_on`; `designed_on` are those
-    that L, rho, P, R were chosen on; each (name, digest). inlet: V = x̄'Px̄ that the start may have.
-    With `follows`, level is multiplied at every sample by g, its one row; half_widths are those
-    where g = 1, which it is on average over the trials of the design. peak: what else is assumed,
-    of single samples.
+    number of samples for which an energy (rho = 1) is assumed; None with rho < 1, for ever.
+    measured: what the level rests on. inlet: V = x̄'Px̄ that the start may have. With `follows`,
+    level is multiplied at every sample by g, its one row; half_widths are those where g = 1, which
+    it is on average over the trials of the design. peak: what else is assumed, of single samples.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -64,10 +88,7 @@ class Tube:
     tau: FloatArray
     half_widths: FloatArray
     level: float
-    measured: float
-    safety_factor: float
-    designed_on: tuple[tuple[str, str], ...]
-    measured_on: tuple[tuple[str, str], ...]
+    measured: Measured
     samples: int | None = None
     inlet: float = 0.0
     follows: CommandLevel | None = None
@@ -149,51 +170,10 @@ class Tube:
             "inlet": self.inlet,
             "tau": self.tau.tolist(),
             "half_widths": self.half_widths.tolist(),
-            "assumption": kind
-            | {
-                "measured": self.measured,
-                "safety_factor": self.safety_factor,
-                "designed_on": _named(self.designed_on),
-                "measured_on": _named(self.measured_on),
-            },
+            "assumption": kind | self.measured.document(),
             "L": self.L.tolist(),
             "R": self.R.tolist(),
             "P": self.P.tolist(),
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Response:
-    """What is assumed of the output error itself: |y_j - y°_j| <= half_widths_j √g_j, for ever.
-
-    half_widths: (p,), in the outputs' units. g_j: row j of `follows`, or 1. measured: the largest
-    error as a part of this on the trials `measured_on`, times safety_factor at most 1;
-    `designed_on` are those that g was chosen on.
-    """
-
-    half_widths: FloatArray
-    measured: float
-    safety_factor: float
-    designed_on: tuple[tuple[str, str], ...]
-    measured_on: tuple[tuple[str, str], ...]
-    follows: CommandLevel | None = None
-
-    def __post_init__(self) -> None:
-        freeze(self, "response", {"half_widths": (None,)})
-        if not (self.half_widths > 0.0).all():
-            raise DataError(f"response: half-widths {self.half_widths.tolist()} should be positive")
-
-    def document(self) -> Json:
-        """The JSON form; every number round-trips exactly."""
-        follows: Json = {} if self.follows is None else {"follows": self.follows.document()}
-        return follows | {
-            "half_widths": self.half_widths.tolist(),
-            "assumption": {
-                "measured": self.measured,
-                "safety_factor": self.safety_factor,
-                "designed_on": _named(self.designed_on),
-                "measured_on": _named(self.measured_on),
-            },
         }
 
 
@@ -232,9 +212,9 @@ class TubeFunnel:
 
     The simulation starts at the observer's state after `settling` samples. y_box (p, 2), u_box
     (n_u, 2): where outputs, states and inputs have to stay, for implicit models whose increments
-    are known on a box only; else None. model: its digest. response: what else is assumed, beside
-    what the tubes assume. cusum: a second alarm, which is no assumption. policy: the digest of the
-    policy whose plan the tubes are around too, None without one.
+    are known on a box only; else None. model: its digest. cusum: a second alarm, which is no
+    assumption. policy: the digest of the policy whose plan the tubes are around too, None without
+    one.
     """
 
     tubes: tuple[Tube, ...]
@@ -242,7 +222,6 @@ class TubeFunnel:
     model: str
     y_box: FloatArray | None = None
     u_box: FloatArray | None = None
-    response: Response | None = None
     cusum: Cusum | None = None
     policy: str | None = None
 
@@ -294,7 +273,6 @@ class TubeFunnel:
             **({} if self.policy is None else {"policy": self.policy}),
             "settling": self.settling,
             **box,
-            **({} if self.response is None else {"response": self.response.document()}),
             **({} if self.cusum is None else {"cusum": self.cusum.document()}),
             "tubes": [tube.document() for tube in self.tubes],
         }
@@ -312,8 +290,6 @@ class TubeFunnel:
             given = files.member(document, "box", dict, source=source)
             box = {f"{k}_box": files.array(given, k, (None, 2), source=source) for k in ("y", "u")}
         beside: dict[str, Any] = {}
-        if "response" in document:
-            beside["response"] = _response(document["response"], f"{source} response")
         if "cusum" in document:
             beside["cusum"] = _cusum(document["cusum"], f"{source} cusum")
         return cls(
@@ -343,10 +319,13 @@ def _tube(document: Any, source: str) -> Tube:
         tau=files.array(document, "tau", (None,), source=source),
         half_widths=files.array(document, "half_widths", (None,), source=source),
         level=files.number(document, "level", source=source),
-        measured=files.number(given, "measured", source=source),
-        safety_factor=files.number(given, "safety_factor", source=source),
-        designed_on=_trials(given, "designed_on", source),
-        measured_on=_trials(given, "measured_on", source),
+        measured=Measured(
+            files.number(given, "measured", source=source),
+            files.number(given, "safety_factor", source=source),
+            _trials(given, "designed_on", source),
+            _trials(given, "measured_on", source),
+            files.member(given, "rank", int, source=source),
+        ),
         samples=samples,
         inlet=files.number(document, "inlet", source=source),
         follows=_follows(document, source),
@@ -358,30 +337,19 @@ def _peak(document: Json, source: str) -> Peak | None:
     if "peak" not in document:
         return None
     given = files.member(document, "peak", dict, source=source)
-    peaks = [files.array(given, k, (None,), source=source) for k in ("at_most", "measured")]
-    if "direct" not in document:
-        return Peak(*peaks, direct=np.zeros_like(peaks[0]))
-    return Peak(*peaks, direct=files.array(document, "direct", (None,), source=source))
+    at_most, measured = (
+        files.array(given, key, (None,), source=source) for key in ("at_most", "measured")
+    )
+    direct = np.zeros_like(at_most)
+    if "direct" in document:
+        direct = files.array(document, "direct", (None,), source=source)
+    return Peak(at_most, measured, direct)
 
 
 def _follows(document: Json, source: str) -> CommandLevel | None:
     if "follows" not in document:
         return None
     return CommandLevel.from_document(document["follows"], source=f"{source} follows")
-
-
-def _response(document: Any, source: str) -> Response:
-    if not isinstance(document, dict):
-        raise DocumentError(f"{source} should be an object")
-    given = files.member(document, "assumption", dict, source=source)
-    return Response(
-        half_widths=files.array(document, "half_widths", (None,), source=source),
-        measured=files.number(given, "measured", source=source),
-        safety_factor=files.number(given, "safety_factor", source=source),
-        designed_on=_trials(given, "designed_on", source),
-        measured_on=_trials(given, "measured_on", source),
-        follows=_follows(document, source),
-    )
 
 
 def _cusum(document: Any, source: str) -> Cusum:

@@ -53,7 +53,7 @@ TERM: Table = {
 ASSUMPTION: Table = {  # what was measured is no part of the claim
     "kind": one_of("fading", "energy"),
     "samples?": whole(1, MAX_SAMPLES),
-    **dict.fromkeys(("measured", "safety_factor", "designed_on", "measured_on"), itself),
+    **dict.fromkeys(("measured", "rank?", "safety_factor", "designed_on", "measured_on"), itself),
 }
 CommandLevel = list[tuple[Fraction, Members]]  # weights, not negative, some positive; and terms G
 

@@ -4,8 +4,8 @@ Each tube has an observer, x̂⁺ = f(x̂, w) + L e, and a number, E⁺ = ρE + 
 f(x, w) is common to them. A sample without a measurement is a step with e = 0, and nothing is said
 of it. The simulation needs every input: where one is not known, as of a sample that never came, is
 refused by the model or leaves the box, a new run starts. A level that follows the commands is a few
-more numbers of state. Beside the tubes there may be an assumption about the output error itself,
-and CUSUM of the innovation, an alarm that nothing rests on. Source: docs/certificate_tube.md.
+more numbers of state. Beside the tubes there may be CUSUM of the innovation, an alarm that nothing
+rests on. Source: docs/certificate_tube.md.
 """
 
 import copy
@@ -21,7 +21,6 @@ from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.factor import MOST_ROUNDING, STEPS, UNIT, refuse_coarse
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
-from nlsid_core.kernel.signals import name_label
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
@@ -82,12 +81,6 @@ class TubeRun:
         follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
-        response = funnel.response
-        self._assumed: list[float] = [] if response is None else response.half_widths.tolist()
-        if response is not None and len(response.half_widths) != p:
-            raise DataError("the funnel's response is not one of this model")
-        if response is not None and response.follows is not None:
-            follow[len(tubes)] = response.follows
         if any(level.inputs > len(self._stepper.u) for level in follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
         self._follow = follow
@@ -331,26 +324,6 @@ class TubeRun:
         room = np.array([max(g[j][0], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
         return room, self._widths * np.sqrt(room)[:, None]
 
-    def _response(self, away: list[float]) -> tuple[float, str]:
-        """The most of what is assumed of the output error that is used, and of which."""
-        used, worst = 0.0, 0
-        g = self._g.get(len(self._tubes))
-        for j, width in enumerate(self._assumed):  # none without a response
-            error = away[j]
-            bound = width * (1.0 if g is None else math.sqrt(max(g[j], TINY))) * (1.0 - ROUNDING)
-            part = abs(error) / bound
-            if not part <= used:
-                used, worst = part, j
-        if used <= 1.0:
-            return used * used, ""
-        unit = self._stepper.y[worst].unit
-        said = f"{abs(away[worst]):.4g} {unit}".rstrip()
-        most = f"{abs(away[worst]) / used:.4g} {unit}".rstrip()
-        return used * used, (
-            f"{name_label(self._names[worst])} is {said} from the simulation, above {most}, which "
-            f"is assumed ({WATCHED})"
-        )
-
     def _alarm(self, innovation: list[float]) -> str:
         """What CUSUM says of the first observer; empty if it does not alarm."""
         cusum, sums = self._cusum, self._sums
@@ -390,7 +363,6 @@ class TubeRun:
         margin = 1.0 - size
         most = max(lasting, key=spent.__getitem__)
         sharpest = max(lasting, key=peaks.__getitem__)
-        response, exceeded = self._response(away)
         reason = ""
         status = Status.INSIDE
         if not spent[most] <= 1.0:
@@ -407,13 +379,11 @@ class TubeRun:
                 f"one sample's innovation is {math.sqrt(peaks[sharpest]):.4g} times what is "
                 f"assumed{beside}, at t = {t:g} s"
             )
-        elif exceeded:
-            status, reason = Status.ASSUMPTION_VIOLATED, f"{exceeded}, at t = {t:g} s"
         if not size <= 1.0:
             status = Status.OUTSIDE
             kept = "although the assumption was kept: what runs is not what was proved"
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
-        used = max(spent[most], peaks[sharpest], response)
+        used = max(spent[most], peaks[sharpest])
         return Reading(
             t,
             status,

@@ -18,7 +18,7 @@ FOLDER = CORPUS / "tube" / "following"
 
 @pytest.fixture
 def documents() -> tuple[Json, Json]:
-    """A model, and a funnel with a peak, a response and a level that follows the commands."""
+    """A model, and a funnel with a level that follows the commands."""
     model, funnel = (files.load_document(FOLDER / f"{name}.json") for name in ("model", "funnel"))
     return model, funnel
 
@@ -69,7 +69,7 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
     _, funnel = documents
     tube = funnel["tubes"][0]
     tube |= {"peak": {"at_most": [1.0], "measured": [0.1]}}
-    tube["assumption"]["measured"] = 1.0
+    tube["assumption"] |= {"measured": 1.0, "rank": 1}
     case = next(case for case in corpus() if (case.kind, case.name) == ("tube", "following"))
     forged = case.copied()
     forged.about["funnel.json"] = funnel
@@ -86,7 +86,8 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
     [
         ("level", {"level": 0.02}, "its level is below"),
         ("peak", {"peak": {"at_most": [0.01], "measured": [0.007]}}, "a peak is below"),
-        ("assumption", {"safety_factor": 0.5}, "the safety factor is below 1"),
+        ("assumption", {"safety_factor": 0.5}, "the safety factor or the rank is below 1"),
+        ("assumption", {"rank": 0}, "the safety factor or the rank is below 1"),
         ("assumption", {"measured_on": []}, "measured on no trial"),
         (
             "assumption",

@@ -12,7 +12,7 @@ from nlsid_core.dynamics import VectorField, constant_on, cubic_through, linear_
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
-from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.funnels.tube import Measured, Tube, TubeFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
@@ -49,7 +49,8 @@ def discrete_documents() -> dict[str, Any]:
     assumption = DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),))
     two = np.array([np.eye(2)] * 3)
     ones, trial = np.ones(1), (("trial", "sha256:1"),)
-    tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, 1.0, 2.0, (), trial)
+    scaled = Measured(1.0, 2.0, (), trial)
+    tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, scaled)
     return {
         "discrete": SampledFunnel(
             two, two[:2], np.ones(3), np.ones(3), np.ones((3, 2)), assumption, "m", "p"

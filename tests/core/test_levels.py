@@ -97,25 +97,6 @@ def test_products_of_a_few_inputs_are_tried_and_of_many_are_not() -> None:
     assert not any(term.inputs == (1,) for term in candidates([still]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("moved", [1.0, 0.0])
-def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says(moved: float) -> None:
-    """A level designed on 8 trials, scaled on 9 others: the next one exceeds it in a tenth.
-
-    Whatever the level is: so each of 4 levels meets 25 times 10 new trials.
-    """
-    exceeded, designs, draws = 0, 4, 25
-    for k in range(designs):
-        level = followed(*trials(8, 10_000 + k, moved=moved), always=True)
-        assert level is not None
-        for draw in range(draws):
-            fresh = zip(*trials(10, 20_000 + draws * k + draw, moved=moved), strict=True)
-            most = np.array([float((E[:, 0] / level.along(u)[:, 0]).max()) for E, u in fresh])
-            exceeded += int(most[-1] > most[:-1].max())
-    count = designs * draws
-    assert exceeded <= count / 10 + 3 * np.sqrt(count * 0.1 * 0.9)
-
-
 @pytest.mark.parametrize("name", slow_among(["following", "two_following"], {"two_following"}))
 def test_an_assumption_that_follows_is_kept_by_the_calibration_trials_and_broken_by_more(
     name: str,
@@ -139,7 +120,7 @@ def test_a_level_that_overflows_starts_a_new_run_and_is_never_inside() -> None:
     recorded = dataset(MODELS["following"](), 100, 1).trajectories[0]
     fading = CommandLevel((Term((0,), scale=1e-160, fading=0.9),), np.array([[1e-300]]))
     tubes = tuple(replace(tube, follows=fading) for tube in made.funnel.tubes)
-    monitor = Monitor([Stage(made.model, None, replace(made.funnel, tubes=tubes, response=None))])
+    monitor = Monitor([Stage(made.model, None, replace(made.funnel, tubes=tubes))])
     rows = zip(recorded.t.tolist(), recorded.y + 100.0, recorded.u + 1.0, strict=True)
     said = [monitor.update(t, y, u) for t, y, u in rows]
     assert {reading.status for reading in said} == {Status.UNKNOWN}
@@ -152,8 +133,8 @@ def test_a_shift_that_breaks_no_assumption_raises_the_alarm_and_only_that() -> N
     cusum = made.funnel.cusum
     assert cusum is not None
     recorded = dataset(MODELS["linear"](), 500, 1, 2000).trajectories[0]
-    biased = replace(recorded, y=recorded.y + 1.2 * cusum.deviation)
-    lasting = replace(made.funnel, tubes=made.funnel.tubes[:1], response=None)
+    biased = replace(recorded, y=recorded.y + 0.7 * cusum.deviation)
+    lasting = replace(made.funnel, tubes=made.funnel.tubes[:1])
     clean, alarmed = (
         [monitor.update(t, y, u) for t, y, u in zip(r.t.tolist(), r.y, r.u, strict=True)]
         for monitor, r in (

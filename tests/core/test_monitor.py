@@ -76,7 +76,7 @@ def test_training_trials_are_inside_and_spend_at_most_the_measured_share(
     design: OutputTubeDesign, train: Dataset
 ) -> None:
     tube = design.funnel.tubes[0]
-    measured_on = {name for name, _ in tube.measured_on}
+    measured_on = {name for name, _ in tube.measured.measured_on}
     shares = {}
     for trial in train:
         readings = run(design, trial.y[:, 0], trial.u[:, 0])
@@ -84,8 +84,8 @@ def test_training_trials_are_inside_and_spend_at_most_the_measured_share(
         assert {r.status for r in judged} == {Status.INSIDE}
         shares[trial.name] = max(r.assumption for r in judged)
     largest = max(shares[name] for name in measured_on)
-    assert largest <= 1 / tube.safety_factor**2 + ROUNDING
-    assert largest >= 0.99 / tube.safety_factor**2
+    assert largest <= 1 / tube.measured.safety_factor**2 + ROUNDING
+    assert largest >= 0.99 / tube.measured.safety_factor**2
 
 
 def test_the_monitor_spends_the_energy_the_design_measured(

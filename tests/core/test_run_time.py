@@ -22,7 +22,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.funnels import factor
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
-from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.funnels.tube import Measured, Tube, TubeFunnel
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
@@ -128,10 +128,7 @@ def steep() -> tuple[DifferenceEquation, TubeFunnel]:
         tau=np.ones(1),
         half_widths=np.ones(1),
         level=1.0,
-        measured=0.1,
-        safety_factor=1.5,
-        designed_on=(),
-        measured_on=(("trial", "sha256:0"),),
+        measured=Measured(0.1, 1.5, (), (("trial", "sha256:0"),)),
         samples=5,
         inlet=LEVEL,
     )
