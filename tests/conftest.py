@@ -112,6 +112,7 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> OutputTubeDesign:
             profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.5), (7.0, 0.5)],
             horizon=7.0,
             inlet=0.02,
+            safety_factor=1.5,
         )
     )
 

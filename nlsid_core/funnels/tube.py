@@ -324,7 +324,7 @@ def _tube(document: Any, source: str) -> Tube:
             files.number(given, "safety_factor", source=source),
             _trials(given, "designed_on", source),
             _trials(given, "measured_on", source),
-            files.member(given, "rank", int, source=source),
+            files.member({"rank": 1} | given, "rank", int, source=source),
         ),
         samples=samples,
         inlet=files.number(document, "inlet", source=source),

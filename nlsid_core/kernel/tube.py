@@ -58,9 +58,10 @@ ASSUMPTION: Table = {  # what was measured is no part of the claim
 CommandLevel = list[tuple[Fraction, Members]]  # weights, not negative, some positive; and terms G
 
 SENTENCE = (
-    "tube: the measured output stays near the model's simulation under the same inputs, {tubes}, "
-    "{where}{plan}"
+    "tube: the measured {names} within {widths} of what the model predicts from the inputs alone, "
+    "{where}, for {lasting}, as long as what is assumed is kept{remarks}{others}{plan}"
 )
+ALSO = "; also within {widths} for {lasting}{remarks}"
 PLAN = (
     "; and as near the policy's plan, which is the simulation from its start under its inputs, for "
     "at most its {samples}, {how}"
@@ -109,13 +110,24 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     assumptions = [_start(model, policy, tubes, funnel["settling"], several)]
     if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
-    own, shown = " of its own observer" if several else "", []
+    own = " of its own observer" if several else ""
+    shown: dict[tuple[bool, int, int], dict[str, str]] = {}
     for i, tube in enumerate(tubes, 1):
-        label = f"({i}) " if len(tubes) > 1 else ""
-        shown.append(label + _shown(model, tube))
-        assumptions.append(f"{label}innovation energy{own}: {_energy(model, tube)}")
-    plan = _around_plan(model, policy) if policy else ""
-    said = text.say(SENTENCE, tubes="; ".join(shown), where=model.where, plan=plan)
+        label = f"tube {i}" if len(tubes) > 1 else ""
+        plainness = (bool(tube["follows"]), tube["assumption"]["samples"] or 0, i)
+        shown[plainness] = _shown(model, tube, label)
+        which = f"{label}: " if label else ""
+        assumptions.append(f"{which}innovation energy{own}: {_energy(model, tube)}")
+    first, *others = (shown[plainness] for plainness in sorted(shown))
+    names = [signal.name for signal in model.y]
+    said = text.say(
+        SENTENCE,
+        names=" and ".join(names) + (" stays" if len(names) == 1 else " stay"),
+        **first,
+        where=model.where,
+        others="".join(text.say(ALSO, **other) for other in others),
+        plan=_around_plan(model, policy) if policy else "",
+    )
     return text.Verdict(said, margin, tuple(assumptions), digests)
 
 
@@ -221,29 +233,23 @@ def _read_policy(node: Node, model: Model, made_for: str) -> Members:
     return policy
 
 
-def _shown(model: Model, tube: Members) -> str:
-    """The half-widths of one tube, and for how long they hold."""
+def _shown(model: Model, tube: Members, label: str) -> dict[str, str]:
+    """The half-widths of one tube, for how long they hold, and how much of them is inferred."""
     root, samples = " sqrt(g)" if tube["follows"] else "", tube["assumption"]["samples"]
-    widths = " and ".join(
-        f"{signal.name} within {signal.quantity(text.above(width))}{root}"
-        for signal, width in zip(model.y, tube["half_widths"], strict=True)
-    )
-    lasting = _samples(model, samples) if samples else "ever"
-    return f"{widths} for {lasting}{_inferred(model, tube)}"
-
-
-def _inferred(model: Model, tube: Members) -> str:
-    """What of the half-widths is not the stated peak of an innovation; nothing if none is."""
     rows = list(zip(model.y, tube["half_widths"], tube["direct"], strict=True))
-    if not any(part for _, _, (part, _) in rows):
-        return ""
-    shares = [1 - part * peak / width for _, width, (part, peak) in rows]
-    shown = " and ".join(
-        f"{signal.name} {text.below(share, 2)}"
-        for (signal, _, _), share in zip(rows, shares, strict=True)
-    )
-    nearly = f", {NEARLY}" if max(shares) < LITTLE else ""
-    return f" (inferred share {shown}{nearly})"
+    remarks = [label] if label else []
+    if any(part for _, _, (part, _) in rows):
+        shares = [1 - part * peak / width for _, width, (part, peak) in rows]
+        named = zip(model.y, shares, strict=True)
+        shown = " and ".join(f"{signal.name} {text.below(share, 2)}" for signal, share in named)
+        remarks.append(f"inferred share {shown}")
+        if max(shares) < LITTLE:
+            remarks.append(NEARLY)
+    return {
+        "widths": " and ".join(s.quantity(text.above(width)) + root for s, width, _ in rows),
+        "lasting": _samples(model, samples) if samples else "ever",
+        "remarks": f" ({', '.join(remarks)})" if remarks else "",
+    }
 
 
 def _samples(model: Model, count: int) -> str:

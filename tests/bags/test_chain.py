@@ -97,11 +97,11 @@ def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
     model = documents.load_model(chain / documents.MODEL)
     proved = documents.load(chain / documents.FUNNEL)
     for tube in proved.funnel.tubes:
-        assert {name for name, _ in tube.measured_on} == set(config.split.calibration)
-        assert set(tube.designed_on) == set(model.bags)
-        assert not {d for _, d in tube.measured_on} & {d for _, d in model.bags}
+        assert {name for name, _ in tube.measured.measured_on} == set(config.split.calibration)
+        assert set(tube.measured.designed_on) == set(model.bags)
+        assert not {d for _, d in tube.measured.measured_on} & {d for _, d in model.bags}
     said = of_proof(chain / documents.FUNNEL_PROOF).said[0]
-    assert "exceeds their largest with probability at most 1/17" in said
+    assert "any other alarm of this funnel with probability at most 1/17" in said
 
 
 def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
@@ -109,11 +109,11 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     made = nlsid("funnel", again, "--config", CONFIG)
     said = " ".join(made.replace("│", " ").split())
     tube = documents.load(chain / documents.FUNNEL).funnel.tubes[0]
-    found = re.search(r"E <= (\S+) .*? largest of 16 distinct trials (\S+), safety", said)
+    found = re.search(r"E <= (\S+) .*? energy of tube 1: (\S+) by the scale of 16", said)
     assert found
     level, measured = found.groups()
     assert 0.999 * tube.level < float(level) <= tube.level
-    assert tube.measured <= float(measured) < 1.001 * tube.measured
+    assert tube.measured.largest <= float(measured) < 1.001 * tube.measured.largest
     assert "probability at most 1/17" in said
 
 

@@ -31,9 +31,14 @@ def alone(name: str, i: int = 0, *, peak: bool = True) -> tuple[Any, TubeFunnel]
     """A model and a funnel of its tube i only, with or without what is assumed of its peak."""
     made = design(name)
     tube = made.funnel.tubes[i]
-    assert tube.peak is not None
-    any_peak = replace(tube.peak, at_most=np.full_like(tube.peak.at_most, 1e9))
-    kept = tube if peak else replace(tube, peak=any_peak)
+    kept = tube
+    if not peak and tube.peak is not None:  # the energy alone bounds what is direct too
+        direct = (1.0 - (1.0 - tube.peak.direct) ** 2) * np.diag(np.linalg.inv(tube.R))
+        kept = replace(
+            tube,
+            peak=replace(tube.peak, at_most=np.full_like(tube.peak.at_most, 1e9)),
+            half_widths=(1.0 + 1e-7) * np.sqrt(tube.level * (1.0 / tube.tau + direct)),
+        )
     return made.model, replace(made.funnel, tubes=(kept,))
 
 
@@ -173,8 +178,8 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
     assert (with_peak.high <= without.high).all()
     (predicted,), _ = stepper.advance(x, u[lags + 1])
     g = 1.0 if tube.follows is None else float(tube.follows.along(u)[lags + 1, 0])
-    single = tube.peak.at_most @ np.abs(tube.R) @ tube.peak.at_most
-    most = np.sqrt(max(g, 1.0) * single * np.diag(np.linalg.inv(tube.R)))
+    single = max(g, 1.0) * tube.peak.at_most @ np.abs(tube.R) @ tube.peak.at_most
+    most = np.sqrt(min(single, g * tube.level) * np.diag(np.linalg.inv(tube.R)))
     least = np.minimum(most, np.sqrt(g) * tube.half_widths)
     assert (with_peak.high[0] >= predicted + (1.0 - 1e-7) * least).all()
     assert (with_peak.high[0] <= predicted + (1.0 + 1e-7) * most).all()

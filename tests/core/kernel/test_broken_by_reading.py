@@ -145,11 +145,11 @@ def test_a_tube_is_not_about_trajectories_that_start_elsewhere() -> None:
 )
 def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
     verdict = decided("tube", tube(name=text), {})
-    assert f" under the same inputs, {json.dumps(text)} within " in verdict.statement
+    assert f"the measured {json.dumps(text)} stays within " in verdict.statement
     assert verdict.statement.isascii()
     if text:
         unit = decided("tube", tube(unit=text), {}).statement
-        assert f" {json.dumps(text)} for 2 samples, " in unit
+        assert f" {json.dumps(text)} of what the model predicts" in unit
 
 
 def test_usual_names_and_units_are_as_they_are() -> None:
@@ -166,12 +166,12 @@ def test_a_unit_cannot_change_the_number_before_it(unit: str) -> None:
     """`0.0000009537 /1000` would be a thousandth of what is proved."""
     said = decided("tube", tube(unit=unit), {}).statement
     assert said == (
-        "tube: the measured output stays near the model's simulation under the same inputs, speed "
-        f"within 9.537e-07 {json.dumps(unit)} for 2 samples, which span 0.1 s, for every input; "
-        "and as near the policy's plan, which is the simulation from its start under its inputs, "
-        "for at most its 2 samples, which span 0.1 s, whether those inputs are played, the policy "
-        "is engaged around them, or anything between the two acts, such as the policy's input "
-        "clipped to a range that holds the plan's, as [0.123456, 1] m/s does"
+        f"tube: the measured speed stays within 9.537e-07 {json.dumps(unit)} of what the model "
+        "predicts from the inputs alone, for every input, for 2 samples, which span 0.1 s, as long "
+        "as what is assumed is kept; and as near the policy's plan, which is the simulation from "
+        "its start under its inputs, for at most its 2 samples, which span 0.1 s, whether those "
+        "inputs are played, the policy is engaged around them, or anything between the two acts, "
+        "such as the policy's input clipped to a range that holds the plan's, as [0.123456, 1] m/s does"
     )
 
 

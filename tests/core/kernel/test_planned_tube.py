@@ -79,11 +79,12 @@ def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) 
     span = down((len(policy["u"]) - 1) * model["period"])
     wide = [up(tube["half_widths"][0]) for tube in (lasting, energy)]
     assert verdict.statement == (
-        "tube: the measured output stays near the model's simulation under the same inputs, (1) "
-        f"speed within {wide[0]} m/s for ever; (2) speed within {wide[1]} m/s for 70 samples, "
-        f"which span {span} s, for every input; and as near the policy's plan, which is the "
-        f"simulation from its start under its inputs, for at most its 70 samples, which span "
-        f"{span} s, whether those inputs are played, the policy is engaged around them, or "
+        f"tube: the measured speed stays within {wide[0]} m/s of what the model predicts from the "
+        "inputs alone, for every input, for ever, as long as what is assumed is kept (tube 1); "
+        f"also within {wide[1]} m/s for 70 samples, which span {span} s (tube 2); and as near the "
+        "policy's plan, which is the simulation from its start under its inputs, for at most its "
+        f"70 samples, which span {span} s, whether those inputs are played, the policy is engaged "
+        "around them, or "
         "anything between the two acts, such as the policy's input clipped to a range that holds "
         f"the plan's, as [{exactly(low)}, {exactly(high)}] m/s does"
     )
@@ -91,9 +92,9 @@ def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) 
     assert verdict.assumptions == (
         f"after 2 samples ({up(0.2)} s) the simulation starts at the observer's state, or where V "
         f"= xbar'P xbar <= {inlets}, xbar the observer's state minus its own, as the plan does",
-        f"(1) innovation energy: E <= {down(lasting['level'])} (m/s)^2 after every sample, E+ = "
-        f"{lasting['rho']} E + e^2 from 0",
-        f"(2) innovation energy: sum of e^2 <= {down(energy['level'])} (m/s)^2 over 70 samples",
+        f"tube 1: innovation energy: E <= {down(lasting['level'])} (m/s)^2 after every sample, "
+        f"E+ = {lasting['rho']} E + e^2 from 0",
+        f"tube 2: innovation energy: sum of e^2 <= {down(energy['level'])} (m/s)^2 over 70 samples",
     )
     assert 0.0 < verdict.margin < 0.01
 
@@ -238,7 +239,7 @@ def test_a_plan_is_taken_up_to_the_limit_and_no_longer(
 
 def test_a_plan_is_for_a_linear_model(documents: dict[str, Json]) -> None:
     model, funnel, proof = claim("monotone")
-    del funnel["response"], funnel["cusum"]  # these, and levels by commands, have no plan
+    del funnel["cusum"]  # these, and levels by commands, have no plan
     first(funnel).pop("follows", None)
     policy = documents["policy"] | {
         "period": model["period"],

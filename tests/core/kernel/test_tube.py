@@ -41,22 +41,25 @@ def test_a_tube_of_every_class_is_proved_and_the_oracle_agrees(name: str) -> Non
 
 def test_the_sentences_are_those_of_the_page() -> None:
     model, funnel, proof = claim("linear")
-    widths = [tube["half_widths"][0] for tube in funnel["tubes"]]
+    headline, energy = funnel["tubes"]
+    share = 1 - headline["direct"][0] * headline["peak"]["at_most"][0] / headline["half_widths"][0]
+    peak = f"{headline['peak']['at_most'][0]:.9f}"[:6]
     said = str(decide(model, funnel, proof)).splitlines()
     assert said[0].startswith(
-        "PROVED tube: the measured output stays near the model's simulation under the same inputs, "
-        f"(1) speed within {widths[0]:.3g} m/s for ever; "
-        f"(2) speed within {widths[1]:.3g} m/s for 40 samples, which span 0.975 s, for every "
-        "input, margin "
+        f"PROVED tube: the measured speed stays within {headline['half_widths'][0]:.3g} m/s of "
+        "what the model predicts from the inputs alone, for every input, for ever, as long as what "
+        f"is assumed is kept (tube 1, inferred share speed {int(100 * share) / 100}); also within "
+        f"{energy['half_widths'][0]:.3g} m/s for 40 samples, which span 0.975 s (tube 2), margin "
     )
     assert (
         said[1]
         == "  assuming after 3 samples (0.07501 s) the simulation starts at one state with the "
         "observers, one for each tube"
     )
-    rho = funnel["tubes"][0]["rho"]
-    assert said[2].endswith(f"E+ = {rho} E + e^2 from 0")
-    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[3]
+    assert (
+        f"E+ = {headline['rho']} E + e^2 from 0; the innovation of speed at most {peak}" in said[2]
+    )
+    assert "tube 2: innovation energy of its own observer: sum of e^2 <= " in said[3]
     assert len(said) == 4  # what was measured, and on what, is no part of the claim
 
 
@@ -198,7 +201,7 @@ def test_a_direct_part_of_an_innovation_narrows_a_tube_and_is_said() -> None:
     said = decide(model, funnel, proof)
     assert oracle.is_proved(model, funnel, proof)
     assert "; the innovation of speed at most 0.02 m/s in size at every sample" in str(said)
-    assert "(inferred share speed 0." in said.statement
+    assert "inferred share speed 0." in said.statement
     assert "nearly what was measured" not in said.statement
     assert "nearly what was measured" in decide(*with_a_direct_part(1.0, 10.0)).statement
 
