@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_831,
     ("bags",): 12_002,
     ("nlsid_ros",): 2_676,
-    ("tests",): 23_298,
+    ("tests",): 23_292,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
