@@ -197,7 +197,7 @@ def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[st
     def mean(tube: Tube) -> FloatArray:
         if tube.follows is None:
             return np.asarray(tube.half_widths)
-        rows = [tube.follows.along(now)[settling:, 0] for now in u]
+        rows = [tube.follows.along(now)[settling:] for now in u]
         return np.asarray(tube.half_widths * float(np.mean(np.sqrt(np.concatenate(rows)))))
 
     lasting = [tube for tube in made.funnel.tubes if tube.samples is None]
@@ -220,7 +220,7 @@ def outside(model: Any, made: Any, trial: Trajectory) -> int:
         e, o = innovations(model, gains, trial, settling).swapaxes(0, 1)
         g = np.ones(len(e))
         if tube.follows is not None:
-            g = tube.follows.along(trial.u)[settling:, 0]
+            g = tube.follows.along(trial.u)[settling:]
         kept = energy(e, tube) <= tube.level * g
         if tube.peak is not None:
             kept &= (np.abs(e) <= tube.peak.at_most * np.sqrt(np.maximum(g, 1.0))[:, None]).all(1)

@@ -162,15 +162,6 @@ class FunnelConfig(Section):
         Field(ge=1.0, allow_inf_nan=False),
         Key("on the disturbance's amplitude, over the largest that was measured", example=1.5),
     ] = 1.2
-    false_alarms: Annotated[
-        float | None,
-        Field(gt=0.0, lt=1.0),
-        Key(
-            "in place of the factor: in which part of further trials, exchangeable with those of "
-            "the calibration, a robot without a fault may set off an alarm (null: the factor)",
-            example=0.1,
-        ),
-    ] = None
     inlet: Annotated[
         NonNegative,
         Key(

@@ -335,13 +335,16 @@ def _of_bags(trials: Sequence[str], names: Sequence[str]) -> list[str]:
     return [name for name in trials if called(name) or called(name.rpartition(".")[0])]
 
 
-def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTubeDesign:
+def design_funnel_files(
+    model_path: Path, config: Config, out: Path, false_alarms: float | None = None
+) -> OutputTubeDesign:
     """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
     A tube around the simulation of a model of any class; with a profile around a plan of a linear
     one as well, with the policy that tracks it, policy.json. The observer is chosen on training.npz
     beside the model, the disturbance measured on the calibration trials of held_back.npz, without
-    which every second training trial is one. Raises DataError or Infeasible.
+    which every second training trial is one. false_alarms: see `OutputTube`. Raises DataError or
+    Infeasible.
     """
     options = config.funnel
     if options is None:
@@ -360,7 +363,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTu
             trials.calibration,
             reaction_time=options.reaction_time,
             safety_factor=options.safety_factor,
-            false_alarms=options.false_alarms,
+            false_alarms=false_alarms,
             horizon=options.horizon,
             level=options.level,
             box=getattr(config.identification.model_class, "box", None),

@@ -97,11 +97,7 @@ def funnel(
 
     path = config_of(folder, config)
     if not is_tracking(path):
-        settings = load_config(path)
-        if given.false_alarms is not None and settings.funnel is not None:
-            asked = settings.funnel.model_copy(update={"false_alarms": given.false_alarms})
-            settings = settings.model_copy(update={"funnel": asked})
-        tube(folder, settings)
+        tube(folder, load_config(path), given.false_alarms)
         return
     if not bags:
         raise typer.BadParameter("give the bags on which the disturbance is measured")
@@ -117,8 +113,11 @@ def _proof_in(path: Path) -> Path:
     return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
-def tube(folder: Path, settings: Config) -> None:
-    """Design a tube around the model in a folder, and what it catches."""
+def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> None:
+    """Design a tube around the model in a folder, and what it catches.
+
+    false_alarms: in place of what the settings say, None for that.
+    """
     from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
@@ -128,7 +127,7 @@ def tube(folder: Path, settings: Config) -> None:
     model = folder / documents.MODEL
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
-        design = design_funnel_files(model, settings, folder)
+        design = design_funnel_files(model, settings, folder, false_alarms)
         progress("sabotaging the test trials", 0.7)
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)

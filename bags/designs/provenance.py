@@ -85,8 +85,8 @@ def of_funnel(model: Json, funnel: Json) -> Provenance:
             pairs = zip(peak["at_most"], peak["measured"], strict=True)
             bounds += [("a peak", Fraction(bound), most * Fraction(seen)) for bound, seen in pairs]
         found.append(_judged(f"innovation energy of tube {i}", given, fitted, bounds))
-    said = [line for line, _ in found]
-    return Provenance(tuple(said), tuple(line for _, lines in found for line in lines))
+    said = tuple(line for line, _ in found)
+    return Provenance(said, tuple(line for _, lines in found for line in lines))
 
 
 def _judged(

@@ -56,8 +56,8 @@ def candidates(inputs: Sequence[FloatArray]) -> tuple[Term, ...]:
 def followed(
     energies: Sequence[FloatArray], inputs: Sequence[FloatArray], *, always: bool = False
 ) -> CommandLevel | None:
-    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`) or
-    there are too few trials (`FEWEST`) to tell.
+    """A level for E (N,) of each trial, or None where it gains little (`WORTH`) or there are too
+    few trials (`FEWEST`) to tell.
 
     inputs: (settling + N, n_u) of each trial, from its run's start. What is narrower, and how small
     the constant part may be, is decided by the mean half-width where each half of the trials is
@@ -68,23 +68,20 @@ def followed(
     terms = candidates(inputs)
     G = [_columns(terms, u)[len(u) - len(E) :] for u, E in zip(inputs, energies, strict=True)]
     halves = _halves(list(zip(energies, G, strict=True)))
-    rows, parts = [], []
-    for r in range(energies[0].shape[1]):
-        tried = {floor: _tried(halves, r, floor) for floor in (1.0, *FLOORS)}
-        floor = min(FLOORS if always else tried, key=tried.__getitem__)
-        weights = _weights(np.concatenate([E[:, r] for E in energies]), np.concatenate(G), floor)
-        if weights is None:
-            weights, floor = np.eye(len(terms))[0], 1.0
-        g = np.concatenate(G) @ weights
-        rows.append(weights / float(np.mean(np.sqrt(g))) ** 2)
-        parts.append(tried[floor] / tried[1.0])
-    if float(np.mean(parts)) > WORTH and not always:
+    tried = {floor: _tried(halves, floor) for floor in (1.0, *FLOORS)}
+    floor = min(FLOORS if always else tried, key=tried.__getitem__)
+    columns = np.concatenate(G)
+    weights = _weights(np.concatenate(list(energies)), columns, floor)
+    if weights is None:
+        weights, floor = np.eye(len(terms))[0], 1.0
+    if tried[floor] > WORTH * tried[1.0] and not always:
         return None
-    shares = np.array(rows) * np.max(np.concatenate(G), axis=0)
-    kept = (shares > NEGLIGIBLE * shares.max(axis=1, keepdims=True)).any(axis=0)
-    rounded = [[_rounded(w) for w in np.array(row)[kept]] for row in rows]
+    shares = weights * columns.max(axis=0)
+    kept = shares > NEGLIGIBLE * shares.max()
+    scaled = weights[kept] / float(np.mean(np.sqrt(columns @ weights))) ** 2
     return CommandLevel(
-        tuple(t for t, keep in zip(terms, kept, strict=True) if keep), np.array(rounded)
+        tuple(t for t, keep in zip(terms, kept, strict=True) if keep),
+        np.array([_rounded(weight) for weight in scaled]),
     )
 
 
@@ -100,7 +97,7 @@ def _columns(terms: Sequence[Term], u: FloatArray) -> FloatArray:
     return np.column_stack(columns)
 
 
-Block = tuple[FloatArray, FloatArray]  # E (N, rows) and G (N, terms)
+Block = tuple[FloatArray, FloatArray]  # E (N,) and G (N, terms)
 
 
 def _halves(blocks: list[Block]) -> tuple[Block, Block]:
@@ -115,15 +112,15 @@ def _halves(blocks: list[Block]) -> tuple[Block, Block]:
     return first, second
 
 
-def _tried(halves: tuple[Block, Block], row: int, floor: float) -> float:
+def _tried(halves: tuple[Block, Block], floor: float) -> float:
     """Mean half-width of one half with the other's weights, over both ways; floor 1: constant."""
     found = []
     for (E, G), (E_next, G_next) in (halves, halves[::-1]):
-        weights = _weights(E[:, row], G, floor)
+        weights = _weights(E, G, floor)
         if weights is None:
             return float("inf")
         g = G_next @ weights
-        scale = float((E_next[:, row] / g).max())
+        scale = float((E_next / g).max())
         found.append(float(np.mean(np.sqrt(scale * g))))
     return float(np.mean(found))
 

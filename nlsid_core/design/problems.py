@@ -53,12 +53,10 @@ class OutputTube:
     lqr_weights: tuple[float, float] | None = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        for key in ("reaction_time", "horizon"):
+        for key in ("reaction_time", "horizon", "false_alarms"):
             if getattr(self, key) is not None:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
-        if self.false_alarms is not None and not 0.0 < self.false_alarms < 1.0:
-            raise OptionError("false_alarms", self.false_alarms, "above 0 and below 1, or None")
         require_at_least(self, "inlet", 0.0)
         if self.profile is not None and len(self.profile) < 2:
             raise OptionError("profile", self.profile, "two or more corners (s, output)")

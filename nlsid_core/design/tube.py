@@ -71,8 +71,9 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     safety_factor = problem.safety_factor if problem.false_alarms is None else 1.0
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    least = least_window(model, train, horizon)
-    trials = calibration_trials(train, problem.calibration, least=least)
+    trials = calibration_trials(
+        train, problem.calibration, least=least_window(model, train, horizon)
+    )
     train, rank = trials.design, _rank(problem.false_alarms, len(trials.calibration))
     y_box, u_box = _box(model, stepper, train, problem.box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
@@ -80,10 +81,9 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     if profile is not None:
         K, level = _gain(model, problem.lqr_weights), "constant"
     form = Form.of(model, bounds, K)
-    ahead = problem.reaction_time
-    samples = REACTION if ahead is None else max(1, round(ahead / model.period))
+    samples = max(1, round((problem.reaction_time or REACTION * model.period) / model.period))
     amplitudes = np.maximum(
-        np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
+        np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, TINY
     )
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
@@ -131,9 +131,10 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
         return ""
 
     start = inlet / safety_factor
-    fading = _pairs(gains, e, form.fading())
-    found = [_best(form, fading, amplitudes, samples, decided, start)]
-    lasting: list[int | None] = [None]
+    fast = _best(form, _pairs(gains, e, form.fading()), amplitudes, samples, decided, start)
+    slower = np.stack([*(s * fast.L for s in SLOWER), 0.0 * fast.L])
+    own = [innovations(model, slower, trial, settling) for trial in train]
+    found, tubes, alarm = [fast], [tube_of(fast, None)], None
     if horizon is not None:
         length = max(1, round(horizon / model.period))
         longest = max(map(len, trials.calibration)) - settling
@@ -142,34 +143,25 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
                 f"horizon {horizon} s is {length} samples; the energy can be measured on the "
                 f"calibration trials for 1 to {longest}"
             )
-        lasting.append(length)
         if profile is not None:  # the policy has one observer
-            i = found[0].at
-            gains, e = found[0].L[None], [part[:, i : i + 1] for part in e]
-            found[0] = replace(found[0], at=0)
+            gains, e = fast.L[None], [part[:, :1] for part in own]
         found.append(_best(form, _pairs(gains, e, [1.0]), amplitudes, length, decided, start))
-    u = [trial.u for trial in train]
-    tubes = []
-    for design, samples_left in zip(found, lasting, strict=True):
-        nothing = np.zeros(len(amplitudes))
-        peak = Peak(nothing + 1.0, nothing, nothing)
-        planned = samples_left is not None or profile is not None
-        tube = tube_of(design, samples_left, None if planned else peak)
-        if level != "constant" and samples_left is None:
-            spent = [energy(part[:, design.at], tube)[:, None] for part in e]
-            tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
-        tubes.append(tube)
-    alarm = None
+        tubes.append(tube_of(found[1], length))
     if profile is None:  # what is assumed around a plan is what is held there
-        slow = [innovations(model, _slower(found[0].L), trial, settling) for trial in train]
-        headline, peak = _headline(form, found[0], slow, amplitudes, decided)
-        if np.array_equal(headline.L, found[0].L) and tubes[0].follows is None:
+        headline, peak = _headline(form, fast, own, amplitudes, decided)
+        follows = None
+        if level != "constant":
+            spent = [energy(part[:, 0], fast) for part in own]
+            follows = followed(spent, [trial.u for trial in train], always=level == "commands")
+        if follows is None and np.array_equal(headline.L, fast.L):
             found[0], tubes[0] = headline, tube_of(headline, None, peak)
-        elif headline is not found[0]:
+        else:
+            early = replace(peak, direct=np.zeros_like(peak.direct))
+            tubes[0] = replace(tubes[0], follows=follows, peak=early)
             found.append(headline)
             tubes.append(tube_of(headline, None, peak))
-        own = np.concatenate([part[:, found[0].at] for part in e])
-        alarm = Cusum(np.maximum(own.std(axis=0), TINY), DRIFT, DRIFT)
+        deviation = np.concatenate([part[:, 0] for part in own]).std(axis=0)
+        alarm = Cusum(np.maximum(deviation, TINY), DRIFT, DRIFT)
     funnel = replace(around(*tubes), cusum=alarm)
     funnel = calibrated(funnel, model, train, trials.calibration)
     refuse_far(model, funnel, trials.calibration)
@@ -181,34 +173,37 @@ def _rank(false_alarms: float | None, trials: int) -> int:
     if false_alarms is None:
         return 1
     rank = math.floor(false_alarms * (trials + 1) * (1.0 + 1e-12))
-    if rank < 1:
+    if not 1 <= rank <= trials:
         raise DataError(
-            f"false alarms in {false_alarms:g} of the trials at most: {trials} calibration trials "
-            f"promise 1/{trials + 1} at best; allow more, or calibrate on "
-            f"{math.ceil(1.0 / false_alarms * (1.0 - 1e-12)) - 1} trials or more"
+            f"false alarms in {false_alarms:g} of the trials: {trials} calibration trials can "
+            f"promise 1/{trials + 1} to {trials}/{trials + 1}; record more for less"
         )
     return rank
 
 
 def statistics(funnel: TubeFunnel, model: StableModel, trial: Trajectory) -> FloatArray:
-    """(S,) the most along a trial of all that alarms: of each tube √E and its peaks, then CUSUM.
+    """(S, 3) the most along a trial of all that alarms: of each tube √E and its peaks, then CUSUM.
 
-    Of the funnel's rules, whatever its levels are.
+    Each with its room at first and its growth. Of the funnel's rules, whatever its levels are.
     """
-    settling, alarm, found = funnel.settling, funnel.cusum, []
+    settling, alarm = funnel.settling, funnel.cusum
     e = innovations(model, np.stack([tube.L for tube in funnel.tubes]), trial, settling)
+    found: list[tuple[float, float, float]] = []
     for j, tube in enumerate(funnel.tubes):
         g: FloatArray = np.ones(len(e))
         if tube.follows is not None:
-            g = tube.follows.along(trial.u)[settling:, 0]
-        found.append(np.sqrt((energy(e[:, j], tube) / g)[: tube.samples].max(keepdims=True)))
+            g = tube.follows.along(trial.u)[settling:]
+        beside = BESIDE if tube.follows is None else FOLLOWING
+        found.append((math.sqrt((energy(e[:, j], tube) / g)[: tube.samples].max()), *beside))
         if tube.peak is not None:
-            found.append((np.abs(e[:, j]) / np.sqrt(np.maximum(g, 1.0))[:, None]).max(axis=0))
+            peaks = (np.abs(e[:, j]) / np.sqrt(np.maximum(g, 1.0))[:, None]).max(axis=0)
+            rule = PEAK if tube is funnel.tubes[-1] else beside
+            found += [(peak, *rule) for peak in peaks.tolist()]
     if alarm is not None:
         factor = funnel.tubes[0].measured.safety_factor
         sums = cusum(factor * e[:, 0] / alarm.deviation)
-        found.append(np.maximum(sums.max(keepdims=True), DRIFT))
-    return np.asarray(np.maximum(np.concatenate(found), TINY))
+        found.append((max(DRIFT, float(sums.max())), *SUMS))
+    return np.maximum(np.array(found), TINY)
 
 
 def calibrated(
@@ -222,13 +217,14 @@ def calibrated(
     Source: docs/theory.md, "One scale".
     """
     before, seen = (
-        np.log([statistics(funnel, model, trial) for trial in part])
+        np.array([statistics(funnel, model, trial) for trial in part])
         for part in (design, calibration)
     )
-    room, growth = _rooms(funnel).T
-    at_first = before.max(axis=0) + np.log(room)
-    scales = np.sort(((seen - at_first) / growth).max(axis=1))[::-1]
-    levels = np.exp(at_first + growth * scales[funnel.tubes[0].measured.rank - 1])
+    room, growth = before[0, :, 1:].T
+    at_first = before[:, :, 0].max(axis=0) * room
+    scales = np.sort((np.log(seen[:, :, 0] / at_first) / growth).max(axis=1))[::-1]
+    rank = funnel.tubes[0].measured.rank
+    levels = at_first * np.exp(growth * scales[rank - 1])
     tubes, used = [], 0
     for tube in funnel.tubes:
         end = used + (1 if tube.peak is None else 1 + len(tube.R))
@@ -238,17 +234,6 @@ def calibrated(
     if alarm is not None:
         alarm = replace(alarm, threshold=_above(float(levels[-1])))
     return replace(funnel, tubes=tuple(tubes), cusum=alarm)
-
-
-def _rooms(funnel: TubeFunnel) -> FloatArray:
-    """(S, 2) room at first, and growth, of all `statistics`."""
-    found = []
-    for tube in funnel.tubes:
-        beside = BESIDE if tube.follows is None else FOLLOWING
-        found.append(beside)
-        if tube.peak is not None:
-            found += [PEAK if tube is funnel.tubes[-1] else beside] * len(tube.R)
-    return np.array(found if funnel.cusum is None else [*found, SUMS])
 
 
 def _scaled(tube: Tube, E: float, peaks: FloatArray) -> Tube:
@@ -272,11 +257,6 @@ def _widths(tube: Tube) -> FloatArray:
     )
 
 
-def _slower(L: FloatArray) -> FloatArray:
-    """sL of every s, and no observer."""
-    return np.stack([*(s * L for s in SLOWER), np.zeros_like(L)])
-
-
 def _headline(
     form: Form,
     fast: Found,
@@ -286,16 +266,15 @@ def _headline(
 ) -> tuple[Found, Peak]:
     """The fastest observer whose tube is about as narrow as the response; else the narrowest.
 
-    slow: innovations (N, B, p) of `_slower` in each trial of the design. Of an innovation the part
-    c is bounded by its peak ε, where √(ℓ (a + (1 - c)² r)) + c ε is least: ℓ the energy, a and r
-    the output's shares of it by V and by e.
+    slow: innovations (N, B, p) of SLOWER, and of none, in each trial of the design. Of an
+    innovation the part c is bounded by its peak ε, where √(ℓ (a + (1 - c)² r)) + c ε is least: ℓ
+    the energy, a and r the output's shares of it by V and by e.
     """
     sizes = [
         np.max([np.abs(part[:, i]).max(axis=0) for part in slow], axis=0)
         for i in range(len(SLOWER) + 1)
     ]
     r = np.diag(np.linalg.inv(fast.R)) * (1.0 + TAU_ROOM)
-    nothing = np.zeros(len(amplitudes))
     tried: list[tuple[float, Found, Peak]] = []
     # R of several outputs was fitted to the innovations at s = 1, which are the smaller for it.
     for i, s in list(enumerate(SLOWER))[len(amplitudes) > 1 :]:
@@ -309,14 +288,15 @@ def _headline(
             (
                 float(np.sum(width / amplitudes)),
                 replace(found, tau=1.0 / share),
-                Peak(peak, nothing, 1.0 - rest),
+                Peak(peak, peak, 1.0 - rest),
             )
         )
     enough = NEAR * float(np.sum(sizes[-1] / amplitudes))
     for _, found, peak in sorted(tried, key=lambda entry: max(entry[0], enough)):
         if not decided(found, peak):
             return found, peak
-    return fast, Peak(np.maximum(sizes[0], TINY), nothing, nothing)
+    peak = np.maximum(sizes[0], TINY)
+    return fast, Peak(peak, peak, np.zeros_like(peak))
 
 
 def _gain(model: StableModel, weights: tuple[float, float] | None) -> FloatArray:
@@ -438,7 +418,7 @@ def _gains(form: Form, amplitudes: FloatArray) -> FloatArray:
 def _pairs(gains: FloatArray, e: list[FloatArray], rhos: Sequence[float]) -> list[Pair]:
     """Every gain with every ρ; e: innovations (N, B, p) of the gains in each trial."""
     return [
-        Pair(gains[i], i, rho, [part[:, i] for part in e])
+        Pair(gains[i], rho, [part[:, i] for part in e])
         for i, rho in product(range(len(gains)), rhos)
     ]
 

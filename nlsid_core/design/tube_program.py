@@ -35,10 +35,7 @@ CUT = 1e-3  # relative, by which a window may exceed the level at which R is des
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it.
-
-    at: which of the gains L is.
-    """
+    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it."""
 
     L: FloatArray
     rho: float
@@ -46,33 +43,27 @@ class Found:
     R: FloatArray
     tau: FloatArray
     multipliers: Json | None
-    at: int
 
 
 class Pair(NamedTuple):
-    """A pair to try: L (n, p), which of the gains it is, ρ, and its innovations e (N, p)."""
+    """A pair to try: L (n, p), ρ, and its innovations e (N, p)."""
 
     L: FloatArray
-    at: int
     rho: float
     e: list[FloatArray]
 
 
 def gramian(form: Form, pair: Pair) -> tuple[FloatArray, FloatArray]:
     """W, mean over a few vertices, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
-    p, (L, _, rho, e) = len(form.H), pair
-    most = np.max([_fading_squares(part, rho).max(axis=0) for part in e], axis=0)
+    p, (L, rho, e) = len(form.H), pair
+    fading = [lfilter([1.0], [1.0, -rho], part**2, axis=0) for part in e]
+    most = np.max([squares.max(axis=0) for squares in fading], axis=0)
     R = np.diag(1.0 / (p * np.maximum(most, np.finfo(float).tiny)))
     noise = L @ np.linalg.inv(R) @ L.T
     noise = noise + UNREACHED * (np.trace(noise) / len(noise) or 1.0) * np.eye(len(noise))
     Ws = [solve_discrete_lyapunov(A / np.sqrt(rho), noise) for A in form.corners]
     W = np.mean(Ws, axis=0)
     return (W + W.T) / 2.0, R
-
-
-def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
-    """Σ ρ^i e_j(t - i)², (N, p)."""
-    return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
 
 
 def solved(form: Form, pair: Pair, amplitudes: FloatArray) -> Found | None:
@@ -98,7 +89,7 @@ def _balanced(
     form: Form, pair: Pair, amplitudes: FloatArray, W: FloatArray, R0: FloatArray
 ) -> Found | None:
     """`solved` in the units of W^(1/2)."""
-    m, p, (L, at, rho, e) = form.m, len(form.H), pair
+    m, p, (L, rho, e) = form.m, len(form.H), pair
     try:
         values, vectors = np.linalg.eigh(W)
         root = (vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))) @ vectors.T
@@ -141,7 +132,6 @@ def _balanced(
         np.eye(1) if p == 1 else (R + R.T) / 2.0,
         unit * (1.0 - TAU_ROOM) * tau / sizes**2,
         None if form.tree is None else _with_multipliers(form.tree, found),
-        at,
     )
 
 
@@ -157,21 +147,21 @@ def slowed(form: Form, found: Found, s: float) -> Found:
     supply[form.m :, form.m :] = found.rho * found.P
     leaves = [] if found.multipliers is None else _multipliers(found.multipliers)
     scales = np.concatenate([np.full(states, 1.0 / s), np.ones(len(form.H))])[:, None] / s
-    worst = np.zeros(len(form.H))
-    for vertices, Ns in zip(form.leaves, leaves, strict=True):
-        for N in Ns[1:]:
-            N[states:] = 0.0
-        for E, (j, h) in product(vertices, enumerate(form.H)):
-            cross = Ns[1 + j][:states] @ E
-            worst[j] = max(worst[j], h @ np.linalg.solve(supply + cross + cross.T, h))
-    if not form.m:
-        worst = np.einsum("ji,ij->j", form.H, np.linalg.solve(supply, form.H.T))
+    pairs = [(Ns, E) for Ns, vertices in zip(leaves, form.leaves, strict=True) for E in vertices]
+    for N in (N for Ns in leaves for N in Ns[1:]):
+        N[states:] = 0.0
+
+    def worst(j: int) -> float:
+        crosses = [Ns[1 + j][:states] @ E for Ns, E in pairs] or [np.zeros_like(supply)]
+        solutions = (np.linalg.solve(supply + N_E + N_E.T, form.H[j]) for N_E in crosses)
+        return max(float(form.H[j] @ solution) for solution in solutions)
+
     scaled: list[list[FloatArray]] = [[scales * N for N in Ns] for Ns in leaves]
     return replace(
         found,
         L=s * found.L,
         P=found.P / s**2,
-        tau=(1.0 - TAU_ROOM) / (s**2 * worst),
+        tau=(1.0 - TAU_ROOM) / (s**2 * np.array([worst(j) for j in range(len(form.H))])),
         multipliers=None if form.tree is None else _with_multipliers(form.tree, scaled),
     )
 

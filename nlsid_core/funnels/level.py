@@ -1,6 +1,6 @@
 """`CommandLevel`: how much room a tube has at every sample, from the commands up to then.
 
-    g_r(k) = Σ_i weights_ri G_i(k),   G(k) = fading G(k-1) + v(k)²,   G = 0 before the run
+    g(k) = Σ_i weights_i G_i(k),   G(k) = fading G(k-1) + v(k)²,   G = 0 before the run
 v = (s - centre)/scale, or the change of s since the last sample over scale, s the product of some
 inputs; no inputs: s = 1. Source: docs/certificate_tube.md, "A level that follows the commands".
 """
@@ -53,16 +53,16 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class CommandLevel:
-    """g (rows): weights (rows, len(terms)), not negative. Raises ShapeError, DataError."""
+    """g: weights (len(terms),), not negative. Raises ShapeError, DataError."""
 
     terms: tuple[Term, ...]
     weights: FloatArray
 
     def __post_init__(self) -> None:
         weights = np.array(self.weights, dtype=np.float64)
-        if weights.ndim != 2 or weights.shape[1] != len(self.terms) or not self.terms:
+        if weights.shape != (len(self.terms),) or not self.terms:
             raise ShapeError(f"weights {weights.shape} for {len(self.terms)} terms of a level")
-        if not ((weights >= 0.0).all() and (weights.sum(axis=1) > 0.0).all()):
+        if not ((weights >= 0.0).all() and weights.sum() > 0.0):
             raise DataError("a level's weights should not be negative, nor all 0")
         keep(self, {"weights": weights})
 
@@ -72,15 +72,15 @@ class CommandLevel:
         return 1 + max((i for term in self.terms for i in term.inputs), default=-1)
 
     def along(self, u: FloatArray) -> FloatArray:
-        """g (N, rows) at every sample of one run with inputs u (N, n_u)."""
+        """g (N,) at every sample of one run with inputs u (N, n_u)."""
         meter = LevelMeter(self)
-        return np.array([meter.update(now) for now in u.tolist()]).reshape(len(u), -1)
+        return np.array([meter.update(now) for now in u.tolist()])
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
             "terms": [term.document() for term in self.terms],
-            "weights": self.weights.tolist(),
+            "weights": [self.weights.tolist()],
         }
 
     @classmethod
@@ -90,7 +90,7 @@ class CommandLevel:
             raise DocumentError(f"{source} should be an object")
         entries = files.member(document, "terms", list, source=source)
         terms = tuple(_term(entry, f"{source} terms[{i}]") for i, entry in enumerate(entries))
-        weights = files.array(document, "weights", (None, len(terms)), source=source)
+        (weights,) = files.array(document, "weights", (1, len(terms)), source=source)
         return cls(terms, weights)
 
 
@@ -117,7 +117,7 @@ class LevelMeter:
             (term.inputs, term.of == CHANGE, term.centre, term.scale, term.fading)
             for term in level.terms
         ]
-        self._weights: list[list[float]] = level.weights.tolist()
+        self._weights: list[float] = level.weights.tolist()
         self.restart()
 
     def restart(self) -> None:
@@ -125,8 +125,8 @@ class LevelMeter:
         self._G = [0.0] * len(self._terms)
         self._before: list[float] | None = None
 
-    def update(self, u: Sequence[float]) -> list[float]:
-        """g of every row at the next sample, whose inputs are u."""
+    def update(self, u: Sequence[float]) -> float:
+        """g at the next sample, whose inputs are u."""
         G, before, products = self._G, self._before, []
         for i, (factors, change, centre, scale, fading) in enumerate(self._terms):
             s = 1.0
@@ -138,4 +138,4 @@ class LevelMeter:
             v = (s - centre) / scale
             G[i] = fading * G[i] + v * v
         self._before = products
-        return [sum(map(mul, row, G)) for row in self._weights]
+        return sum(map(mul, self._weights, G))

@@ -56,16 +56,6 @@ class Measured:
     measured_on: tuple[tuple[str, str], ...]
     rank: int = 1
 
-    def document(self) -> Json:
-        """Its members of a tube's assumption."""
-        return {
-            "measured": self.largest,
-            "rank": self.rank,
-            "safety_factor": self.safety_factor,
-            "designed_on": _named(self.designed_on),
-            "measured_on": _named(self.measured_on),
-        }
-
 
 @dataclass(frozen=True, eq=False)
 class Tube:
@@ -170,7 +160,14 @@ class Tube:
             "inlet": self.inlet,
             "tau": self.tau.tolist(),
             "half_widths": self.half_widths.tolist(),
-            "assumption": kind | self.measured.document(),
+            "assumption": kind
+            | {
+                "measured": self.measured.largest,
+                "rank": self.measured.rank,
+                "safety_factor": self.measured.safety_factor,
+                "designed_on": _named(self.measured.designed_on),
+                "measured_on": _named(self.measured.measured_on),
+            },
             "L": self.L.tolist(),
             "R": self.R.tolist(),
             "P": self.P.tolist(),
@@ -237,11 +234,6 @@ class TubeFunnel:
         return np.asarray(np.min([tube.half_widths for tube in self.tubes], axis=0))
 
     @property
-    def half_width(self) -> float:
-        """The first output's, in its unit."""
-        return float(self.half_widths[0])
-
-    @property
     def made_for(self) -> tuple[str, str | None]:
         """The digests of the model, and of the policy if there is one."""
         return self.model, self.policy
@@ -282,14 +274,13 @@ class TubeFunnel:
         """Raises DocumentError if the document is not a funnel of this kind."""
         files.header(document, FORMAT, source=source, kind=KIND)
         entries = files.member(document, "tubes", list, source=source)
-        policy = None
+        beside: dict[str, Any] = {}
         if "policy" in document:
-            policy = files.member(document, "policy", str, source=source)
-        box: dict[str, Any] = {}
+            beside["policy"] = files.member(document, "policy", str, source=source)
         if "box" in document:
             given = files.member(document, "box", dict, source=source)
-            box = {f"{k}_box": files.array(given, k, (None, 2), source=source) for k in ("y", "u")}
-        beside: dict[str, Any] = {}
+            for key in ("y", "u"):
+                beside[f"{key}_box"] = files.array(given, key, (None, 2), source=source)
         if "cusum" in document:
             beside["cusum"] = _cusum(document["cusum"], f"{source} cusum")
         return cls(
@@ -297,8 +288,6 @@ class TubeFunnel:
             **beside,
             settling=files.member(document, "settling", int, source=source),
             model=files.member(document, "model", str, source=source),
-            policy=policy,
-            **box,
         )
 
 
@@ -310,6 +299,9 @@ def _tube(document: Any, source: str) -> Tube:
     if kind not in ("fading", "energy"):
         raise DocumentError(f"{source}: assumption is '{kind}'; known: fading, energy")
     samples = files.member(given, "samples", int, source=source) if kind == "energy" else None
+    follows = None
+    if "follows" in document:
+        follows = CommandLevel.from_document(document["follows"], source=f"{source} follows")
     L, P, R = (files.array(document, key, (None, None), source=source) for key in "LPR")
     return Tube(
         rho=files.number(document, "rho", source=source),
@@ -328,7 +320,7 @@ def _tube(document: Any, source: str) -> Tube:
         ),
         samples=samples,
         inlet=files.number(document, "inlet", source=source),
-        follows=_follows(document, source),
+        follows=follows,
         peak=_peak(document, source),
     )
 
@@ -346,18 +338,13 @@ def _peak(document: Json, source: str) -> Peak | None:
     return Peak(at_most, measured, direct)
 
 
-def _follows(document: Json, source: str) -> CommandLevel | None:
-    if "follows" not in document:
-        return None
-    return CommandLevel.from_document(document["follows"], source=f"{source} follows")
-
-
 def _cusum(document: Any, source: str) -> Cusum:
     if not isinstance(document, dict):
         raise DocumentError(f"{source} should be an object")
     deviation = files.array(document, "deviation", (None,), source=source)
-    numbers = (files.number(document, key, source=source) for key in ("drift", "threshold"))
-    return Cusum(deviation, *numbers)
+    return Cusum(
+        deviation, *(files.number(document, key, source=source) for key in ("drift", "threshold"))
+    )
 
 
 def _named(trials: tuple[tuple[str, str], ...]) -> list[Json]:

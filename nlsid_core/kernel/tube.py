@@ -119,10 +119,10 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
         which = f"{label}: " if label else ""
         assumptions.append(f"{which}innovation energy{own}: {_energy(model, tube)}")
     first, *others = (shown[plainness] for plainness in sorted(shown))
-    names = [signal.name for signal in model.y]
+    stay = " stays" if len(model.y) == 1 else " stay"
     said = text.say(
         SENTENCE,
-        names=" and ".join(names) + (" stays" if len(names) == 1 else " stay"),
+        names=" and ".join(signal.name for signal in model.y) + stay,
         **first,
         where=model.where,
         others="".join(text.say(ALSO, **other) for other in others),

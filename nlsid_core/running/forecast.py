@@ -93,9 +93,9 @@ def reach(tube: Tube, linear: Linear | None, steps: int) -> FloatArray:
     R⁻¹L'PL, at most 1; a linear model's own response is never worse.
     """
     inverse = np.linalg.inv(tube.R)
-    single, ever = np.diag(inverse), 1.0 / tube.tau
-    if tube.peak is not None:  # τ bounds the output but for what is direct
-        ever = ever + (1.0 - (1.0 - tube.peak.direct) ** 2) * single
+    single = np.diag(inverse)
+    direct = 0.0 if tube.peak is None else 1.0 - (1.0 - tube.peak.direct) ** 2
+    ever = 1.0 / tube.tau + direct * single  # τ bounds the output but for what is direct
     if linear is None:
         spread = np.linalg.eigvals(inverse @ tube.L.T @ tube.P @ tube.L).real.max()
         parts = np.minimum(1.0, spread * np.arange(steps))

@@ -73,14 +73,10 @@ class Reading(NamedTuple):
             "assumption": self.assumption,
             "time_to_exit": self.time_to_exit,
         }
-        count = len(self.measured)
-        if count == 1:
-            values["nominal"] = self.nominal[0] if self.nominal else math.nan
-            values["measured"] = self.measured[0]
-            return values
-        for i in range(count):
-            values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
-            values[f"measured[{i}]"] = self.measured[i]
+        for i, measured in enumerate(self.measured):
+            which = f"[{i}]" if len(self.measured) > 1 else ""
+            values[f"nominal{which}"] = self.nominal[i] if self.nominal else math.nan
+            values[f"measured{which}"] = measured
         return values
 
 

@@ -41,16 +41,15 @@ class Stepper:
     def __init__(self, model: StableModel) -> None:
         self.model = model
         single = isinstance(model, DifferenceEquation | BlockCascade)
-        self.y: tuple[Signal, ...] = _signals(model.y)
+        self.y: tuple[Signal, ...] = (model.y,) if isinstance(model.y, Signal) else model.y
         self.u: tuple[Signal, ...] = (model.u,) if single else model.u  # type: ignore[assignment]
         if not self.y:
             raise DataError("an implicit model without recorded signals has no tube of its outputs")
-        made: Any = _KINDS[type(model)](model)
-        self._kind = made
-        self.order: int = made.order
-        self.lags: int = max(made.lags, made.delays)
-        self.delays: int = made.delays
-        self._past: deque[FloatArray] = deque(maxlen=made.delays + 1)
+        self._kind: Any = _KINDS[type(model)](model)
+        self.order: int = self._kind.order
+        self.delays: int = self._kind.delays
+        self.lags: int = max(self._kind.lags, self.delays)
+        self._past: deque[FloatArray] = deque(maxlen=self.delays + 1)
 
     def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
         """The state (n,) after the samples y (k, p), u (k, n_u), k >= lags.
@@ -110,10 +109,6 @@ class Stepper:
         return found
 
 
-def _signals(given: Signal | tuple[Signal, ...]) -> tuple[Signal, ...]:
-    return (given,) if isinstance(given, Signal) else given
-
-
 class _Linear:
     """x⁺ = A x + B u + f, y = x_1 + D u + c."""
 
@@ -152,12 +147,11 @@ class _StateAffine:
         )
         self._products = Products(exponents)
         table = np.zeros((len(exponents), p, (len(model) + 1) * p + 1))
-        first, place = 0, places.ravel().tolist()
+        place = iter(places.ravel().tolist())
         for k, part in enumerate(parts):
             values = part.coefficients.reshape(len(part.exponents), p, -1)
             for row in values:
-                table[place[first], :, k * p : k * p + values.shape[2]] += row
-                first += 1
+                table[next(place), :, k * p : k * p + values.shape[2]] += row
         # A constant G_0 is divided out once.
         self._solved = not model.G[0].exponents.any()
         if self._solved:

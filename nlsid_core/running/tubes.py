@@ -11,7 +11,7 @@ rests on. Source: docs/certificate_tube.md.
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -74,19 +74,16 @@ class TubeRun:
                 for tube in tubes
             ]
         )
-        self._direct = [tube.peak is not None and tube.peak.direct.any() for tube in tubes]
         self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
         self._unmoved = np.ones(len(tubes))
-        self._samples = [tube.samples for tube in tubes]
-        follow: dict[int, CommandLevel] = {
+        self._follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
-        if any(level.inputs > len(self._stepper.u) for level in follow.values()):
+        if any(level.inputs > len(self._stepper.u) for level in self._follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
-        self._follow = follow
         self._cusum = funnel.cusum
+        self._signals = (*self._stepper.y, *self._stepper.u)
         self._names = [signal.name for signal in self._stepper.y]
-        self._units = [tube.energy_unit(self._stepper.y) for tube in tubes]
         y_box, u_box = funnel.y_box, funnel.u_box
         self._box: tuple[FloatArray, FloatArray, FloatArray] | None = None
         if y_box is not None and u_box is not None:
@@ -111,7 +108,7 @@ class TubeRun:
         self._largest, self._hidden = np.zeros(self._stepper.order), np.zeros_like(self._widths)
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
-        self._g: dict[int, list[float]] = {}
+        self._g: dict[int, float] = {}
         cusum = self._cusum
         self._sums = None if cusum is None else CusumMeter(len(self._names), cusum.drift)
         self._trend = Trend()
@@ -188,12 +185,10 @@ class TubeRun:
     def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
         if y.shape != (len(self._names),) or u.shape != (len(self._stepper.u),):
             return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
-        if all(map(math.isfinite, (*y.tolist(), *u.tolist()))):
-            return ""
-        for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
-            for value, signal in zip(values.tolist(), signals, strict=True):
-                if not math.isfinite(value):
-                    return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
+        values = (*y.tolist(), *u.tolist())
+        for value, signal in zip(values, self._signals, strict=True):
+            if not math.isfinite(value):
+                return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
     def _without(self, u: FloatArray, fault: str) -> str:
@@ -274,7 +269,7 @@ class TubeRun:
                 parts /= np.maximum(g, 1.0)[:, None]
             peaks = parts.max(axis=1).tolist()
         self._x, self._k = after, self._k + 1
-        followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
+        followed = all(map(math.isfinite, self._g.values()))
         nominal = tuple(simulated.tolist())
         finite = all(map(math.isfinite, (*self._spent.tolist(), *nominal)))
         if not (followed and finite and np.isfinite(after).all()):
@@ -299,10 +294,58 @@ class TubeRun:
             return self._unknown(
                 t, y, f"{COARSE}: {most} beside a half-width of {least}, at t = {t:g} s"
             )
-        measured = tuple(y.tolist())
-        away, innovations = deviation.tolist(), e.tolist()
-        judged = _Judged(sizes.tolist(), spent, peaks, level, widths, away, innovations[0])
-        return self._reading(t, judged, nominal, measured)
+        alarm = self._alarm(e[0].tolist())
+        lasting = self._lasting(self._k)
+        if not lasting:
+            over = f"the proof covers {self._tubes[0].samples} samples; they are over"
+            return self._unknown(t, y, over)._replace(alarm=alarm)
+        row = sizes[lasting].max(axis=0) if len(lasting) > 1 else sizes[lasting[0]]
+        size = float(row.max())
+        used, reason = self._used(t, lasting, spent, peaks)
+        status = Status.ASSUMPTION_VIOLATED if reason else Status.INSIDE
+        if not size <= 1.0:
+            status = Status.OUTSIDE
+            kept = "although the assumption was kept: what runs is not what was proved"
+            reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+        return Reading(
+            t,
+            status,
+            1.0 - size,
+            used,
+            self._trend.exit_after(t, 1.0 - size),
+            self._names[int(row.argmax())],
+            nominal,
+            tuple(y.tolist()),
+            Level.TUBE if size <= 1.0 else Level.NONE,
+            reason,
+            self._assuming,
+            [*deviation.tolist(), *e[0].tolist()],
+            alarm,
+            tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
+        )
+
+    def _used(
+        self, t: float, lasting: list[int], spent: list[float], peaks: list[float]
+    ) -> tuple[float, str]:
+        """The most of what the tubes that last assume that is used, and what is exceeded."""
+        most = max(lasting, key=spent.__getitem__)
+        sharpest = max(lasting, key=peaks.__getitem__)
+        used = max(spent[most], peaks[sharpest])
+        if not spent[most] <= 1.0:
+            unit = self._tubes[most].energy_unit(self._stepper.y)
+            level = self._spent[most] / spent[most]
+            return used, (
+                f"innovation energy {self._spent[most]:.4g}{unit} above the level "
+                f"{level:.4g}{unit} at t = {t:g} s"
+            )
+        if not peaks[sharpest] <= 1.0:
+            peak = self._tubes[sharpest].peak
+            beside = "" if peak is not None and peak.direct.any() else f" ({WATCHED})"
+            return used, (
+                f"one sample's innovation is {math.sqrt(peaks[sharpest]):.4g} times what is "
+                f"assumed{beside}, at t = {t:g} s"
+            )
+        return used, ""
 
     def _hides(self, simulated: FloatArray) -> FloatArray:
         """(tubes, p) what rounding can hide of the outputs' distance from these simulated (p,)."""
@@ -317,11 +360,11 @@ class TubeRun:
                 self._hidden = np.minimum(self._hidden, directly)
         return self._hidden + STEPS * UNIT * np.abs(simulated)
 
-    def _followed(self, g: dict[int, list[float]]) -> tuple[FloatArray, FloatArray]:
+    def _followed(self, g: dict[int, float]) -> tuple[FloatArray, FloatArray]:
         """By what levels are multiplied (tubes,), and half-widths (tubes, p), where g is this."""
         if not g:
             return self._unmoved, self._widths
-        room = np.array([max(g[j][0], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
+        room = np.array([max(g[j], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
         return room, self._widths * np.sqrt(room)[:, None]
 
     def _alarm(self, innovation: list[float]) -> str:
@@ -338,74 +381,6 @@ class TubeRun:
             f"side, above {cusum.threshold:.4g}; nothing is proved of this"
         )
 
-    def _reading(
-        self,
-        t: float,
-        judged: "_Judged",
-        nominal: tuple[float, ...],
-        measured: tuple[float, ...],
-    ) -> Reading:
-        """The narrowest margin and the most that is used over the tubes that last."""
-        sizes, spent, peaks, level, widths, away, innovation = judged
-        alarm = self._alarm(innovation)
-        lasting = self._lasting(self._k)
-        if not lasting:
-            covered = self._samples[0]
-            return Reading(
-                t,
-                Status.UNKNOWN,
-                measured=measured,
-                alarm=alarm,
-                reason=f"the proof covers {covered} samples; they are over",
-            )
-        row = max((sizes[j] for j in lasting), key=max)
-        size = max(row)
-        margin = 1.0 - size
-        most = max(lasting, key=spent.__getitem__)
-        sharpest = max(lasting, key=peaks.__getitem__)
-        reason = ""
-        status = Status.INSIDE
-        if not spent[most] <= 1.0:
-            status = Status.ASSUMPTION_VIOLATED
-            unit = self._units[most]
-            reason = (
-                f"innovation energy {self._spent[most]:.4g}{unit} above the level "
-                f"{level[most]:.4g}{unit} at t = {t:g} s"
-            )
-        elif not peaks[sharpest] <= 1.0:
-            status = Status.ASSUMPTION_VIOLATED
-            beside = "" if self._direct[sharpest] else f" ({WATCHED})"
-            reason = (
-                f"one sample's innovation is {math.sqrt(peaks[sharpest]):.4g} times what is "
-                f"assumed{beside}, at t = {t:g} s"
-            )
-        if not size <= 1.0:
-            status = Status.OUTSIDE
-            kept = "although the assumption was kept: what runs is not what was proved"
-            reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
-        used = max(spent[most], peaks[sharpest])
-        return Reading(
-            t,
-            status,
-            margin,
-            used,
-            self._trend.exit_after(t, margin),
-            self._names[row.index(size)],
-            nominal,
-            measured,
-            Level.TUBE if size <= 1.0 else Level.NONE,
-            reason,
-            self._assuming,
-            away + innovation,
-            alarm,
-            self._narrowest(widths, lasting) if self._follow else (),
-        )
-
-    def _narrowest(self, widths: FloatArray, lasting: list[int]) -> tuple[float, ...]:
-        """(p,) the least half-widths of these tubes."""
-        rows = widths[lasting[0]] if len(lasting) == 1 else widths[lasting].min(axis=0)
-        return tuple(rows.tolist())
-
     def _reached(self, steps: int) -> FloatArray:
         """(tubes, p) of `reach` after so many steps; found for twice as many where they are new."""
         if steps > len(self._reach):
@@ -415,7 +390,7 @@ class TubeRun:
 
     def _lasting(self, k: int) -> list[int]:
         """The tubes whose proof covers k samples."""
-        return [j for j, ends in enumerate(self._samples) if ends is None or k <= ends]
+        return [j for j, tube in enumerate(self._tubes) if k <= (tube.samples or k)]
 
     def _unknown(self, t: float, y: FloatArray, reason: str) -> Reading:
         return Reading(t, Status.UNKNOWN, measured=tuple(y.tolist()), reason=reason)
@@ -462,22 +437,6 @@ class Ahead:
         room = np.vstack([beside, widths[lasting]]) * (1.0 + OUTWARD)
         room += np.tile(run._hides(outputs[-1])[lasting], (2, 1))
         return (centres - room).max(axis=0), (centres + room).min(axis=0)
-
-
-class _Judged(NamedTuple):
-    """One sample against all tubes. sizes, widths: of each tube's outputs; spent, level: of it.
-
-    peaks: the squares of the sample's innovation as parts of the tube's peaks. away: the output
-    error. innovation: of the first observer.
-    """
-
-    sizes: list[list[float]]
-    spent: list[float]
-    peaks: list[float]
-    level: FloatArray
-    widths: FloatArray
-    away: list[float]
-    innovation: list[float]
 
 
 def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:

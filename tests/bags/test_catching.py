@@ -268,7 +268,7 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     )
     level, settling = made.funnel.tubes[0].follows, made.funnel.settling
     assert level is not None
-    g = np.concatenate([level.along(trial.u)[settling:, 0] for trial in calibration])
+    g = np.concatenate([level.along(trial.u)[settling:] for trial in calibration])
     following, headline = (tube.half_widths[0] for tube in made.funnel.tubes)
     expected = np.minimum(following * np.sqrt(g), headline)
     width = found.widths[0]

@@ -75,7 +75,7 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
     said = nlsid("export", tmp_path, "--out", tmp_path / "out")
     assert f"no {CONTROLLER}: no signal is in rad or m" in said
     content = yaml.safe_load((tmp_path / "out" / VALIDATOR).read_text())
-    width = up(design.funnel.half_width)
+    width = up(float(design.funnel.half_widths[0]))
     assert content["/**"]["ros__parameters"]["thresholds"] == {
         "over_velocity_ratio": 0.0,
         "over_velocity_offset": width,

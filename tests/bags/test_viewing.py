@@ -348,7 +348,7 @@ def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_
     assert [s.stamp_ns for s in samples] == [entry.stamp_ns for entry in readings]
     margins = [s.numbers["margin"] for s in samples]
     assert margins == pytest.approx([e.reading.margin for e in readings], nan_ok=True, abs=0.0)
-    width = proved.funnel.half_width
+    width = proved.funnel.half_widths[0]
     assert {s.signal("half_width", 0) for s in samples} == {width}
     said = shown.verdict()
     assert (said.word, said.level) == ("recording over", STALE)

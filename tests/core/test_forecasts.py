@@ -62,7 +62,7 @@ def attack(
     for k in range(lags, samples):
         u[k] = rng.uniform(LOW, HIGH, n_u) if rng.random() < 0.2 else u[k - 1]
         outputs, x = stepper.advance(x, u[k])
-        level = tube.level * (1.0 if meter is None else meter.update(u[k].tolist())[0])
+        level = tube.level * (1.0 if meter is None else meter.update(u[k].tolist()))
         left = max(level - tube.rho * spent, 0.0) * (1.0 - 1e-9)
         away = np.sign(outputs[0] - outputs[1] + 1e-12 * rng.normal(size=p)) * rng.random(p)
         direction = away if kind == "sign" else rng.normal(size=p)
@@ -177,7 +177,7 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
     assert (with_peak.low >= without.low).all()
     assert (with_peak.high <= without.high).all()
     (predicted,), _ = stepper.advance(x, u[lags + 1])
-    g = 1.0 if tube.follows is None else float(tube.follows.along(u)[lags + 1, 0])
+    g = 1.0 if tube.follows is None else float(tube.follows.along(u)[lags + 1])
     single = max(g, 1.0) * tube.peak.at_most @ np.abs(tube.R) @ tube.peak.at_most
     most = np.sqrt(min(single, g * tube.level) * np.diag(np.linalg.inv(tube.R)))
     least = np.minimum(most, np.sqrt(g) * tube.half_widths)

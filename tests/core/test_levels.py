@@ -21,17 +21,17 @@ TERMS = (
     Term((0, 1), VALUE, 0.0, 3.0, 0.9),
     Term((1,), CHANGE, 0.0, 0.5, 0.7),
 )
-LEVEL = CommandLevel(TERMS, np.array([[0.1, 2.0, 3.0, 0.0], [0.0, 1.0, 0.0, 5.0]]))
+LEVEL = CommandLevel(TERMS, np.array([0.1, 2.0, 3.0, 5.0]))
 
 
 def by_hand(u: FloatArray) -> FloatArray:
-    """(N, 2): g of LEVEL as sums over the past."""
+    """(N,): g of LEVEL as sums over the past."""
     found = []
     for k in range(len(u)):
         value = ((u[k, 0] - 0.5) / 2.0) ** 2
         product = sum(0.9 ** (k - i) * (u[i, 0] * u[i, 1] / 3.0) ** 2 for i in range(k + 1))
         change = sum(0.7 ** (k - i) * ((u[i, 1] - u[i - 1, 1]) / 0.5) ** 2 for i in range(1, k + 1))
-        found.append([0.1 + 2.0 * value + 3.0 * product, value + 5.0 * change])
+        found.append(0.1 + 2.0 * value + 3.0 * product + 5.0 * change)
     return np.array(found)
 
 
@@ -41,7 +41,7 @@ def test_a_level_is_the_sum_that_its_page_states_and_online_it_is_the_same() -> 
     meter = LevelMeter(LEVEL)
     assert [meter.update(now) for now in u.tolist()] == LEVEL.along(u).tolist(), "bit for bit"
     meter.restart()
-    assert meter.update(u[0].tolist()) == LEVEL.along(u)[0].tolist()
+    assert meter.update(u[0].tolist()) == LEVEL.along(u)[0]
     assert CommandLevel.from_document(LEVEL.document(), source="x").document() == LEVEL.document()
 
 
@@ -50,9 +50,9 @@ def test_a_level_that_makes_no_sense_is_refused() -> None:
         with pytest.raises(DataError, match="does not make sense"):
             replace(TERMS[1], **change)
     with pytest.raises(DataError, match="not be negative"):
-        CommandLevel(TERMS[:1], np.array([[-1.0]]))
+        CommandLevel(TERMS[:1], np.array([-1.0]))
     with pytest.raises(ShapeError):
-        CommandLevel(TERMS, np.ones((1, 2)))
+        CommandLevel(TERMS, np.ones(2))
     with pytest.raises(DocumentError, match="whole numbers"):
         CommandLevel.from_document(
             {"terms": [TERMS[0].document() | {"inputs": [0.5]}], "weights": [[1.0]]}, source="x"
@@ -66,7 +66,7 @@ def trials(count: int, seed: int, *, moved: float) -> tuple[list[FloatArray], li
     for k in range(count):
         rng = np.random.default_rng((seed, k))
         u = np.repeat(rng.uniform(-1.0, 1.0, (8, 1)), 25, axis=0)
-        size = CommandLevel((Term((0,), CHANGE, 0.0, 1.0, 0.85),), np.ones((1, 1))).along(u)
+        size = CommandLevel((Term((0,), CHANGE, 0.0, 1.0, 0.85),), np.ones(1)).along(u)
         room = 0.01 + moved * size
         energies.append(room * rng.uniform(0.0, 1.0, room.shape))
         inputs.append(u)
@@ -77,8 +77,8 @@ def test_what_moves_with_the_commands_is_followed_and_what_does_not_is_not() -> 
     energies, inputs = trials(12, 0, moved=1.0)
     level = followed(energies, inputs)
     assert level is not None
-    g = np.concatenate([level.along(u)[:, 0] for u in inputs])
-    E = np.concatenate(energies)[:, 0]
+    g = np.concatenate([level.along(u) for u in inputs])
+    E = np.concatenate(energies)
     scale = (E / g).max()
     assert np.mean(np.sqrt(g)) == pytest.approx(1.0, rel=0.01)
     assert np.sqrt(scale) < 0.5 * np.sqrt(E.max()), "half as wide on average as a constant"
@@ -118,7 +118,7 @@ def test_a_level_that_overflows_starts_a_new_run_and_is_never_inside() -> None:
     """v² is infinite in float64, and would be for ever where it fades."""
     made = design("following")
     recorded = dataset(MODELS["following"](), 100, 1).trajectories[0]
-    fading = CommandLevel((Term((0,), scale=1e-160, fading=0.9),), np.array([[1e-300]]))
+    fading = CommandLevel((Term((0,), scale=1e-160, fading=0.9),), np.array([1e-300]))
     tubes = tuple(replace(tube, follows=fading) for tube in made.funnel.tubes)
     monitor = Monitor([Stage(made.model, None, replace(made.funnel, tubes=tubes))])
     rows = zip(recorded.t.tolist(), recorded.y + 100.0, recorded.u + 1.0, strict=True)

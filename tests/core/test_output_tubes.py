@@ -75,7 +75,7 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
     assert tube.peak is not None
     g: FloatArray = np.ones(len(E))
     if tube.follows is not None:
-        g = tube.follows.along(trial.u)[settling:, 0]
+        g = tube.follows.along(trial.u)[settling:]
     peaks = ((e / tube.peak.at_most) ** 2).max(axis=1) / np.maximum(g, 1.0)
     expected = np.maximum(E / tube.level / g, peaks)
     used = np.array([r.assumption for r in judged])
@@ -103,7 +103,7 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
     assert tube.peak is not None
     wide = replace(made.funnel, tubes=(replace(tube, level=100.0 * tube.level),), cusum=None)
     innovation = np.array(run(monitor_of(name), trial)[k].deviation[-len(tube.R) :])
-    g = 1.0 if tube.follows is None else max(1.0, float(tube.follows.along(trial.u)[k, 0]))
+    g = 1.0 if tube.follows is None else max(1.0, float(tube.follows.along(trial.u)[k]))
     most = tube.peak.at_most * np.sqrt(g)
     for part, status in ((0.99, Status.INSIDE), (1.01, Status.ASSUMPTION_VIOLATED)):
         y = trial.y.copy()

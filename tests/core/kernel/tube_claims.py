@@ -141,7 +141,7 @@ def attacks(design: OutputTubeDesign, i: int, kind: str, samples: int, seed: int
             "sign": np.sign(y[0] - y[1] + 1e-12 * rng.normal(size=p)) * rng.random(p),
             "held": held,
         }[kind]
-        level = tube.level * (1.0 if meter is None else meter.update(now.tolist())[0])
+        level = tube.level * (1.0 if meter is None else meter.update(now.tolist()))
         left = max(level - tube.rho * spent, 0.0)
         part = 1.0 if kind == "held" or rng.random() < 0.3 else rng.random()
         e = e * np.sqrt(part * left / (e @ tube.R @ e))
