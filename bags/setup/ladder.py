@@ -28,6 +28,7 @@ FEW_LAGS = (1, 2, 3, 4)
 STEPS = 6  # of a search while it is one of many
 MORE_STEPS = 20  # of the best
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
+EVERY = 100  # linear models are quick
 GLANCE = 1000  # samples, to which an attempt is fitted to see whether it is worth a closer look
 DROPPED = 1.25  # times the best glance of a stage: worse ones are not looked at again
 MOST_FILTERED = 6  # states of filters
@@ -62,7 +63,7 @@ def choose(
         for place, row in enumerate(glances):
             if row.refusal:
                 rows.append(row)
-            elif place < kept and row.percent <= DROPPED * best:
+            elif kept == EVERY or (place < kept and row.percent <= DROPPED * best):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
                 rows.append(held_out.judged(row.attempt))
             else:
@@ -145,6 +146,10 @@ def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         if made.degrees.leading:
             higher = replace(made.degrees, inputs=3, leading=2 if signals_of(data) == (1, 1) else 1)
             yield replace(attempt, model_class=replace(made, lags=made.lags - 1, degrees=higher))
+    if isinstance(part := getattr(made, "structure", None), FilterMapFilter):
+        for phases, intervals in ((1, 24), (2, 24), (3, 48)):
+            finer = replace(part, phases=phases, intervals=intervals)
+            yield replace(attempt, model_class=Network(finer))
     if isinstance(method := attempt.method, Rse | Sem):
         for iterations in (1, MORE_STEPS):
             yield replace(attempt, method=replace(method, iterations=iterations))
@@ -180,7 +185,7 @@ def excited(data: Dataset, lags: int, degree: int) -> tuple[int, ...] | None:
 
 
 Stages = Sequence[tuple[Stage, int]]  # with how many of each are judged
-LINEAR: Stages = ((linear, 4),)
+LINEAR: Stages = ((linear, EVERY),)
 BEYOND: Stages = (
     (curved, 2),
     (networks, 1),

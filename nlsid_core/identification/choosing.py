@@ -2,8 +2,10 @@
 
 The trials are put into folds; trials that repeat one excitation stay together, and where all have
 one excitation, stretches of time are held out instead. Each fold is simulated by models of the
-others, every stretch from a start that is found on its first samples, which are not scored. Taken
-is the simplest model that is within one standard error of the best.
+others, every stretch from a start that is found on its first samples, which are not scored. A class
+with curvature that the data do not determine may do well there and nowhere else: so it counts, too,
+how far the folds' models are apart over the recorded inputs played at twice their speed, where
+nothing was measured. Taken is the simplest model that is within one standard error of the best.
 
 What a person may expect is promised by the same errors, and by none that chose: for each fold the
 model is chosen by the other folds alone, and its error on that fold counts.
@@ -13,7 +15,7 @@ Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t as student
@@ -26,7 +28,7 @@ from nlsid_core.identification.families import ModelClass, describe
 from nlsid_core.identification.identify import identify
 from nlsid_core.identification.methods.options import Method, Rse
 from nlsid_core.identification.polynomial.options import Polynomial
-from nlsid_core.identification.prediction import Model, simulate_started
+from nlsid_core.identification.prediction import Model, simulate_started, simulate_trial
 from nlsid_core.identification.rates import rate_of_memory
 
 FOLDS = 3
@@ -37,6 +39,7 @@ PLACES = (0.0, 0.15, 0.3, 0.45)  # of a trial, where it is tried how many are ne
 START_LAGS, START_STEPS, START_CLOSE = 4, 6, 1.04  # by a linear model, and its squared error
 SHORTEST = 20  # samples of a stretch
 SAMPLES = 8000  # that a fold is fitted to, at most
+FASTER = 2  # times the recorded speed, at which the models of the folds are compared
 CLOSE = 1.05  # times the best error: what is worse is not "as good", however few folds there are
 SURE = 0.9  # probability of the promised interval, were squared errors normal
 
@@ -61,18 +64,28 @@ class Row:
     """What became of an attempt: mean squared errors of the stretches, in squared spreads.
 
     errors: of each stretch, NaN where there is none. size: numbers in the model's file. refusal:
-    why an error is missing.
+    why an error is missing. apart: by how much the folds' models differ at twice the recorded
+    speed, in the same unit: what the data leave open.
     """
 
     attempt: Attempt
     errors: FloatArray
     size: int = 0
     refusal: str = ""
+    apart: float = 0.0
 
     @property
     def percent(self) -> float:
-        """The error over all stretches in % of the outputs' spread; infinite without one."""
-        return 100.0 * math.sqrt(self.errors.mean()) if not self.refusal else math.inf
+        """What is compared, in % of the outputs' spread: the root of error and `apart` together.
+
+        Infinite where an error is missing.
+        """
+        return 100.0 * math.sqrt(self.judged.mean()) if not self.refusal else math.inf
+
+    @property
+    def judged(self) -> FloatArray:
+        """By what attempts are compared: errors, and what the data leave open."""
+        return self.errors + self.apart
 
 
 @dataclass(frozen=True)
@@ -142,20 +155,35 @@ class HeldOut:
             error = float(np.mean(np.concatenate(squares)))
         return error if np.isfinite(error) else np.inf
 
+    def apart(self, models: Sequence[Model]) -> float:
+        """The mean square of the models' distance from their mean, at twice the recorded speed."""
+        runs = []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for fold in self.folds:
+                for trial, *_ in fold.judged:
+                    half = trial.t[: len(trial.t[::FASTER])]
+                    faster = replace(trial, t=half, y=trial.y[::FASTER], u=trial.u[::FASTER])
+                    outputs = np.array([simulate_trial(model, faster) for model in models])
+                    runs.append((outputs - outputs.mean(axis=0)) / self.spread)
+            found = float(np.mean(np.square(np.concatenate(runs, axis=1))))
+        return found if np.isfinite(found) else np.inf
+
     def judged(self, attempt: Attempt) -> Row:
         """The row of an attempt."""
         errors, size = np.full(len(self.fold_of), np.nan), 0
+        models: list[Model] = []
         for k, fold in enumerate(self.folds):
             try:
                 model = fitted(fold.fitted, attempt, self.data)
             except (DataError, SolverError) as refusal:
                 return Row(attempt, errors, size, str(refusal))
+            models.append(model)
             here = self.fold_of == k
             errors[here] = [self.error(model, stretch) for stretch in fold.judged]
             size = max(size, _numbers(model.document()))
             if not np.isfinite(errors[here]).all():
                 return Row(attempt, errors, size, "its simulation diverges")
-        return Row(attempt, errors, size)
+        return Row(attempt, errors, size, apart=self.apart(models))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +192,11 @@ class Choice:
 
     held_out: HeldOut
     rows: tuple[Row, ...]
+
+    @property
+    def found(self) -> bool:
+        """Whether anything that was tried has proved models."""
+        return any(not row.refusal for row in self.rows)
 
     @property
     def best(self) -> Row:
@@ -203,13 +236,13 @@ def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
 
     The error is that of the difference, stretch by stretch. Of equally small ones the best.
     """
-    means = [float(np.mean(row.errors[by])) for row in rows]
+    means = [float(np.mean(row.judged[by])) for row in rows]
     best = rows[int(np.argmin(means))]
 
     def is_as_good(row: Row) -> bool:
-        worse = (row.errors - best.errors)[by]
+        worse = (row.judged - best.judged)[by]
         error = float(worse.std(ddof=1)) / math.sqrt(len(worse))
-        limit = (CLOSE**2 - 1.0) * float(np.mean(best.errors[by]))
+        limit = (CLOSE**2 - 1.0) * float(np.mean(best.judged[by]))
         return float(worse.mean()) <= min(error, limit)
 
     good = [(row.size, mean, i) for i, (row, mean) in enumerate(zip(rows, means, strict=True))]

@@ -11,8 +11,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_828,
-    ("bags",): 12_002,
+    ("nlsid_core",): 18_845,
+    ("bags",): 12_007,
     ("nlsid_ros",): 2_679,
     ("tests",): 23_291,
     ("benchmarks", "examples"): 3_809,
