@@ -422,13 +422,12 @@ class FunnelMonitor(ManagedNode):
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN, at_once=True)
 
     def _say(self, reading: Reading, state: State, *, at_once: bool = False) -> None:
-        """Publish diagnostics if the state changed; remember what to repeat.
+        """Publish diagnostics if the state or what it assumes changed; remember what to repeat.
 
         An alarm is repeated until ~/restart, whatever comes after it.
         """
-        before = self._said[1]
-        self._said = reading, state
-        if state is before and not at_once:
+        (earlier, before), self._said = self._said, (reading, state)
+        if not at_once and (state, reading.assuming) == (before, earlier.assuming):
             return
         severity = SEVERITY.get(state, 0)
         news = self._latched is None or severity > SEVERITY[self._latched[0]]

@@ -4,7 +4,6 @@ import math
 import re
 import struct
 import time
-from array import array
 from collections.abc import Mapping
 from copy import deepcopy
 from functools import lru_cache, partial
@@ -14,12 +13,10 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.serialization import serialize_message
 from rclpy.validate_topic_name import validate_topic_name
-from sensor_msgs.msg import JointState
 
 from bags.recordings.cdr import ENCAPSULATION, Gatherer
-from bags.recordings.message_types import is_stamped, standard_types
+from bags.recordings.message_types import HEADER, is_stamped, standard_types
 from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
 from nlsid_core import files
@@ -244,11 +241,12 @@ def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> 
 @lru_cache(maxsize=16)
 def _blank(names: tuple[str, ...], frame: str) -> tuple[bytes, int]:
     """A serialised JointState of these names, and where its positions are."""
-    message = JointState(name=list(names), position=array("d", [0.0] * len(names)))
-    message.header.frame_id = frame
-    data = serialize_message(message)
+    types, none = standard_types(), np.zeros(0)
+    header = types.types[HEADER](types.types["builtin_interfaces/msg/Time"](0, 0), frame)
+    message = types.types[_NUMBERS](header, list(names), np.zeros(len(names)), none, none)
+    data = bytes(types.serialize_cdr(message, _NUMBERS))  # rclpy's has bytes of memory at its end
     first = SignalPath.parse("/numbers:position[0]").steps
-    (group,) = Gatherer(_NUMBERS, standard_types(), [first]).layout(data).groups
+    (group,) = Gatherer(_NUMBERS, types, [first]).layout(data).groups
     return data, int(group.offsets[0])
 
 

@@ -67,10 +67,6 @@ class LaunchFile:
         settings = [part for text in renamed for part in ("-r", text)]
         return [[*_command(node, values), *settings] for node in wanted]
 
-    def respawns(self, given: Sequence[str]) -> bool:
-        """Whether a node that fails is to be started again."""
-        return "respawn:=true" in (text.lower() for text in given)
-
     def _values(self, given: Sequence[str]) -> dict[str, str]:
         values = {a.name: a.default for a in self.arguments}
         for text in given:

@@ -112,8 +112,9 @@ def run(
         raise typer.Exit(2)
     if workflow not in WORKFLOWS:
         raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
-    file, given = launch_file(workflow), _launch_arguments(arguments or [])
-    raise typer.Exit(run_together(file.commands(given), respawn=file.respawns(given)))
+    given = _launch_arguments(arguments or [])
+    commands = launch_file(workflow).commands(given)
+    raise typer.Exit(run_together(commands, respawn="respawn:=true" in given))
 
 
 def _launch_arguments(given: list[str]) -> list[str]:

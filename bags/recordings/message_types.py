@@ -91,8 +91,7 @@ def header_frames(data: bytes, msgtype: str, types: Typestore) -> str:
 
 def _string(data: bytes, at: int) -> tuple[str, int]:
     """The string at an offset of a CDR message, and where it ends."""
-    length = int.from_bytes(data[at : at + 4], "little" if data[1] else "big")
-    end = at + 4 + length
+    end = at + 4 + int.from_bytes(data[at : at + 4], "little" if data[1] else "big")
     if end > len(data):
         raise BagError(f"not a CDR message with a header: it has only {len(data)} bytes")
     return data[at + 4 : end].rstrip(b"\0").decode("utf-8", "replace"), end

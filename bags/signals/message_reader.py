@@ -39,11 +39,10 @@ class MessageReader:
         found = self._layout.numbers(data)
         if len(found) == len(self._paths):
             return found
-        values, at = [], 0
+        values, left = [], iter(found)
         for path, group in zip(self._paths, self._targets, strict=True):
-            parts = [np.array([number]) for number in found[at : at + len(group)]]
+            parts = [np.array([next(left)]) for _ in group]
             values.append(float(path.combine(parts)[0]))
-            at += len(group)
         return values
 
 

@@ -5,7 +5,7 @@ they come; the samples are equal bit for bit. What to call for a model's signals
 
     sampler = Sampler([y.path for y in ...], [u.path for u in ...], period=model.period)
     sampler.check(topic, msgtype, types)  # once for each of sampler.topics
-    for sample in sampler.message(topic, sampler.stamp(data, log_ns), data): ...
+    for sample in sampler.take(sampler.stamp(data, log_ns), sampler.numbers(topic, data)): ...
     for sample in sampler.flush(until_ns): ...  # stop waiting for other topics
 
 The paths are expressions (`bags.signals.expressions`) and carry the whole rule, so that nothing
@@ -203,10 +203,6 @@ class Sampler:
     def stamp(self, data: bytes, log_ns: int) -> int:
         """The stamp (ns) of a serialised message that was logged, or live arrived, at `log_ns`."""
         return log_ns if self.clock == "log" else header_stamp_ns(data)
-
-    def message(self, topic: str, stamp_ns: int, data: bytes) -> list[Sample]:
-        """Take a serialised message of a checked topic; the samples that are certain now."""
-        return self.take(stamp_ns, self.numbers(topic, data))
 
     def numbers(self, topic: str, data: bytes) -> dict[int, float]:
         """The numbers of a serialised message by their signals; BagError if it has not all.

@@ -5,6 +5,7 @@ bag, or its parts one behind the other.
 """
 
 import heapq
+import math
 import struct
 import tempfile
 import zlib
@@ -37,6 +38,7 @@ from nlsid_core.progress import Progress, silent
 
 REPORT_EVERY: Final = 1000  # messages between two reports of progress
 SINCE_1970: Final = 1e8  # s, three years: a larger number is no time since the first message
+LATEST: Final = 2**31 * 10**9  # ns: from here on a stamp's seconds have no room in a message
 STORAGES: Final = ("mcap", "sqlite3", "ros1")
 
 
@@ -141,10 +143,10 @@ def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
             raise BagError(
                 f"{bags[0].path} has no topic {pattern}; it has: {', '.join(sorted(there))}"
             )
-    names = {}
+    names: dict[str, str] = {}
     for text in what.rename or ():
         old, equals, new = text.partition("=")
-        if not equals or not new or old not in there or new in there:
+        if not equals or not new or old not in there or new in {*there, *names.values()}:
             raise BagError(f"--rename {text}: expected /old=/new, a topic and a name that is none")
         names[old] = new
     found = []
@@ -205,49 +207,53 @@ def _spans(bags: Sequence[Bag], what: What) -> Spans:
 
 def _moment(text: str, origin_ns: int) -> int:
     """A log time in ns: s after `origin_ns`, s since 1970, or a date; BagError if it is none."""
+    if math.isfinite(seconds := _seconds(text)):
+        return round(seconds * 1e9) + (0 if seconds >= SINCE_1970 else origin_ns)
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise BagError(
+            f"'{text}' is no moment: give s after the first message, s since 1970, or a date "
+            "as 2024-05-01T12:00:00"
+        ) from error
+    whole = date if date.tzinfo else date.replace(tzinfo=UTC)
+    return int(whole.replace(microsecond=0).timestamp()) * 10**9 + whole.microsecond * 1000
+
+
+def _seconds(text: str) -> float:
+    """The s that a text is, NaN if it is none before 2038."""
     try:
         seconds = float(text)
     except ValueError:
-        try:
-            date = datetime.fromisoformat(text)
-        except ValueError as error:
-            raise BagError(
-                f"'{text}' is no moment: give s after the first message, s since 1970, or a date "
-                "as 2024-05-01T12:00:00"
-            ) from error
-        whole = date if date.tzinfo else date.replace(tzinfo=UTC)
-        return int(whole.replace(microsecond=0).timestamp()) * 10**9 + whole.microsecond * 1000
-    return round(seconds * 1e9) + (0 if seconds >= SINCE_1970 else origin_ns)
+        return math.nan
+    return seconds if abs(seconds) < 2**31 else math.nan
 
 
 def _restamping(bags: Sequence[Bag], rule: str) -> Callable[[int, Raw], Raw]:
     """What makes a message of bag n the one that is written."""
     if not rule:
         return lambda _, raw: raw
-    shift_ns = 0
-    if rule not in ("header", "log"):
-        try:
-            shift_ns = round(float(rule) * 1e9)
-        except ValueError as error:
-            raise BagError(f"--restamp {rule}: header, log, or s as +3600") from error
+    shift = 0.0 if rule in ("header", "log") else _seconds(rule)
+    if not math.isfinite(shift):
+        raise BagError(f"--restamp {rule}: header, log, or s as +3600")
+    shift_ns = round(shift * 1e9)
     stamped = [
         {channel.key: is_stamped(*bag.types_on(channel.topic)) for channel in bag.channels}
         for bag in bags
     ]
 
     def restamped(n: int, raw: Raw) -> Raw:
-        has_header = stamped[n][raw.key]
+        data, at = raw.data, raw.log_ns
+        if stamped[n][raw.key] and rule != "log":
+            at = header_stamp_ns(data) + shift_ns
+        log_ns, publish_ns = raw.log_ns + shift_ns, raw.publish_ns + shift_ns
         if rule == "header":
-            at = header_stamp_ns(raw.data) if has_header else raw.log_ns
-            return raw._replace(log_ns=at, publish_ns=at)
-        data = raw.data
-        if has_header:
-            at = raw.log_ns if rule == "log" else header_stamp_ns(data) + shift_ns
+            log_ns = publish_ns = at
+        if not all(0 <= time_ns < LATEST for time_ns in (at, log_ns, publish_ns)):
+            raise BagError(f"--restamp {rule} moves messages to before 1970 or after 2038")
+        if stamped[n][raw.key] and rule != "header":
             layout = "<iI" if data[1] else ">iI"
             data = data[:4] + struct.pack(layout, *divmod(at, 10**9)) + data[12:]
-        log_ns, publish_ns = raw.log_ns + shift_ns, raw.publish_ns + shift_ns
-        if min(log_ns, publish_ns) < 0:
-            raise BagError(f"--restamp {rule} moves messages to before 1970")
         return raw._replace(log_ns=log_ns, publish_ns=publish_ns, data=data)
 
     return restamped
@@ -339,8 +345,9 @@ def _written(
     """New bags, which get their names in the end; nothing is left after an error."""
     if into.storage not in STORAGES:
         raise BagError(f"no storage '{into.storage}'; there are: {', '.join(STORAGES)}")
-    if into.every is not None and not into.every > 0:
-        raise BagError(f"a part of {into.every:g} s")
+    for size, unit in ((into.every, "s"), (into.max_size, "MB")):
+        if size is not None and not size > 0:
+            raise BagError(f"a part of {size:g} {unit}")
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         parts = _Parts(Path(folder) / out.name, into, bags, channels)

@@ -7,8 +7,9 @@ with curvature that the data do not determine may do well there and nowhere else
 how far the folds' models are apart over the recorded inputs played at twice their speed, where
 nothing was measured. Taken is the simplest model that is within one standard error of the best.
 
-What a person may expect is promised by the same errors, and by none that chose: for each fold the
-model is chosen by the other folds alone, and its error on that fold counts.
+What a person may expect is promised by the same errors: for each fold the model is chosen by the
+other folds alone, of what was tried, and its error on that fold counts. Which attempts were tried
+closely enough to be chosen is not held out: a glance at one fold, and the best so far, decide that.
 Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Section
 3.4.3 (the rule of one standard error).
 """
@@ -131,7 +132,7 @@ class HeldOut:
         """DataError if there is too little of it."""
         groups = by_excitation(data)
         if len(groups) == 1:
-            on, folds = "stretches of time", list(_folds_in_time(data))
+            on, folds = "stretches of the only excitation", list(_folds_in_time(data))
         else:
             on, folds = "excitations", list(_folds_of(groups))
         spread = np.concatenate([trial.y for trial in data]).std(axis=0)

@@ -318,8 +318,11 @@ def test_names_and_times_change_and_what_does_not_fit_is_refused(bag: Path, tmp_
     for wrong in (
         ["--topics", "/none*"],
         ["--rename", f"{ODOM}={CMD}"],
-        ["--restamp", "soon"],
-        ["--start", "noon"],
+        ["--rename", f"{ODOM}=/one", "--rename", f"{CMD}=/one"],
+        *(["--restamp", rule] for rule in ("soon", "nan", "inf", "1e300", "+3e9", "-3e9")),
+        *(["--start", moment] for moment in ("noon", "nan", "-inf", "1e300", "2024-13-01")),
+        ["--max-size", "0"],
+        ["--max-size", "nan"],
         ["--storage", "hdf5"],
         ["--compression", "zip"],
         ["--every", "0"],

@@ -24,7 +24,7 @@ def test_a_bag_in_log_order_gives_exactly_the_samples_of_the_grid(bag: Path) -> 
             pairing.check(topic, *source.types_on(topic))
         for message in source.messages(pairing.topics):
             stamp_ns = pairing.stamp(message.data, message.log_time_ns)
-            samples += pairing.message(message.topic, stamp_ns, message.data)
+            samples += pairing.take(stamp_ns, pairing.numbers(message.topic, message.data))
     assert len(samples) == 120  # the last response waits for a command that never comes
     samples += pairing.flush()
     [expected] = read_dataset([bag], responses=[SPEED], excitations=[COMMAND])

@@ -357,7 +357,7 @@ def replayed(bag: Path, sampler: Sampler) -> list[Sample]:
             sampler.check(topic, *source.types_on(topic))
         for message in source.messages(sampler.topics):
             stamp = sampler.stamp(message.data, message.log_time_ns)
-            given += sampler.message(message.topic, stamp, message.data)
+            given += sampler.take(stamp, sampler.numbers(message.topic, message.data))
     return [sample for sample in [*given, *sampler.flush()] if not sample.missing]
 
 
@@ -507,8 +507,9 @@ def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Pa
         given = [
             sample
             for message in source.messages(["/tf"])
-            for sample in sampler.message(
-                "/tf", sampler.stamp(message.data, message.log_time_ns), message.data
+            for sample in sampler.take(
+                sampler.stamp(message.data, message.log_time_ns),
+                sampler.numbers("/tf", message.data),
             )
         ]
     assert [sample.y[0] for sample in came(given)] == read[signals[1]].values.tolist()

@@ -50,7 +50,7 @@ LAGS = [Attempt(Polynomial(lags), LeastSquares()) for lags in (1, 2, 6)]
 
 def test_one_recording_is_cut_in_time() -> None:
     choice = judged(Dataset((trial(0, samples=1200),)), [*LAGS, Attempt(Polynomial(2), Rse(6))])
-    assert choice.held_out.on == "stretches of time"
+    assert choice.held_out.on == "stretches of the only excitation"
     for fold in choice.held_out.folds:
         together = sum(map(len, fold.fitted)) + sum(len(t) for group in fold.judged for t in group)
         assert together == 1200, "each sample is fitted or judged"

@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from bags.recordings.message_types import (
+    decode,
     header_frames,
     header_stamp_ns,
     is_stamped,
@@ -97,6 +99,8 @@ def test_numbers_of_a_node_are_a_message_like_any_other() -> None:
         data = numbers_at(1_500_000_007, numbers, frame)
         message = deserialize_message(data, JointState)
         assert dict(zip(message.name, message.position, strict=True)) == numbers
+        decoded: Any = decode(data, JOINTS, standard_types())  # to the byte
+        assert decoded.position.tolist() == list(numbers.values())
         assert header_stamp_ns(data) == 1_500_000_007
         assert header_frames(data, JOINTS, standard_types()) == message.header.frame_id == frame
 

@@ -328,7 +328,7 @@ def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(
     text, values = robot.said[RECORDER][-1]
     assert text == "recording"
     assert values["bag"] == str(bag)
-    assert (values["messages"], values["lost"]) == ("241", "0")
+    assert (values["messages"], values["lost"]) == ("361", "0")
     with Bag(bag) as source:
         assert source.custom["/odom received"] == "121"
         assert float(source.custom["/odom rate [Hz]"]) == pytest.approx(40.0, rel=0.01)

@@ -127,13 +127,14 @@ def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, s
 
 def widened(problem: ContinuousTracking, found: Found, progress: Progress) -> Found:
     """The funnel in which inputs saturate, if few may and it is much wider at the start."""
-    setting, funnel, field = found.setting, found.funnel, found.setting.steps.field
-    limits = _limits(problem)
+    setting, funnel, limits = found.setting, found.funnel, _limits(problem)
+    field = setting.steps.field
     few = len(limits) <= (MOST_LIMITED if field.n <= FEW_STATES else 1)
     if problem.policy is not None or not len(limits) or not few or len(setting.policy.limits):
         return found
-    kept = replace(field, valid=valid_rows(limits, field.n))
-    if (funnel.rho < AT_LIMIT * validity_caps(kept, setting.policy, setting.P)).all():
+    bounded = replace(field, valid=valid_rows(limits, field.n))
+    caps = validity_caps(bounded, setting.policy, setting.P)
+    if problem.hold is None and (funnel.rho < AT_LIMIT * caps).all():  # a hold takes of the room
         return found
     again = replace(problem, nominal=motion_of(setting), R=setting.weights[1])
     try:

@@ -220,6 +220,8 @@ def passed(weights: list[tuple[int, float]], signal: FloatArray, trial: Trial) -
 
 def _filtered(A: FloatArray, forcing: FloatArray, start: FloatArray, trial: Trial) -> FloatArray:
     """(…, N): forcing through 1/A, from the given first samples, from rest or from a held past."""
+    if not forcing.size:  # nothing moves, as in a flat map's first step
+        return forcing
     if len(start):
         forcing = forcing.copy()
         forcing[..., : len(start)] = lfilter(A, [1.0], start)  # what makes them the first samples
