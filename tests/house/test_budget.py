@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_850,
+    ("nlsid_core",): 18_828,
     ("bags",): 12_002,
     ("nlsid_ros",): 2_676,
-    ("tests",): 23_295,
+    ("tests",): 23_293,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
