@@ -9,7 +9,7 @@ nothing was measured. Taken is the simplest model that is within one standard er
 
 What a person may expect is promised by the same errors: for each fold the model is chosen by the
 other folds alone, of what was tried, and its error on that fold counts. Which attempts were tried
-closely enough to be chosen is not held out: a glance at one fold, and the best so far, decide that.
+closely enough to be chosen is not held out: the first fold, and the best so far, decide that.
 Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Section
 3.4.3 (the rule of one standard error).
 """
