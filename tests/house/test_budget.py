@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 12_002,
     ("nlsid_ros",): 2_676,
-    ("tests",): 23_293,
+    ("tests",): 23_290,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
