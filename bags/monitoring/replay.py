@@ -342,7 +342,7 @@ def replay_bag(
     stamped = _replayed(design, bag, centre, definitions, clock)
     unit, half_width = "", 0.0
     if isinstance(design.funnel, TubeFunnel) and len(design.signals[0]) == 1:
-        unit, half_width = design.signals[0][0].unit, design.funnel.half_width
+        unit, half_width = design.signals[0][0].unit, float(design.funnel.half_widths[0])
     return Replay(
         name=Path(bag).name,
         readings=tuple(entry.reading for entry in stamped),

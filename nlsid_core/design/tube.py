@@ -132,7 +132,7 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
 
     start = inlet / safety_factor
     fast = _best(form, _pairs(gains, e, form.fading()), amplitudes, samples, decided, start)
-    slower = np.stack([*(s * fast.L for s in SLOWER), 0.0 * fast.L])
+    slower = np.multiply.outer([*SLOWER, 0.0], fast.L)
     own = [innovations(model, slower, trial, settling) for trial in train]
     found, tubes, alarm = [fast], [tube_of(fast, None)], None
     if horizon is not None:
@@ -200,10 +200,9 @@ def statistics(funnel: TubeFunnel, model: StableModel, trial: Trajectory) -> Flo
             rule = PEAK if tube is funnel.tubes[-1] else beside
             found += [(peak, *rule) for peak in peaks.tolist()]
     if alarm is not None:
-        factor = funnel.tubes[0].measured.safety_factor
-        sums = cusum(factor * e[:, 0] / alarm.deviation)
-        found.append((max(DRIFT, float(sums.max())), *SUMS))
-    return np.maximum(np.array(found), TINY)
+        z = funnel.tubes[0].measured.safety_factor * e[:, 0] / alarm.deviation
+        found.append((max(DRIFT, float(cusum(z).max())), *SUMS))
+    return np.asarray(np.maximum(found, TINY))
 
 
 def calibrated(
@@ -223,17 +222,16 @@ def calibrated(
     room, growth = before[0, :, 1:].T
     at_first = before[:, :, 0].max(axis=0) * room
     scales = np.sort((np.log(seen[:, :, 0] / at_first) / growth).max(axis=1))[::-1]
-    rank = funnel.tubes[0].measured.rank
-    levels = at_first * np.exp(growth * scales[rank - 1])
+    levels = at_first * np.exp(growth * scales[funnel.tubes[0].measured.rank - 1])
     tubes, used = [], 0
     for tube in funnel.tubes:
         end = used + (1 if tube.peak is None else 1 + len(tube.R))
         tubes.append(_scaled(tube, float(levels[used]) ** 2, levels[used + 1 : end]))
         used = end
-    alarm = funnel.cusum
-    if alarm is not None:
-        alarm = replace(alarm, threshold=_above(float(levels[-1])))
-    return replace(funnel, tubes=tuple(tubes), cusum=alarm)
+    if funnel.cusum is not None:
+        alarm = replace(funnel.cusum, threshold=_above(float(levels[-1])))
+        funnel = replace(funnel, cusum=alarm)
+    return replace(funnel, tubes=tuple(tubes))
 
 
 def _scaled(tube: Tube, E: float, peaks: FloatArray) -> Tube:
@@ -280,9 +278,9 @@ def _headline(
     for i, s in list(enumerate(SLOWER))[len(amplitudes) > 1 :]:
         found, peak = slowed(form, fast, s), np.maximum(sizes[i], TINY)
         level = max(float(energy(part[:, i], fast).max()) for part in slow)
-        a, room = 1.0 / found.tau, np.maximum(level * r - peak**2, TINY)
-        rest = np.minimum(1.0, peak * np.sqrt(a / (r * room)))
-        share = a + rest**2 * r
+        room = found.tau * r * np.maximum(level * r - peak**2, TINY)
+        rest = np.minimum(1.0, peak / np.sqrt(room))
+        share = 1.0 / found.tau + rest**2 * r
         width = np.sqrt(level * share) + (1.0 - rest) * peak
         tried.append(
             (
@@ -388,10 +386,12 @@ def _gains(form: Form, amplitudes: FloatArray) -> FloatArray:
     """
     p, m = len(form.H), form.m
     sizes: FloatArray = np.diag(amplitudes**2)
-    noises: list[tuple[FloatArray, FloatArray, FloatArray]]
     if m == 0:
         assert form.inputs is not None
-        noises = [(form.A[:, :1], np.eye(1), sizes), (*form.inputs, np.eye(1))]
+        noises: list[tuple[FloatArray, FloatArray, FloatArray]] = [
+            (form.A[:, :1], np.eye(1), sizes),
+            (*form.inputs, np.eye(1)),
+        ]
     else:
         G, D = form.F[:, :m], form.H[:, :m]
         spread: FloatArray = np.eye(m) * float(np.mean(amplitudes)) ** 2
@@ -448,8 +448,8 @@ def _best(
         rho = pair.rho
         began = rho * start**2 / float(W[0, 0]) if start else 0.0
         spent = [np.einsum("ti,ij,tj->t", part, R, part) for part in pair.e]
-        weights = rho ** np.arange(samples + 1)
-        ahead = max(float(np.convolve(part, weights).max()) for part in spent)
+        fading = rho ** np.arange(samples + 1)
+        ahead = max(float(np.convolve(part, fading).max()) for part in spent)
         ever = max(float(lfilter([1.0], [1.0, -rho], part).max()) for part in spent)
         scale = float(np.mean(np.sqrt(variance) / amplitudes))
         return scale * float(np.sqrt(ahead + began)), scale * float(np.sqrt(ever + began))

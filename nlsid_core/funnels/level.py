@@ -138,4 +138,4 @@ class LevelMeter:
             v = (s - centre) / scale
             G[i] = fading * G[i] + v * v
         self._before = products
-        return sum(map(mul, self._weights, G))
+        return float(sum(map(mul, self._weights, G)))

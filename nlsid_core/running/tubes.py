@@ -109,8 +109,8 @@ class TubeRun:
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
         self._g: dict[int, float] = {}
-        cusum = self._cusum
-        self._sums = None if cusum is None else CusumMeter(len(self._names), cusum.drift)
+        alarm = self._cusum
+        self._sums = None if alarm is None else CusumMeter(len(self._names), alarm.drift)
         self._trend = Trend()
 
     def update(self, t: float, y: Any, u: Any) -> Reading:
@@ -301,7 +301,7 @@ class TubeRun:
             return self._unknown(t, y, over)._replace(alarm=alarm)
         row = sizes[lasting].max(axis=0) if len(lasting) > 1 else sizes[lasting[0]]
         size = float(row.max())
-        used, reason = self._used(t, lasting, spent, peaks)
+        share, reason = self._used(t, lasting, spent, peaks)
         status = Status.ASSUMPTION_VIOLATED if reason else Status.INSIDE
         if not size <= 1.0:
             status = Status.OUTSIDE
@@ -311,7 +311,7 @@ class TubeRun:
             t,
             status,
             1.0 - size,
-            used,
+            share,
             self._trend.exit_after(t, 1.0 - size),
             self._names[int(row.argmax())],
             nominal,
@@ -333,10 +333,9 @@ class TubeRun:
         used = max(spent[most], peaks[sharpest])
         if not spent[most] <= 1.0:
             unit = self._tubes[most].energy_unit(self._stepper.y)
-            level = self._spent[most] / spent[most]
             return used, (
                 f"innovation energy {self._spent[most]:.4g}{unit} above the level "
-                f"{level:.4g}{unit} at t = {t:g} s"
+                f"{self._spent[most] / spent[most]:.4g}{unit} at t = {t:g} s"
             )
         if not peaks[sharpest] <= 1.0:
             peak = self._tubes[sharpest].peak
@@ -442,8 +441,7 @@ class Ahead:
 def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
     """DataError if a run on such trials (y, u) could not be judged in float64."""
     for trial in trials:
-        most = np.spacing(np.abs(trial.y).max(axis=0))
-        refuse_coarse(most, funnel.half_widths, trial.name)
+        refuse_coarse(np.spacing(np.abs(trial.y).max(axis=0)), funnel.half_widths, trial.name)
         run = TubeRun(model, funnel)
         for k in range(min(len(trial), run.lags + 1)):
             reading = run.update(k * model.period, trial.y[k], trial.u[k])

@@ -149,7 +149,7 @@ def test_widths_and_shares_are_measured_on_the_calibration_trials(
     design: OutputTubeDesign, train: Dataset, found: Catching
 ) -> None:
     (width,) = found.widths
-    assert width.half_width == design.funnel.half_width
+    assert width.half_width == design.funnel.half_widths[0]
     assert width.share == width.half_width / np.ptp(np.concatenate([trial.y for trial in train]))
     assert width.said.endswith(" m/s")
     for name, share in found.shares:

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_899,
-    ("bags",): 12_003,
+    ("nlsid_core",): 18_828,
+    ("bags",): 11_998,
     ("nlsid_ros",): 2_676,
-    ("tests",): 23_290,
+    ("tests",): 23_288,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8

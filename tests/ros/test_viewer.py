@@ -56,7 +56,7 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
     port = free_port()
     proved = documents.load(funnel).funnel
     assert isinstance(proved, TubeFunnel)
-    width = proved.half_width
+    width = float(proved.half_widths[0])
     names = {"__ns": "/robot1"}
     shared = {"/robot1/odom": "/odom", "/robot1/cmd_vel": "/cmd_vel"}
     signals = {"allow_old_stamps": True, "source": "/funnel_publisher", "stale_after": 5.0}
