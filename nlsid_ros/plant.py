@@ -16,7 +16,7 @@ from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
 from bags.designs.documents import load_model
 from bags.signals.expressions import Expression
-from bags.signals.grid import seconds
+from bags.signals.timing import seconds
 from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray

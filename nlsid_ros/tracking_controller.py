@@ -28,8 +28,7 @@ from bags.designs.documents import load_unproved
 from bags.designs.wiring import read_at, written_at
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from bags.recordings.message_types import header_stamp_ns
-from bags.signals.arrivals import Sequence
-from bags.signals.grid import seconds
+from bags.signals.timing import Sequence, seconds
 from nlsid_core import files
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError

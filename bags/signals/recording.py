@@ -8,7 +8,8 @@ from typing import Final
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Regularity, Sequence
+from bags.signals.arrivals import Arrival, Regularity
+from bags.signals.timing import Sequence
 
 COUNTED: Final = ("received", "lost", "gaps", "rate [Hz]", "jitter [ms]")
 UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"
