@@ -152,7 +152,7 @@ class FunnelMonitor(ManagedNode):
         self._help = Help(self, (self.values.stop_service, self.values.snapshot_service))
         self.serve("restart", self._on_restart)
 
-        self._patience = self.get_clock() if self._simulated else self.steady
+        self._patience = self.data_clock
         self._stale = self.later(self._on_stale, self._patience)
         self._release = self.later(self._on_release, self._patience)
         self.every(LOOK, self._look)
