@@ -22,8 +22,8 @@ from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.signals.expressions import Expression, factors
+from bags.signals.message_reader import SignalVector
 from bags.signals.signal import SignalPath
-from bags.signals.vector import SignalVector
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError

@@ -17,8 +17,8 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from bags.recordings.cdr import ENCAPSULATION, Gatherer
 from bags.recordings.message_types import HEADER, is_stamped, standard_types
+from bags.signals.message_reader import SignalVector
 from bags.signals.signal import SignalPath, numeric_paths
-from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike
 from nlsid_core.errors import BagError, DocumentError

@@ -15,8 +15,8 @@ import numpy as np
 from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
 from bags.signals.expressions import Expression
+from bags.signals.message_reader import SignalVector
 from bags.signals.timing import seconds
-from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.dynamics import VectorField, vector_field

@@ -3,8 +3,8 @@
 Subscribes to each topic once a publisher shows its type and quality of service, and writes the
 messages undecoded: log time is the arrival (of /clock, in simulated time), publish time the header
 stamp. What a killed recorder loses is what came after the last chunk, at most `chunk_period` and
-one WRITE. Counts of received and lost messages, rate, jitter and gaps go to /diagnostics every
-second and into the bag's metadata.
+one WRITE. Counts of received and lost messages go to /diagnostics every second and into the bag's
+metadata.
 `~/start` and `~/stop` begin and end a bag, `~/snapshot` saves the last seconds in a bag of their
 own.
 """
@@ -191,7 +191,7 @@ class TrajectoryRecorder(ManagedNode):
         if self._recent is not None:
             self._recent.add(arrival)
         if self._recording is not None:
-            self._recording.add(arrival, stamp_ns)
+            self._recording.add(arrival)
 
     def lose(self, topic: str, count: int) -> None:
         """Count messages that could not wait."""

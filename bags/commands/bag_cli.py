@@ -39,7 +39,6 @@ bag_app = typer.Typer(
     no_args_is_help=True,
 )
 out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
-err = Console(stderr=True)
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]

@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from bags.signals.expressions import Expression
+from bags.signals.message_reader import SignalVector
 from bags.signals.sampling import Sampler
-from bags.signals.vector import SignalVector
 from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.dynamics import VectorField
 

@@ -15,11 +15,12 @@ from rosbags.typesys.store import Typestore
 from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import METADATA, BagFiles, bag_files, data_files, without_twins
+from bags.recordings.mcap_file import Whole
 from bags.recordings.message_types import are_same, ros2_definition, types_in_bag
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.quality import Profile
 from bags.recordings.remote import place
-from bags.recordings.storage import ALWAYS, Channel, Raw, Spans, Storage, defined
+from bags.recordings.storage import ALWAYS, Channel, Raw, Spans, Storage, Takes, defined
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
@@ -64,13 +65,13 @@ class Bag:
         self.ending: str | None = None
         if not self._described.finished:
             self.ending = f"it has no {METADATA}: the recording was not closed"
-        self._storage = Storage(self.files, salvage=salvage)
-        self._storage.channels = [
+        self.storage = Storage(self.files, salvage=salvage)
+        self.storage.channels = [
             defined(self._encoded(channel), definitions or {}, self.release)
-            for channel in self._storage.channels
+            for channel in self.storage.channels
         ]
-        if self._storage.ending is not None:  # of a bag that is one file that is said already
-            self.ending = self._storage.ending.removeprefix(f"{self.path}: ")
+        if self.storage.ending is not None:  # of a bag that is one file that is said already
+            self.ending = self.storage.ending.removeprefix(f"{self.path}: ")
         if self.ending is not None and not (unfinished or salvage):
             self.close()
             raise BagError(self._unfinished())
@@ -84,7 +85,7 @@ class Bag:
 
     def close(self) -> None:
         """Close the bag's files."""
-        self._storage.close()
+        self.storage.close()
 
     def __enter__(self) -> "Bag":
         return self
@@ -95,7 +96,7 @@ class Bag:
     @property
     def channels(self) -> Sequence[Channel]:
         """The recorded streams; a topic has one, or several in a split bag."""
-        return self._storage.channels
+        return self.storage.channels
 
     @cached_property
     def topics(self) -> dict[str, str]:
@@ -110,35 +111,30 @@ class Bag:
     @property
     def custom(self) -> dict[str, str]:
         """The bag's own metadata: `custom_data` of the MCAP files and, before it, metadata.yaml."""
-        return {**self._storage.custom, **self._described.custom}
+        return {**self.storage.custom, **self._described.custom}
 
     @property
     def release(self) -> str:
         """The release of ROS 2 that recorded it, as it says; empty if it does not."""
-        return self._described.release or self._storage.release
-
-    @property
-    def kinds(self) -> dict[str, list[str]]:
-        """`storage`: what its files are. `compression`: how their chunks are compressed."""
-        return self._storage.kinds
+        return self._described.release or self.storage.release
 
     @property
     def lost(self) -> tuple[str, ...]:
         """What cannot be read, as far as it was found by now, and why."""
-        return (*self._damaged, *self._storage.lost)
+        return (*self._damaged, *self.storage.lost)
 
     @property
     def kept_beside(self) -> Iterator[Metadata | Attachment]:
         """The bag's records that are no messages, but for `custom`."""
-        yield from self._storage.records
-        yield from self._storage.attachments()
+        yield from self.storage.records
+        yield from self.storage.attachments()
 
     @property
     def statements(self) -> tuple[str, ...]:
         """What in the bag says how many messages there should be."""
         said = {
             METADATA: self._described.topics is not None,
-            "the files' statistics and indexes": self._storage.stated is not None,
+            "the files' statistics and indexes": self.storage.stated is not None,
         }
         return tuple(name for name, there in said.items() if there)
 
@@ -146,7 +142,7 @@ class Bag:
     def disagreements(self) -> tuple[str, ...]:
         """Where what the bag states and what is there differ, in words."""
         found = [*self._described.notes]
-        said = {METADATA: self._counts, "the file": self._storage.stated}
+        said = {METADATA: self._counts, "the file": self.storage.stated}
         for name, counts in said.items():
             for topic in {**counts, **self.topics} if counts is not None else ():
                 stated, there = (counts or {}).get(topic, 0), self._there(topic)
@@ -162,7 +158,7 @@ class Bag:
     @property
     def start_ns(self) -> int:
         """The first log time in ns; 0 if there are no messages."""
-        return self._storage.start_ns
+        return self.storage.start_ns
 
     def types_on(self, topic: str) -> tuple[str, Typestore]:
         """The message type on `topic`, and the types it is made of.
@@ -219,10 +215,6 @@ class Bag:
     def _there(self, topic: str) -> int:
         return sum(channel.count for channel in self.channels if channel.topic == topic)
 
-    def strand(self, channel: Channel) -> int:
-        """Which of its topic's channels it is; sequence numbers are counted in each."""
-        return self._storage.strands[channel.key]
-
     def batches(
         self, topics: Sequence[str] | None = None, *, progress: Progress = silent
     ) -> Iterator[tuple[Channel, Batch]]:
@@ -239,14 +231,14 @@ class Bag:
         """As `batches`, with the log time in ns that no message from here on goes below."""
         keys = self._keys(topics)
         total, done = max(sum(self.channels[key].count for key in keys), 1), 0
-        for key, batch, later_ns in self._storage.parts(keys):
+        for key, batch, later_ns in self.storage.parts(keys):
             yield self.channels[key], batch, later_ns
             done += len(batch)
             progress("reading", done / total)
 
     def log_times(self, topics: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
         """(topic, log times in ns) part by part; of MCAP from its indexes, without a message."""
-        for key, log_ns in self._storage.log_times(self._keys(topics)):
+        for key, log_ns in self.storage.log_times(self._keys(topics)):
             yield self.channels[key].topic, log_ns
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
@@ -264,8 +256,9 @@ class Bag:
         as_recorded: in the order of the files instead.
         """
         keys = self._keys(topics)
-        recorded = self._storage.recorded(keys) if as_recorded else self._storage.messages(keys)
+        recorded = self.storage.recorded(keys) if as_recorded else self.storage.messages(keys)
         for raw in recorded:
+            assert isinstance(raw, Raw)  # no chunk is taken as a whole
             channel = self.channels[raw.key]
             if raw.error:
                 raise BagError(f"{self.path}: {channel.topic}: {raw.error}")
@@ -277,20 +270,22 @@ class Bag:
         *,
         nearly: bool = False,
         spans: Spans = ALWAYS,
-    ) -> Iterator[Raw]:
+        takes: Takes | None = None,
+    ) -> Iterator[Raw | Whole]:
         """As `messages`, with all that is recorded of them, and those that cannot be unpacked.
 
         nearly: where more chunks overlap in time than memory is meant for, do not refuse. spans:
-        only what was logged in one of them; nothing else is read.
+        only what was logged in one of them; nothing else is read. takes: which chunks come whole.
         """
-        return self._storage.messages(self._keys(topics), nearly=nearly, spans=spans)
+        keys = self._keys(topics)
+        return self.storage.messages(keys, nearly=nearly, spans=spans, takes=takes)
 
     def _keys(self, topics: Sequence[str] | None) -> list[int]:
         wanted = None if topics is None else set(topics)
         return [c.key for c in self.channels if wanted is None or c.topic in wanted]
 
     def _unfinished(self) -> str:
-        if self.path.is_dir() and self._storage.ending is None:
+        if self.path.is_dir() and self.storage.ending is None:
             return (
                 f"{self.path} has no metadata.yaml: the recording was not closed; "
                 f"read {self.files[0].name} itself, or make a whole bag of it with {RECOVER}"

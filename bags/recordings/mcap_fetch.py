@@ -94,7 +94,7 @@ class Fetching:
         if the index of the last chunk, which tells, would have to be fetched for it.
         """
         last = self._blocks[-1]
-        if last.compression or not self._path.holds(last.end, last.last):
+        if last.compression or self._path.held(last.end, last.last) is None:
             return 0
         self._ready = {last.offset: self._entries_of(last)}
         _, ends = self._runs_of([last])

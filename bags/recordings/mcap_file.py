@@ -16,16 +16,18 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
 
 from bags.recordings.batch import Batch
 from bags.recordings.mcap_fetch import Fetching
 from bags.recordings.mcap_records import (
     MAGIC,
+    MESSAGE,
     MESSAGE_FIXED,
+    NEVER,
     RECORD,
     Block,
     Contents,
@@ -59,6 +61,14 @@ _COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
 
 Record = TypeVar("Record")
 Batches = Iterator[tuple[int, Batch]]  # channel id, messages
+
+
+class Whole(NamedTuple):
+    """A chunk as it lies in the file, when it begins, its messages by their channels' numbers."""
+
+    log_ns: int
+    chunk: Chunk
+    messages: dict[int, Batch]
 
 
 class McapFile:
@@ -163,7 +173,9 @@ class McapFile:
             found = offsets.get(channel)
             if found is not None and len(found):
                 batch = messages_at(buffer, found, channel, where, edges)
-                _refuse_earlier(batch, min(blocks, key=lambda block: block.start_ns))
+                if batch.log_ns.min() < min(block.start_ns for block in blocks):
+                    # they would come out of order
+                    raise BagError(f"{where} points at messages before the time it states")
                 yield channel, batch
 
     def _offsets(
@@ -195,12 +207,38 @@ class McapFile:
                 record = indexes[at - block.end :][:length]
                 yield channel, index_times(record, channel, where)
 
+    def whole(self, block: Block) -> Whole | None:
+        """A chunk that can be copied as it is: its checksum is right, and it holds messages only,
+        which its indexes list, within the times that it states. Else None.
+
+        Raises BagError if it is damaged.
+        """
+        if block.index is None or self._fetching is not None:
+            return None
+        messages = dict(self._batches([block], block.index))
+        listed = sum(len(b) * MESSAGE.itemsize + int(b.size.sum()) for b in messages.values())
+        last_ns = max((int(b.log_ns.max()) for b in messages.values()), default=NEVER)
+        if listed != block.uncompressed_size or last_ns > block.end_ns:
+            return None
+        chunk = Chunk(
+            compression=block.compression,
+            data=self._packed(block),
+            message_end_time=block.end_ns,
+            message_start_time=block.start_ns,
+            uncompressed_crc=zlib.crc32(next(iter(messages.values())).buffer),
+            uncompressed_size=block.uncompressed_size,
+        )
+        return Whole(block.start_ns, chunk, messages)
+
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""
+        return uncompressed(replace(block, crc=self._checksum(block)), self._packed(block))
+
+    def _packed(self, block: Block) -> bytes:
         raw = self._read(block.offset, block.size)
         if len(raw) != block.size:
             raise BagError(f"the chunk at byte {block.offset} is cut off")
-        return uncompressed(replace(block, crc=self._checksum(block)), raw)
+        return raw
 
     def _checksum(self, block: Block) -> int:
         """What the chunk's header states, which a summary does not list."""
@@ -397,12 +435,6 @@ class McapFile:
             return self.path.read_range(offset, offset + size)
         assert self._stream is not None
         return os.pread(self._stream.fileno(), size, offset)
-
-
-def _refuse_earlier(batch: Batch, block: Block) -> None:
-    """BagError if messages are logged before their chunk begins: they would come out of order."""
-    if batch.log_ns.min() < block.start_ns:
-        raise BagError(f"the chunk at byte {block.offset} holds messages before the time it states")
 
 
 def _add_loose(blocks: list[Block], at: int, end: int) -> None:

@@ -33,7 +33,6 @@ from bags.recordings.mcap_records import (
     RECORD,
     Block,
     Contents,
-    Record,
     parse,
     walk_records,
 )
@@ -45,6 +44,14 @@ WHOLE_BYTES: Final = TAIL_BYTES + GAP_BYTES  # a file no longer than this is one
 KNOWN_BYTES: Final = 16 * 2**10  # of a declaration that is kept for other bags
 _FOOTER: Final = RECORD.size + 20 + len(MAGIC)
 
+READS: Final[dict[int, Callable[[Any], Any]]] = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+}
 Read = Callable[[int, int], bytes]  # offset, bytes
 
 
@@ -72,29 +79,25 @@ def summarised(read: Read, size: int) -> Contents | None:
         if zlib.crc32(signed) != footer.summary_crc:
             raise BagError("the summary is damaged: its checksum differs")
     found = Contents()
-    metadata: list[MetadataIndex] = []
-    statistics: Statistics | None = None
+    records: dict[int, list[Any]] = {opcode: [] for opcode in READS}
     for opcode, at, record_end in walk_records(summary):
-        content = summary[at + RECORD.size : record_end]
-        if opcode == Opcode.SCHEMA:
-            found.declared.add(_declared(Schema.read, content))
-        elif opcode == Opcode.CHANNEL:
-            found.declared.add(_declared(Channel.read, content))
-        elif opcode == Opcode.STATISTICS:
-            statistics = parse(Statistics.read, content)
-        elif opcode == Opcode.CHUNK_INDEX:
-            found.blocks.append(_listed(parse(ChunkIndex.read, content), start))
-        elif opcode == Opcode.METADATA_INDEX:
-            metadata.append(parse(MetadataIndex.read, content))
-        elif opcode == Opcode.ATTACHMENT_INDEX:
-            attached = parse(AttachmentIndex.read, content)
-            place = attached.offset + RECORD.size, attached.length - RECORD.size
-            found.attachments.append(place)
-    found.blocks = sorted((b for b in found.blocks if b.index), key=lambda block: block.offset)
+        if opcode in READS:
+            content = summary[at + RECORD.size : record_end]
+            records[opcode].append(_declared(opcode, content))
+    for declared in (*records[Opcode.SCHEMA], *records[Opcode.CHANNEL]):
+        found.declared.add(declared)
+    metadata: list[MetadataIndex] = records[Opcode.METADATA_INDEX]
+    found.attachments = [
+        (attached.offset + RECORD.size, attached.length - RECORD.size)
+        for attached in records[Opcode.ATTACHMENT_INDEX]
+    ]
+    blocks = [_listed(chunk, start) for chunk in records[Opcode.CHUNK_INDEX]]
+    found.blocks = sorted((b for b in blocks if b.index), key=lambda block: block.offset)
     for block in found.blocks:
         for channel, (_, length) in (block.index or {}).items():
             count = (length - INDEX.size) // INDEX_ENTRY.itemsize
             found.counts[channel] = found.counts.get(channel, 0) + count
+    statistics: Statistics | None = next(reversed(records[Opcode.STATISTICS]), None)
     if statistics is None or not _lists_everything(found, len(metadata), statistics):
         return None
     found.stated = dict(statistics.channel_message_counts)
@@ -119,10 +122,10 @@ def _lists_everything(found: Contents, metadata: int, statistics: Statistics) ->
     return Counter(found.counts) == Counter(statistics.channel_message_counts)
 
 
-def _declared(read: Callable[[Any], Record], content: bytes) -> Record:
-    """A schema or a channel; robots of a fleet declare the same ones in every bag."""
-    found: Record = (_known if len(content) <= KNOWN_BYTES else parse)(read, content)
-    return found
+def _declared(opcode: int, content: bytes) -> Any:
+    """A record; robots of a fleet declare the same schemas and channels in every bag."""
+    known = opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(content) <= KNOWN_BYTES
+    return (_known if known else parse)(READS[opcode], content)
 
 
 _known = lru_cache(maxsize=256)(parse)

@@ -54,13 +54,6 @@ class Output:
         """Whether `close` was called."""
         return self._stream.closed
 
-    def tell(self) -> int:
-        """The place of the next byte."""
-        return self.size
-
-    def flush(self) -> None:
-        """Nothing: whatever was written has been handed to the operating system."""
-
     def write(self, data: bytes) -> int:
         """Append `data`; OSError if there is no room and no reserve."""
         try:

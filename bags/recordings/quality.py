@@ -7,42 +7,27 @@ if both say the same. Until version 8 policies were numbers in a text of YAML, f
 """
 
 from collections.abc import Iterable
+from enum import Enum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import yaml
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
+FOREVER: Final = QosTime(9223372036, 854775807)  # as ROS 2 writes it
 MAX_TEXT: Final = 2**16  # characters; a topic with a hundred publishers has 30 000
 KEY: Final = "offered_qos_profiles"  # in metadata.yaml, and of a channel's metadata
-
-HISTORIES: Final = ("system_default", "keep_last", "keep_all", "unknown")
-RELIABILITIES: Final = ("system_default", "reliable", "best_effort", "unknown", "best_available")
-DURABILITIES: Final = ("system_default", "transient_local", "volatile", "unknown", "best_available")
-LIVELINESSES: Final = (
-    "system_default",
-    "automatic",
-    "manual_by_node",
-    "manual_by_topic",
-    "unknown",
-    "best_available",
-)  # as rmw counts them from 0
+TYPE_HASH: Final = "topic_type_hash"  # of a channel's metadata, as rosbag2 writes it
 
 _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-class Span(NamedTuple):
-    """A time that a policy states; the default is forever, as ROS 2 writes it."""
-
-    sec: int = 9223372036
-    nsec: int = 854775807
 
 
 class Times(NamedTuple):
     """The times of a profile, by their names in rmw."""
 
-    deadline: Span = Span()
-    lifespan: Span = Span()
-    liveliness_lease_duration: Span = Span()
+    deadline: QosTime = FOREVER
+    lifespan: QosTime = FOREVER
+    liveliness_lease_duration: QosTime = FOREVER
 
 
 class Profile(NamedTuple):
@@ -124,32 +109,34 @@ def _profile(entry: Any) -> Profile:
     if depth < 0:
         raise ValueError(f"depth {depth}")
     return Profile(
-        _word(entry["history"], HISTORIES),
+        _word(entry["history"], QosHistory),
         depth,
-        _word(entry["reliability"], RELIABILITIES),
-        _word(entry["durability"], DURABILITIES),
+        _word(entry["reliability"], QosReliability),
+        _word(entry["durability"], QosDurability),
         Times(*(_span(entry[name]) for name in Times._fields)),
-        _word(entry["liveliness"], LIVELINESSES),
+        _word(entry["liveliness"], QosLiveliness),
         bool(entry["avoid_ros_namespace_conventions"]),
     )
 
 
-def _word(found: object, words: tuple[str, ...]) -> str:
+def _word(found: object, policies: type[Enum]) -> str:
+    """What a policy is called; in old bags it is its number, by rmw."""
+    words = [policy.name.lower() for policy in policies]
     if isinstance(found, int) and 0 <= found < len(words):
         return words[found]
     word = str(found).lower()
     return word if word in words else "unknown"
 
 
-def _span(found: Any) -> Span:
-    span = Span(int(found["sec"]), int(found["nsec"]))
+def _span(found: Any) -> QosTime:
+    span = QosTime(int(found["sec"]), int(found["nsec"]))
     if not (0 <= span.sec < 2**64 and 0 <= span.nsec < 2**64):
         raise ValueError(f"a time of {span}")
     return span
 
 
-def _span_of(time: Any) -> Span:
+def _span_of(time: Any) -> QosTime:
     if hasattr(time, "nanoseconds"):
         whole = int(time.nanoseconds)
-        return Span(*divmod(whole, 10**9)) if whole else Span(0, 0)
-    return Span(int(time.sec), int(time.nsec))
+        return QosTime(*divmod(whole, 10**9))
+    return QosTime(int(time.sec), int(time.nsec))

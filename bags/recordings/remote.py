@@ -183,10 +183,10 @@ class RemotePath(PosixPath):
         """The bytes from `start` to `end`, fetched unless they are held."""
         if end <= start:
             return b""
-        found = self._held_range(start, end)
+        found = self.held(start, end)
         if found is None:
             self.fetch([(start, end)])
-            found = self._held_range(start, end)
+            found = self.held(start, end)
             assert found is not None
         return found
 
@@ -195,7 +195,7 @@ class RemotePath(PosixPath):
 
         Raises FileNotFoundError if the file is gone, BagError if storage does not deliver.
         """
-        missing = {self._not_held(*r) for r in ranges if self._held_range(*r) is None}
+        missing = {self._not_held(*r) for r in ranges if self.held(*r) is None}
         merged: list[list[int]] = []
         for start, end in sorted(missing):
             if merged and start <= merged[-1][1] + GAP_BYTES:
@@ -225,10 +225,6 @@ class RemotePath(PosixPath):
         self.fetched += sum(map(len, parts))
         self._hold(zip(starts, parts, strict=True))
 
-    def holds(self, start: int, end: int) -> bool:
-        """Whether these bytes were fetched, and are held."""
-        return self._held_range(start, end) is not None
-
     def identity(self) -> bytes:
         """What tells the file from others without reading it: its entry, its last bytes and, but
         for S3, whose tags are of the content, its URL: other tags tell versions of one URL apart.
@@ -238,7 +234,8 @@ class RemotePath(PosixPath):
         url = "" if str(self).startswith("s3://") else f" {self}"
         return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}{url}\n".encode()
 
-    def _held_range(self, start: int, end: int) -> bytes | None:
+    def held(self, start: int, end: int) -> bytes | None:
+        """These bytes, if they were fetched and are held."""
         found, at = [], start
         while at < end:
             part = self._part_at(at)

@@ -90,7 +90,9 @@ class Ros1File:
                 elif kind == CONNECTION:
                     self._add_connection(fields, self._read(start, end))
                 elif kind == CHUNK:
-                    found.blocks.append(_chunk(fields, start, end))
+                    compression = fields.get("compression", b"").decode("utf-8", "replace")
+                    size = fields.get_uint32("size")
+                    found.blocks.append(Block(start, end - start, compression, size))
                 elif kind == INDEX:
                     self._add_index(fields, start, end)
                 elif kind == MESSAGE:
@@ -117,7 +119,8 @@ class Ros1File:
             self.contents.blocks.append(Block(start, end - start, LOOSE, end - start))
 
     def _add_connection(self, fields: Header, data: bytes) -> None:
-        number, said = fields.get_uint32("conn"), _fields(data)
+        number = fields.get_uint32("conn")
+        said = Header.read(BytesIO(struct.pack("<I", len(data)) + data))
         topic = fields.get("topic", b"").decode("utf-8", "replace")
         kind = said.get("type", b"").decode("utf-8", "replace")
         profiles = {KEY: offered_text([LATCHED])} if said.get("latching") == b"1" else {}
@@ -201,11 +204,6 @@ def _counts(blocks: Sequence[Block]) -> dict[int, int]:
     return found
 
 
-def _chunk(fields: Header, start: int, end: int) -> Block:
-    compression = fields.get("compression", b"").decode("utf-8", "replace")
-    return Block(start, end - start, compression, fields.get_uint32("size"))
-
-
 def _records(stream: BinaryIO, end: int) -> Iterator[tuple[Header, int, int]]:
     """(header, first byte of the data, their end) of each record; BagError if one is cut."""
     while (at := stream.tell()) < end:
@@ -219,8 +217,3 @@ def _records(stream: BinaryIO, end: int) -> Iterator[tuple[Header, int, int]]:
             raise BagError(f"what starts at byte {at} runs past the end")
         yield header, start, last
         stream.seek(last)
-
-
-def _fields(data: bytes) -> Header:
-    """What a connection says of itself, which is written like a header."""
-    return Header.read(BytesIO(struct.pack("<I", len(data)) + data))

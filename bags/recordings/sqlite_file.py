@@ -18,9 +18,8 @@ from urllib.parse import quote
 from mcap.records import Channel, Metadata, Schema
 
 from bags.recordings.batch import BATCH_BYTES, Batch, joined
-from bags.recordings.description import TYPE_HASH
 from bags.recordings.mcap_records import ROSBAG2, Block, Contents
-from bags.recordings.quality import KEY
+from bags.recordings.quality import KEY, TYPE_HASH
 from nlsid_core.errors import BagError
 
 BESIDE: Final = ("-wal", "-journal")

@@ -23,7 +23,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from bags.recordings.batch import Batch, joined
 from bags.recordings.definitions import Definition
-from bags.recordings.mcap_file import Batches, McapFile
+from bags.recordings.mcap_file import Batches, McapFile, Whole
 from bags.recordings.mcap_records import CUSTOM_DATA, MAGIC, MAX_CHUNK_BYTES, NEVER, ROSBAG2, Block
 from bags.recordings.message_types import JAZZY, ros2_definition, standard_types, types_in_bag
 from bags.recordings.quality import KEY, Profile, offered
@@ -46,6 +46,7 @@ UNPACKED_BYTES: Final = 2**20  # of a file that was compressed whole, at once
 ALWAYS: Final = ((0, NEVER),)
 
 Spans = Sequence[tuple[int, int]]  # ns: from the first to before the second
+Takes = Callable[[Block, Mapping[int, int]], bool]  # of a chunk, with its channels' number -> key
 
 DataFile = McapFile | SqliteFile | Ros1File
 KINDS: Final = {McapFile: "mcap", SqliteFile: "sqlite3", Ros1File: "ros1"}
@@ -55,8 +56,8 @@ KINDS: Final = {McapFile: "mcap", SqliteFile: "sqlite3", Ros1File: "ros1"}
 class Channel:
     """One recorded stream of messages; a topic has one, or several if it was recorded in parts.
 
-    key: its place in `Storage.channels`. definition: of the type, see `_definition`. count:
-    messages it has. metadata: the recorder's own.
+    key: its place in `Storage.channels`. schema: encoding and data of what defines the type, empty
+    where nothing does. count: messages it has. metadata: the recorder's own.
     offered: what its publishers offered, as far as the file says so.
     """
 
@@ -64,10 +65,18 @@ class Channel:
     topic: str
     msgtype: str
     encoding: str
-    definition: MessageDefinition
-    count: int
+    schema: tuple[str, bytes]
+    count: int = 0
     metadata: Mapping[str, str] = field(default_factory=dict)
     offered: tuple[Profile, ...] = ()
+
+    @property
+    def definition(self) -> MessageDefinition:
+        """What the schema says, as far as its encoding is known."""
+        encoding, data = self.schema
+        if encoding not in FORMATS:
+            return MessageDefinition(MessageDefinitionFormat.NONE, "")
+        return MessageDefinition(FORMATS[encoding], data.decode("utf-8", "replace"))
 
 
 class Raw(NamedTuple):
@@ -88,7 +97,7 @@ class Raw(NamedTuple):
 
 def defined(channel: Channel, given: Mapping[str, Definition], release: str) -> Channel:
     """The channel, with a definition where its file has none: the given one, or the release's."""
-    if channel.definition.format != MessageDefinitionFormat.NONE:
+    if channel.schema[0] in FORMATS:
         return channel
     if channel.msgtype in given:
         text = given[channel.msgtype].text
@@ -98,7 +107,7 @@ def defined(channel: Channel, given: Mapping[str, Definition], release: str) -> 
         text = _text_of(channel.msgtype, f"ros2_{release}")
     if not text:
         return channel
-    return replace(channel, definition=MessageDefinition(MessageDefinitionFormat.MSG, text))
+    return replace(channel, schema=("ros2msg", text.encode()))
 
 
 @cache
@@ -113,11 +122,13 @@ class Storage:
 
     strands: for each channel, which of its
     topic's channels in its file it is: those of one recording are counted on from file to file.
+    numbers: those that the channels have in their files.
     """
 
     def __init__(self, paths: Sequence[Path], *, salvage: bool = False) -> None:
         self.channels: list[Channel] = []
         self.strands: list[int] = []
+        self.numbers: list[int] = []
         self.custom: dict[str, str] = {}
         self.records: list[Metadata] = []
         self._refused: list[str] = []
@@ -208,12 +219,13 @@ class Storage:
             keys[number] = len(self.channels)
             strand = strands[recorded.topic] = strands.get(recorded.topic, -1) + 1
             self.strands.append(strand)
+            self.numbers.append(number)
             channel = Channel(
                 key=keys[number],
                 topic=recorded.topic,
                 msgtype=_type_name(schema.name if schema else ""),
                 encoding=recorded.message_encoding,
-                definition=_definition(schema),
+                schema=(schema.encoding, schema.data) if schema else ("", b""),
                 count=found.counts.get(number, 0),
                 metadata=recorded.metadata,
                 offered=offered(recorded.metadata.get(KEY, "")),
@@ -241,7 +253,7 @@ class Storage:
             raise BagError(f"not a '{channel.msgtype}' of ROS 1: {reason}")
 
         self._translated[channel.key] = translate
-        return replace(channel, encoding="cdr", definition=definition)
+        return replace(channel, encoding="cdr", schema=("ros2msg", definition.data.encode()))
 
     @property
     def ending(self) -> str | None:
@@ -340,9 +352,17 @@ class Storage:
                 yield from sorted(self._raws(n, i, keys), key=attrgetter("place"))
 
     def messages(
-        self, keys: Collection[int], *, nearly: bool = False, spans: Spans = ALWAYS
-    ) -> Iterator[Raw]:
+        self,
+        keys: Collection[int],
+        *,
+        nearly: bool = False,
+        spans: Spans = ALWAYS,
+        takes: Takes | None = None,
+    ) -> Iterator[Raw | Whole]:
         """The messages that were logged in one of `spans`, by log time; equal ones as recorded.
+
+        A chunk that is wanted as a whole, and that `takes` has said it takes, comes as it is when
+        its first message is due.
 
         Chunks outside the spans are not read. Raises BagError if so many chunks overlap in time
         that sorting needs MAX_OVERLAP_BYTES; with `nearly` they are sorted as far as that goes.
@@ -355,8 +375,12 @@ class Storage:
         )
         waiting: list[Raw] = []
         for (_, n, i), (later_ns, *_) in pairwise([*order, (NEVER,)]):
-            waiting += self._raws(n, i, keys)
-            waiting.sort()
+            whole = self._whole(n, i, keys, spans, takes) if takes else None
+            if whole is not None:
+                yield whole
+            else:
+                waiting += self._raws(n, i, keys)
+                waiting.sort()
             ready = bisect_left(waiting, later_ns, key=attrgetter("log_ns"))
             if sum(len(raw.data) for raw in waiting[ready:]) > MAX_OVERLAP_BYTES:
                 if not nearly:
@@ -369,6 +393,23 @@ class Storage:
                 if any(start <= raw.log_ns < end for start, end in spans):
                     yield raw
             waiting = waiting[ready:]
+
+    def _whole(
+        self, n: int, i: int, keys: Collection[int], spans: Spans, takes: Takes
+    ) -> Whole | None:
+        """The block, if all of it is wanted and taken, and nothing in it has to be translated."""
+        file, known = self.files[n], self._keys[n]
+        block = file.contents.blocks[i]
+        inside = any(start <= block.start_ns and block.end_ns < end for start, end in spans)
+        numbers = {number: known[number] for number in block.index or ()}
+        wanted = inside and set(numbers.values()) <= set(keys) - self._translated.keys()
+        if not isinstance(file, McapFile) or not wanted or not takes(block, numbers):
+            return None
+        with reading(file.path):
+            found = file.whole(block)
+        if found is None or any(_packed(batch).any() for batch in found.messages.values()):
+            return None
+        return found
 
     def _raws(self, n: int, i: int, keys: Collection[int]) -> Iterator[Raw]:
         file = self.files[n]
@@ -472,16 +513,6 @@ def reading(path: Path) -> Iterator[None]:
         raise BagError(
             f"{path} is damaged or not a bag: {type(error).__name__}: {str(error)[:200]}"
         ) from error
-
-
-def _definition(schema: Any) -> MessageDefinition:
-    """What a schema says; of one that is not read, its encoding in a line, and its bytes."""
-    if schema is None or not (schema.encoding or schema.data):
-        return MessageDefinition(MessageDefinitionFormat.NONE, "")
-    if schema.encoding not in FORMATS:
-        content = f"{schema.encoding}\n{schema.data.decode('latin-1')}"
-        return MessageDefinition(MessageDefinitionFormat.NONE, content)
-    return MessageDefinition(FORMATS[schema.encoding], schema.data.decode("utf-8", "replace"))
 
 
 def _type_name(name: str) -> str:

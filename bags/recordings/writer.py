@@ -2,56 +2,37 @@
 
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Final
 
-from mcap.records import Attachment, Metadata
-from mcap.writer import CompressionType, Writer
-from rosbags.interfaces import MessageDefinitionFormat
+import yaml
+from mcap.records import Channel as McapChannel
+from mcap.records import Metadata, Schema
 
 from bags.recordings.definitions import Definition, standard_definition
-from bags.recordings.description import TYPE_HASH, Topic, write_metadata
+from bags.recordings.folders import METADATA, NEWEST_VERSION
 from bags.recordings.mcap_records import CUSTOM_DATA
+from bags.recordings.mcap_writer import PACKING, McapWriter
 from bags.recordings.output import Output, Reserve
-from bags.recordings.quality import KEY, Profile, offered_text
-from bags.recordings.storage import FORMATS, Channel, Raw
+from bags.recordings.quality import KEY, TYPE_HASH, Profile, offered_text
+from bags.recordings.storage import Channel
 from nlsid_core.errors import BagError
+from nlsid_core.files import write_atomically
 
+MOST_CHANNELS: Final = 2**16
 MAX_COUNT: Final = 2**32  # an MCAP file counts the messages of a topic in 32 bits
 RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
-SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
-CHUNK_BYTES: Final = 2**20
 
 
 def refuse_existing(path: Path) -> None:
     """Raise a BagError if something is at `path`."""
     if path.exists():
         raise BagError(f"{path} exists already; take another name or move it away")
-
-
-def topic_like(channel: Channel) -> Topic:
-    """A topic to which another bag's messages are copied as they are."""
-    definition = channel.definition
-    if definition.format != MessageDefinitionFormat.NONE:
-        encoding = "ros1msg" if channel.encoding == "ros1" else SCHEMA_ENCODINGS[definition.format]
-        schema = encoding, definition.data.encode()
-    else:
-        encoding, _, data = definition.data.partition("\n")
-        schema = encoding, data.encode("latin-1")
-    if schema == ("", b"") and channel.encoding == "cdr":
-        with suppress(BagError):  # not a standard type either: copied without its definition
-            schema = "ros2msg", standard_definition(channel.msgtype).text.encode()
-    return Topic(
-        channel.topic,
-        channel.msgtype,
-        channel.encoding,
-        schema,
-        channel.metadata,
-        channel.offered,
-    )
 
 
 class BagWriter:
@@ -65,7 +46,7 @@ class BagWriter:
     killed process loses nothing of a closed chunk; a power cut may.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
-    from a timer, limits what a kill loses.
+    from a timer, limits what a kill loses. `mcap` takes what is copied as it is.
 
     Raises BagError if `path` exists; OS errors pass through.
     """
@@ -79,17 +60,14 @@ class BagWriter:
         compression: str = "zstd",
     ) -> None:
         self.path = Path(path)
-        self.counts: dict[str, int] = {}
-        self._topics: list[Topic] = []
-        self._channels: list[int] = []  # their numbers in the file
-        self._numbers: dict[str, int] = {}  # topic -> its place in `_topics`, of those not copied
+        self._topics: dict[int, Channel] = {}  # by the numbers of their channels in the file
+        self._numbers: dict[str, int] = {}  # topic -> its channel, of those not copied
         self._copies: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, tuple[str, bytes]], int] = {}
         self._custom: dict[str, str] = {}
-        self._span_ns: tuple[int, int] | None = None
         self._in_place = in_place
-        if compression.upper() not in CompressionType.__members__:
-            raise BagError(f"no compression '{compression}'; there are zstd, lz4 and none")
+        if compression not in PACKING:
+            raise BagError(f"no compression '{compression}'; there are: {', '.join(PACKING)}")
         refuse_existing(self.path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if in_place:
@@ -103,23 +81,24 @@ class BagWriter:
         try:
             self._reserve = Reserve(self._folder / RESERVE) if in_place else None
             self._output = Output(self._folder / f"{self.path.name}.mcap", self._reserve)
+            self.mcap = McapWriter(self._output, compression)
+            self.annotate(custom or {})
         except BaseException:
             shutil.rmtree(self._folder)
             raise
-        # Any: half of mcap's writer is not annotated
-        self._mcap: Any = Writer(
-            self._output,  # type: ignore[arg-type]  # all that it uses of a stream
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType[compression.upper()],
-        )
-        self._mcap.start(profile="ros2", library="nlsid")
-        self.annotate(custom or {})
-        self.close_chunk()
 
     @property
     def size(self) -> int:
         """Bytes written so far, but for the chunk at hand."""
         return self._output.size
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages of each topic."""
+        found: dict[str, int] = {}
+        for number, channel in self._topics.items():
+            found[channel.topic] = found.get(channel.topic, 0) + self.mcap.counts[number]
+        return found
 
     @property
     def full(self) -> str:
@@ -150,41 +129,38 @@ class BagWriter:
         defined = definition or standard_definition(msgtype)
         metadata = {TYPE_HASH: defined.type_hash}
         schema = ("ros2msg", defined.text.encode())
-        self._numbers[topic] = self._add(Topic(topic, msgtype, "cdr", schema, metadata, offered))
+        channel = Channel(0, topic, msgtype, "cdr", schema, metadata=metadata, offered=offered)
+        self._numbers[topic] = self._add(channel, len(self._topics) + 1)
 
-    def add_copy(self, channel: Channel, strand: object = 0) -> int:
-        """Announce the topic of a channel of another bag; its number for `copy`.
+    def add_copy(self, channel: Channel, strand: object, number: int) -> int:
+        """Announce the topic of a channel of another bag; its number for `mcap.add`.
 
         What is copied from channels of one `strand`, topic and definition is one channel again.
+        number: which it has there; it keeps it if no other has it here.
         """
-        key = (strand, channel.topic, channel.msgtype, channel.encoding, channel.definition)
+        key = (strand, channel.topic, channel.msgtype, channel.encoding, channel.schema)
         if key not in self._copies:
-            self._copies[key] = self._add(topic_like(channel))
+            if channel.schema == ("", b"") and channel.encoding == "cdr":
+                with suppress(BagError):  # no standard type either: copied without a definition
+                    text = standard_definition(channel.msgtype).text
+                    channel = replace(channel, schema=("ros2msg", text.encode()))
+            self._copies[key] = self._add(channel, number)
         return self._copies[key]
 
-    def _add(self, topic: Topic) -> int:
-        key = (topic.msgtype, topic.schema)
+    def _add(self, channel: Channel, wanted: int) -> int:
+        key = (channel.msgtype, channel.schema)
         if key not in self._schemas:
-            self._schemas[key] = self._mcap.register_schema(topic.msgtype, *topic.schema)
-        channel = self._mcap.register_channel(
-            topic.name,
-            topic.encoding,
-            self._schemas[key],
-            {**topic.metadata, KEY: offered_text(topic.offered)},
+            encoding, content = channel.schema
+            self._schemas[key] = len(self._schemas) + 1
+            self.mcap.declare(Schema(self._schemas[key], content, encoding, channel.msgtype))
+        notes = {**channel.metadata, KEY: offered_text(channel.offered)}
+        numbers = chain([wanted], range(1, MOST_CHANNELS))
+        number = next(n for n in numbers if n not in self._topics)
+        self.mcap.declare(
+            McapChannel(number, channel.topic, channel.encoding, notes, self._schemas[key])
         )
-        self._channels.append(channel)
-        self._topics.append(topic)
-        self.counts.setdefault(topic.name, 0)
-        return len(self._topics) - 1
-
-    def keep(self, record: Metadata | Attachment) -> None:
-        """Copy what is no message of another bag."""
-        if isinstance(record, Metadata):
-            self._mcap.add_metadata(record.name, record.metadata)
-        else:
-            self._mcap.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
+        self._topics[number] = channel
+        return number
 
     def write(
         self,
@@ -205,29 +181,18 @@ class BagWriter:
             raise BagError(f"{self.path}: {topic}: times {log_time_ns}, {publish_time_ns} ns")
         self.add_topic(topic, msgtype)
         number = self._numbers[topic]
-        count = self.counts[topic] if sequence is None else sequence % MAX_COUNT
-        self._write(number, data, log_time_ns, publish_time_ns, count)
-
-    def copy(self, number: int, raw: Raw) -> None:
-        """Append a message of another bag, as it is, to what `add_copy` announced."""
-        self._write(number, raw.data, raw.log_ns, raw.publish_ns, raw.sequence)
-
-    def _write(self, number: int, data: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
-        channel = self._channels[number]
-        self._mcap.add_message(channel, log_ns, data, publish_ns, sequence=sequence)
-        self.counts[self._topics[number].name] += 1
-        first_ns, last_ns = self._span_ns or (log_ns, log_ns)
-        self._span_ns = min(first_ns, log_ns), max(last_ns, log_ns)
+        count = self.mcap.counts[number] if sequence is None else sequence % MAX_COUNT
+        self.mcap.add(number, log_time_ns, publish_time_ns, count, data)
 
     def annotate(self, custom: Mapping[str, str]) -> None:
         """Add to the bag's own key-value pairs; the newest of those with one key counts."""
         self._custom.update(custom)
         if custom:
-            self.keep(Metadata(CUSTOM_DATA, dict(custom)))
+            self.mcap.keep(Metadata(CUSTOM_DATA, dict(custom)))
 
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
-        self._mcap.flush()
+        self.mcap.close_chunk()
         self._output.refuse_loss()
 
     def close(self) -> None:
@@ -241,16 +206,16 @@ class BagWriter:
         try:
             if self._reserve is not None:
                 self._reserve.release()
-            self._mcap.finish()
+            self.mcap.finish()
             self._output.sync()
             self._output.close()
-            write_metadata(
+            _write_metadata(
                 self._folder,
                 f"{self.path.name}.mcap",
-                self._topics,
+                self._topics.values(),
                 self.counts,
                 self._custom,
-                self._span_ns or (0, 0),
+                self.mcap.span_ns,
             )
         except OSError:
             self.abandon()
@@ -283,3 +248,54 @@ class BagWriter:
             self.close()
         else:
             self.discard()
+
+
+def _write_metadata(
+    folder: Path,
+    file: str,
+    topics: Iterable[Channel],
+    counts: Mapping[str, int],
+    custom: Mapping[str, str],
+    span_ns: tuple[int, int],
+) -> None:
+    """Make the folder a finished bag of one file, as rosbag2 and rosbags read it.
+
+    Of topics of one name the first is described. counts: messages by topic. span_ns: the first and
+    the last log time, 0 without a message.
+    """
+    named: dict[str, Channel] = {}
+    for topic in topics:
+        named.setdefault(topic.topic, topic)
+    first_ns, last_ns = span_ns
+    extent = {
+        "starting_time": {"nanoseconds_since_epoch": first_ns},
+        "duration": {"nanoseconds": last_ns - first_ns},
+        "message_count": sum(counts.values()),
+    }
+    information = {
+        "version": NEWEST_VERSION,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [file],
+        **extent,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": name,
+                    "type": topic.msgtype,
+                    "serialization_format": topic.encoding,
+                    KEY: [profile.document() for profile in topic.offered],
+                    "type_description_hash": topic.metadata.get(TYPE_HASH, ""),
+                },
+                "message_count": counts[name],
+            }
+            for name, topic in named.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": file, **extent}],
+        "custom_data": dict(custom) or None,
+        "ros_distro": "jazzy",
+    }
+    document = {"rosbag2_bagfile_information": information}
+    text = yaml.safe_dump(document, sort_keys=False, width=4096)  # a value stays on its line
+    write_atomically(folder / METADATA, text.encode())

@@ -17,9 +17,9 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.setup.proposal import Unfit
 from bags.signals.columns import Columns, expand_paths, read_columns
-from bags.signals.delays import Delay, delay
 from bags.signals.expressions import derivative, turn_of
 from bags.signals.signal import ANGLES, SignalPath
+from bags.signals.timing import Delay, delay
 from bags.signals.units import per_second
 from bags.tools.listing import Listed, bag_signals
 from nlsid_core.arrays import FloatArray, IntArray

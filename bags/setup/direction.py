@@ -7,8 +7,8 @@ import numpy as np
 
 from bags.setup.candidates import LONGEST_DELAY, Found
 from bags.setup.proposal import Proposal
-from bags.signals.delays import Delay, delay
 from bags.signals.expressions import factors
+from bags.signals.timing import Delay, delay
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError

@@ -24,9 +24,9 @@ from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
 from bags.signals.columns import read_columns
-from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.signal import SignalPath
+from bags.signals.timing import RELATED
 from nlsid_core.data.repeats import same_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError

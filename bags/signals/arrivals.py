@@ -1,6 +1,5 @@
-"""What arrived on a topic: how many, how often, how evenly, and the last seconds of it."""
+"""What arrived on a topic: when, how many are missing, and the last seconds of it."""
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,9 +10,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 
-GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
 SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
-SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
 
 
 class Arrival(NamedTuple):
@@ -49,42 +46,6 @@ class LogClock:
         if not first or not first <= wall_ns <= last:
             return now
         return begun + (now - begun) * (wall_ns - first) // max(last - first, 1)
-
-
-@dataclass
-class Regularity:
-    """Rate and jitter of one topic's stamps, and the gaps in them; cheap enough for 10 kHz."""
-
-    gaps: int = 0
-    _last_ns: int | None = None
-    _period: float = math.nan
-    _variance: float = 0.0
-
-    def update(self, stamp_ns: int) -> None:
-        """Take the next stamp."""
-        last, self._last_ns = self._last_ns, stamp_ns
-        if last is None:
-            return
-        interval = (stamp_ns - last) * 1e-9
-        if math.isnan(self._period):
-            self._period = interval
-            return
-        off = interval - self._period
-        if interval > GAP * self._period > 0.0:
-            self.gaps += 1
-            return
-        self._period += SMOOTHING * off
-        self._variance += SMOOTHING * (off * off - self._variance)
-
-    @property
-    def rate(self) -> float:
-        """Hz, NaN before the second message."""
-        return 1.0 / self._period if self._period > 0.0 else math.nan
-
-    @property
-    def jitter(self) -> float:
-        """s, standard deviation of the intervals between stamps."""
-        return math.sqrt(self._variance)
 
 
 @dataclass

@@ -89,9 +89,11 @@ def to_trajectories(
         _refuse_repeated_stamps(samples, name)
     signals = [Expression.parse(samples.path) for samples in responses]
     where = f"{name}: {responses[0].path}"
-    period_ns = _period_ns(responses[0].stamp_ns, grid.period, where, on_grid=_on_grid(signals[0]))
+    on_grid = signals[0].operation("hold", "linear") is not None
+    period_ns = _period_ns(responses[0].stamp_ns, grid.period, where, on_grid=on_grid)
     gap_ns = round(BRIDGED * period_ns if grid.max_gap is None else grid.max_gap * 1e9)
-    held = [product(_held_for(samples, gap_ns) for samples in part) for part in parts]
+    rules = [[Expression.parse(samples.path) for samples in part] for part in parts]
+    held = [product(str(r.sampled("hold", window=gap_ns / 1e9)) for r in part) for part in rules]
     sampler = Sampler(list(map(str, signals)), held, period=period_ns / 1e9)
     found = [
         sample for sample in _sampled(sampler, [*responses, *drives]) if sample.missing != LOST
@@ -116,7 +118,12 @@ def to_trajectories(
     y_paths = tuple(samples.path for samples in responses)
     trials = []
     for k, run in enumerate(runs, start=1):
-        _refuse_incomplete(run, name)
+        if wrong := [sample for sample in run if sample.missing]:
+            raise DataError(
+                f"{name}: {wrong[0].missing}, at {stamp_text(wrong[0].stamp_ns)} "
+                f"({len(wrong)} of {len(run)} samples are not complete); "
+                "split_gaps leaves out such stretches"
+            )
         y, u, counted = _numbers(run, sampler, parts, gap_ns, name)
         t = seconds(period_ns * np.arange(len(y)), 0)
         said = {what: count for what, count in counted.items() if count}
@@ -136,15 +143,6 @@ def to_trajectories(
             )
         )
     return trials
-
-
-def _on_grid(response: Expression) -> bool:
-    return response.operation("hold", "linear") is not None
-
-
-def _held_for(samples: Samples, gap_ns: int) -> str:
-    """The excitation's text with a limit to how long it is held."""
-    return str(Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9))
 
 
 def _sampled(sampler: Sampler, signals: Sequence[Samples]) -> Iterator[Sample]:
@@ -178,16 +176,6 @@ def _whole_runs(found: Sequence[Sample], gap_ns: int) -> Iterator[list[Sample]]:
             run.append(sample)
     if run:
         yield run
-
-
-def _refuse_incomplete(run: Sequence[Sample], label: str) -> None:
-    for sample in run:
-        if sample.missing:
-            raise DataError(
-                f"{label}: {sample.missing}, at {stamp_text(sample.stamp_ns)} "
-                f"({sum(bool(s.missing) for s in run)} of {len(run)} samples are not complete); "
-                "split_gaps leaves out such stretches"
-            )
 
 
 def _numbers(

@@ -4,14 +4,17 @@ A node decodes no messages: where the lengths in them stay as they were, the num
 were. The values are those of `bags.signals.reader`, bit for bit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.cdr import PADDING, Gatherer, Layout
 from bags.recordings.message_types import decode
+from bags.signals.expressions import Expression
 from bags.signals.signal import SignalPath
+from nlsid_core.errors import BagError
 
 
 class MessageReader:
@@ -75,3 +78,40 @@ class _Laid:
             number = np.frombuffer(data, kind, 1, at).item()
             found.append(float(bool(number) if is_bool else number))
         return found
+
+
+@dataclass(frozen=True)
+class SignalVector:
+    """Signals in the messages of one topic, such as all positions and rates of a JointState."""
+
+    paths: tuple[SignalPath, ...]
+
+    @classmethod
+    def parse(cls, texts: Iterable[str]) -> "SignalVector":
+        """Read where each expression is; BagError if they are not all on one topic."""
+        paths = tuple(Expression.parse(text).path for text in texts)
+        topics = {path.topic for path in paths}
+        if len(topics) != 1:
+            raise BagError(
+                f"live and replayed samples come from one topic, not {', '.join(sorted(topics))}; "
+                "publish the whole state in one message"
+            )
+        return cls(paths)
+
+    def __str__(self) -> str:
+        fields = [str(path).removeprefix(f"{self.topic}:") for path in self.paths]
+        return f"{self.topic}:{', '.join(fields)}"
+
+    @property
+    def topic(self) -> str:
+        """The one topic."""
+        return self.paths[0].topic
+
+    def check(self, msgtype: str, types: Typestore) -> None:
+        """BagError unless messages of `msgtype` have a number at each."""
+        for path in self.paths:
+            path.check(msgtype, types)
+
+    def reader(self, msgtype: str, types: Typestore) -> MessageReader:
+        """What reads the numbers in serialised messages of this type."""
+        return MessageReader(self.paths, msgtype, types)

@@ -8,10 +8,10 @@ from typing import Final
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Regularity
+from bags.signals.arrivals import Arrival
 from bags.signals.timing import Sequence
 
-COUNTED: Final = ("received", "lost", "gaps", "rate [Hz]", "jitter [ms]")
+COUNTED: Final = ("received", "lost")
 UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"
 UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
 
@@ -29,14 +29,12 @@ class Recording:
         self._least_free = least_free  # MB
         self._lost: dict[str, int] = {}
         self._sequence: dict[str, Sequence] = {}
-        self._regularity: dict[str, Regularity] = {}
         self._closed = False
 
     def expect(self, topic: str) -> None:
         """List a topic although nothing is known of it yet."""
         self._lost.setdefault(topic, 0)
         self._sequence.setdefault(topic, Sequence())
-        self._regularity.setdefault(topic, Regularity())
 
     def add_topic(
         self, topic: str, definition: Definition, offered: tuple[Profile, ...] = ()
@@ -45,12 +43,11 @@ class Recording:
         self.expect(topic)
         self.bag.add_topic(topic, definition.msgtype, definition=definition, offered=offered)
 
-    def add(self, arrival: Arrival, stamp_ns: int) -> None:
-        """Take a message; `stamp_ns` is what its regularity is judged by."""
+    def add(self, arrival: Arrival) -> None:
+        """Take a message."""
         if self._closed:
             return
         topic, msgtype, data, log_ns, publish_ns, number = arrival
-        self._regularity[topic].update(stamp_ns)
         if number is not None:
             self._sequence[topic].update(number)
         times = {"log_time_ns": log_ns, "publish_time_ns": publish_ns}
@@ -101,19 +98,15 @@ class Recording:
     def counts(self) -> dict[str, str]:
         """What came on each topic, in words."""
         values = {}
-        for topic, regularity in self._regularity.items():
+        for topic, sequence in self._sequence.items():
             values[f"{topic} received"] = str(self.bag.counts.get(topic, 0))
-            mixed = self._sequence[topic].mixed
-            values[f"{topic} lost"] = UNCOUNTED if mixed else str(self._lost_on(topic))
-            values[f"{topic} gaps"] = str(regularity.gaps)
-            values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
-            values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
+            values[f"{topic} lost"] = UNCOUNTED if sequence.mixed else str(self._lost_on(topic))
         return values
 
     def summary(self, most: int) -> dict[str, str]:
         """Of all topics together, and then a line each of the `most` that lose most, in words."""
         counts = self.counts()
-        lost = {topic: self._lost_on(topic) for topic in self._regularity}
+        lost = {topic: self._lost_on(topic) for topic in self._lost}
         values = {
             "topics": len(lost),
             "messages": sum(self.bag.counts.values()),

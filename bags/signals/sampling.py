@@ -255,17 +255,14 @@ class Sampler:
         if running is None:
             running = self._running[k] = self._signals[k].numbers.running("")
         if running.remembers and stamp_ns + self._kept[k].delay_ns <= self._kept[k].newest_ns:
-            self._count_late(k, stamp_ns)
+            if k >= len(self.responses):
+                self.late += 1
+            elif stamp_ns == self._kept[k].newest_ns:
+                self.duplicate_responses += k == 0
+            else:
+                self.late_responses += k == 0
             return
         self.add(k, stamp_ns, running.update(stamp_ns, value))
-
-    def _count_late(self, k: int, stamp_ns: int) -> None:
-        if k >= len(self.responses):
-            self.late += 1
-        elif stamp_ns == self._kept[k].newest_ns:
-            self.duplicate_responses += k == 0
-        else:
-            self.late_responses += k == 0
 
     def add(self, k: int, stamp_ns: int, value: float) -> None:
         """What `feed` takes; the samples come with the next call that gives any."""

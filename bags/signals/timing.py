@@ -1,4 +1,4 @@
-"""The times of a recording: offset and drift between clocks, gaps, duplicates, commands held."""
+"""The times of a recording: offset and drift between clocks, losses, commands held, delays."""
 
 from dataclasses import dataclass
 from typing import Final, overload
@@ -16,6 +16,7 @@ DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency
 SOON: Final = 100  # messages: a publisher does not begin anew twice in so many
 STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
 ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
+RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
 
 
 @overload
@@ -164,3 +165,45 @@ def missing(sequence: IntArray) -> int | None:
     if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
         return None
     return int(np.maximum(steps - 1, 0).sum())
+
+
+@dataclass(frozen=True)
+class Delay:
+    """seconds: by which the response follows the command. correlation: there, -1 to 1."""
+
+    seconds: float
+    correlation: float
+
+
+def correlation(y: FloatArray, u: FloatArray) -> FloatArray:
+    """Σ_t y(t + k) u(t) at the lags k = 0 … N-1 of two signals (N,)."""
+    size = 2 * len(y)  # so long that nothing comes round
+    found: FloatArray = np.fft.irfft(np.fft.rfft(y, size) * np.fft.rfft(u, size).conj(), size)
+    return found[: len(y)]
+
+
+def delay(command: FloatArray, response: FloatArray, period: float, max_delay: float) -> Delay:
+    """The delay (N,) samples `period` s apart show: where command and response correlate most.
+
+    Of two signals on one grid the normalised cross-correlation about their means, over delays from
+    0 to `max_delay` s, refined by a parabola through its peak. A lag in the response counts as
+    part of the delay. Raises DataError if either is constant or `max_delay` leaves no overlap.
+
+    Source: C. Knapp, G. Carter, IEEE Trans. ASSP 24 (1976) 320, the unweighted correlator.
+    """
+    most = min(round(max_delay / period), len(command) - 2)
+    if most < 1 or len(command) != len(response):
+        raise DataError(f"{len(command)} samples leave no delay of up to {max_delay:g} s to find")
+    u, y = command - command.mean(), response - response.mean()
+    if not (u @ u > 0 and y @ y > 0):
+        raise DataError("a constant signal has no delay")
+    overlap = len(u) - np.arange(most + 1)
+    found = correlation(y, u)[: most + 1] * (len(u) / overlap)
+    found = found / np.sqrt((u @ u) * (y @ y))
+    k = int(np.argmax(np.abs(found)))
+    shift = 0.0
+    if 0 < k < len(found) - 1:
+        before, here, after = np.abs(found[k - 1 : k + 2])
+        bend = before - 2 * here + after
+        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return Delay((k + shift) * period, float(np.clip(found[k], -1.0, 1.0)))

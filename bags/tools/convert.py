@@ -8,7 +8,6 @@ import heapq
 import math
 import struct
 import tempfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,8 @@ from typing import Final
 import numpy as np
 
 from bags.recordings.bag import Bag
-from bags.recordings.mcap_records import NEVER
+from bags.recordings.mcap_file import Whole
+from bags.recordings.mcap_records import NEVER, Block
 from bags.recordings.message_types import (
     are_same,
     header_stamp_ns,
@@ -46,13 +46,11 @@ STORAGES: Final = ("mcap", "sqlite3", "ros1")
 class Copied:
     """How many messages were copied, what was left out or is not as it was stated, in words.
 
-    sums: topic -> (messages, sum of their checksums, which does not depend on their order).
     parts: the new bags.
     """
 
     messages: int = 0
     notes: list[str] = field(default_factory=list)
-    sums: dict[str, tuple[int, int]] = field(default_factory=dict)
     parts: Sequence[Path] = ()
 
 
@@ -69,13 +67,14 @@ def convert(
 
     Each keeps the definition that it was written with, its times and its sequence number. A new bag
     has all chosen topics, also those without messages, the attachments and the other records.
+    Of one bag, a chunk whose messages are all wanted as they are is checked and copied as it is.
 
     Args:
         bags: of several, messages are merged; definitions that were given to a bag are written.
         out: the new bag, or with parts how their names begin.
         what: of the messages (None: all).
         into: how they are written (None: one MCAP bag).
-        nearly: see `Bag.raws`.
+        nearly: message by message, see `Bag.raws`.
         progress: told how far it is.
 
     Returns:
@@ -97,26 +96,31 @@ def convert(
     copied = Copied()
     unreadable: dict[tuple[str, str], int] = {}
     total = sum(channel.count for known in channels for channel in known.values())
-    streams = [
-        zip(bag.raws(list(topics), nearly=nearly, spans=spans), repeat(n))
-        for n, bag in enumerate(bags)
-    ]
+    whole = len(bags) == 1 and not nearly and not what.restamp
     with _written(out, into, bags, channels) as parts:
+        takes = parts.takes if whole else None
+        streams = [
+            zip(bag.raws(list(topics), nearly=nearly, spans=spans, takes=takes), repeat(n))
+            for n, bag in enumerate(bags)
+        ]
         by_time = heapq.merge(*streams, key=lambda entry: entry[0].log_ns)
-        for done, (raw, n) in enumerate(streams[0] if len(streams) == 1 else by_time, 1):
+        for done, (raw, n) in enumerate(streams[0] if len(streams) == 1 else by_time):
+            if done % REPORT_EVERY == 0 or isinstance(raw, Whole):
+                progress("copying", copied.messages / max(total, 1))
+            if isinstance(raw, Whole):
+                parts.at(raw.log_ns).mcap.copy_chunk(raw)
+                copied.messages += sum(map(len, raw.messages.values()))
+                continue
             channel = channels[n][raw.key]
             if raw.error:
                 reason = channel.topic, raw.error
                 unreadable[reason] = unreadable.get(reason, 0) + 1
                 continue
             writer = parts.at(raw.log_ns)
-            number = writer.add_copy(channel, (n, bags[n].strand(channel)))
-            writer.copy(number, restamped(n, raw))
+            number = writer.add_copy(*parts.sources[n, raw.key])
+            made = restamped(n, raw)
+            writer.mcap.add(number, made.log_ns, made.publish_ns, made.sequence, made.data)
             copied.messages += 1
-            count, checksum = copied.sums.get(channel.topic, (0, 0))
-            copied.sums[channel.topic] = count + 1, checksum + zlib.crc32(raw.data)
-            if done % REPORT_EVERY == 0:
-                progress("copying", done / max(total, 1))
         for bag in bags:
             copied.notes += [*bag.lost, *bag.disagreements]
         for (topic, why), count in unreadable.items():
@@ -267,13 +271,14 @@ class _Parts:
     ) -> None:
         self.paths: list[Path] = []
         self._out, self._into, self._bags = out, into, bags
-        self._channels = [
-            (channel, (n, bag.strand(channel)))
+        self.sources = {
+            (n, key): (channel, (n, bag.storage.strands[key]), bag.storage.numbers[key])
             for n, (bag, known) in enumerate(zip(bags, channels, strict=True))
-            for channel in known.values()
-        ]
+            for key, channel in known.items()
+        }
         self._writer: BagWriter | None = None
         self._first_ns, self._until_ns = 0, NEVER
+        self._compression = "" if into.compression == "none" else into.compression
         self._most = NEVER if into.max_size is None else into.max_size * 1e6
 
     @property
@@ -287,6 +292,15 @@ class _Parts:
         if self._writer is None or log_ns >= self._until_ns or self._writer.size >= self._most:
             return self._begin(log_ns)
         return self._writer
+
+    def takes(self, block: Block, numbers: Mapping[int, int]) -> bool:
+        """Whether a chunk of the only bag fits as it is; numbers: of its channels -> keys."""
+        if self._into.storage != "mcap" or block.compression != self._compression:
+            return False
+        writer = self.at(block.start_ns)
+        if block.end_ns >= self._until_ns:
+            return False
+        return all(writer.add_copy(*self.sources[0, key]) == n for n, key in numbers.items())
 
     def _begin(self, log_ns: int) -> BagWriter:
         """Begin the next, with all that is no message."""
@@ -306,23 +320,15 @@ class _Parts:
         )
         for bag in self._bags:
             for record in bag.kept_beside:
-                writer.keep(record)
-        kinds: dict[str, set[object]] = {}
-        for channel, _ in self._channels:
-            kind = channel.msgtype, channel.encoding, channel.definition
-            kinds.setdefault(channel.topic, set()).add(kind)
-        for channel, strand in self._channels:
-            if len(kinds[channel.topic]) == 1:  # else when a message needs it
-                writer.add_copy(channel, strand)
+                writer.mcap.keep(record)
+        for source in self.sources.values():
+            writer.add_copy(*source)
         self._writer = writer
         return writer
 
     def _close(self) -> None:
         """Finish the bag at hand."""
         if self._writer is not None:
-            for channel, strand in self._channels:
-                if channel.topic not in self._writer.counts:
-                    self._writer.add_copy(channel, strand)
             self._writer.close()
             self.paths.append(self._writer.path)
 

@@ -18,13 +18,12 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.remote import StorageError, place
 from bags.signals.columns import expand_paths, read_columns
-from bags.signals.delays import RELATED, Delay, delay
 from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
 from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
-from bags.signals.timing import clock_relation, held
+from bags.signals.timing import RELATED, Delay, clock_relation, delay, held
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
 
@@ -150,8 +149,11 @@ def _samples(
     """What identification would make of the signals; `commands` become those of its samples."""
     clocks = {samples.clock for samples in (*responses, *excitations)}
     if len(clocks) > 1:
-        what = "some signals have no header stamp: identify and check them with clock log"
-        yield Finding(Level.BAD, "samples", what)
+        yield Finding(
+            Level.BAD,
+            "samples",
+            "some signals have no header stamp: identify and check them with clock log",
+        )
         return
     held = [_ruled(samples, "hold") for samples in excitations]
     apart = Grid(split_gaps=True)
@@ -164,13 +166,17 @@ def _samples(
         except (BagError, DataError) as second:
             yield Finding(Level.BAD, "samples", f"identification refuses them: {second}")
             return
-        what = f"only with grid.resample: linear or last; as they come: {error}"
-        yield Finding(Level.LOOK, "samples", what)
+        yield Finding(
+            Level.LOOK, "samples", f"only with grid.resample: linear or last; as they come: {error}"
+        )
     longest = max(trials, key=len)
     count = sum(map(len, trials))
     stretches = "one stretch" if len(trials) == 1 else f"{len(trials)} stretches"
-    what = f"{count} samples of {longest.period:.4g} s in {stretches} without a gap"
-    yield Finding(Level.GOOD, "samples", what)
+    yield Finding(
+        Level.GOOD,
+        "samples",
+        f"{count} samples of {longest.period:.4g} s in {stretches} without a gap",
+    )
     u = np.concatenate([trial.u for trial in trials])
     commands |= {samples.path: c for samples, c in zip(excitations, u.T, strict=True)}
 
@@ -205,26 +211,36 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
     logged = {e.path.topic for e in map(Expression.parse, signals) if e.clock == "log"}
     for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
         if topic in logged:
-            what = f"{topic} by its log times, which carry the latency of recording"
-            yield Finding(Level.GOOD, "clock", what)
+            yield Finding(
+                Level.GOOD,
+                "clock",
+                f"{topic} by its log times, which carry the latency of recording",
+            )
         elif columns.stamp_ns is None:
-            what = f"{topic} has no header stamp; its log times carry the latency of recording"
-            yield Finding(Level.LOOK, "clock", what)
+            yield Finding(
+                Level.LOOK,
+                "clock",
+                f"{topic} has no header stamp; its log times carry the latency of recording",
+            )
         elif len(columns) and not columns.stamp_ns.any():
             yield Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0")
         elif len(columns):
             back = int((np.diff(columns.stamp_ns) < 0).sum())
             if back:
-                what = f"{topic}: stamps go back in {_counted(back, 'place')}"
-                yield Finding(Level.BAD, "clock", what)
+                yield Finding(
+                    Level.BAD, "clock", f"{topic}: stamps go back in {_counted(back, 'place')}"
+                )
             relation = clock_relation(columns.stamp_ns, columns.log_ns)
             offsets[topic] = relation.offset
             level = Level.LOOK if relation.drift else Level.GOOD
             yield Finding(level, "clock", f"{topic}: {relation}")
     if offsets and max(offsets.values()) - min(offsets.values()) > 1.0:
         far = max(offsets, key=lambda topic: abs(offsets[topic]))
-        what = f"the topics' stamps are of different clocks: {far} is {offsets[far]:+.3f} s off"
-        yield Finding(Level.BAD, "clock", what)
+        yield Finding(
+            Level.BAD,
+            "clock",
+            f"the topics' stamps are of different clocks: {far} is {offsets[far]:+.3f} s off",
+        )
 
 
 def _regularity(samples: Samples) -> Iterator[Finding]:
@@ -234,20 +250,29 @@ def _regularity(samples: Samples) -> Iterator[Finding]:
         yield Finding(Level.BAD, "regularity", f"{name} has one sample")
         return
     if repeated := int((steps == 0).sum()):
-        what = f"{name}: {repeated} of {len(samples)} stamps repeat the one before"
-        yield Finding(Level.LOOK, "regularity", what)
+        yield Finding(
+            Level.LOOK,
+            "regularity",
+            f"{name}: {repeated} of {len(samples)} stamps repeat the one before",
+        )
     steps = steps[steps > 0]
     if not len(steps):
         return
     period = float(np.median(steps))
     gaps = steps > GAP * period
     if gaps.any():
-        what = f"{name}: {_counted(int(gaps.sum()), 'gap')}, the longest {np.max(steps):.3g} s"
-        yield Finding(Level.LOOK, "regularity", what)
+        yield Finding(
+            Level.LOOK,
+            "regularity",
+            f"{name}: {_counted(int(gaps.sum()), 'gap')}, the longest {np.max(steps):.3g} s",
+        )
     jitter = float(np.quantile(np.abs(steps[~gaps] - period), 0.95)) / period
     level = Level.LOOK if jitter > JITTER_LOOK else Level.GOOD
-    what = f"{name}: {_rate(samples, period)}, 95 % of steps within {_percent(jitter)}"
-    yield Finding(level, "regularity", what)
+    yield Finding(
+        level,
+        "regularity",
+        f"{name}: {_rate(samples, period)}, 95 % of steps within {_percent(jitter)}",
+    )
 
 
 def _commands(samples: Samples, last_ns: int) -> Iterator[Finding]:
@@ -262,14 +287,23 @@ def _commands(samples: Samples, last_ns: int) -> Iterator[Finding]:
         return
     rate = _rate(samples, float(np.median(steps)))
     found = held(samples.stamp_ns, last_ns)
-    what = f"{name}: {rate}, one held for at most {found.longest:.3g} s (grid.hold)"
-    yield Finding(Level.GOOD, "commands", what)
+    yield Finding(
+        Level.GOOD,
+        "commands",
+        f"{name}: {rate}, one held for at most {found.longest:.3g} s (grid.hold)",
+    )
     if found.tail:
-        what = f"{name} ends {found.tail:.3g} s before the responses do: what follows is not fitted"
-        yield Finding(Level.LOOK, "commands", what)
+        yield Finding(
+            Level.LOOK,
+            "commands",
+            f"{name} ends {found.tail:.3g} s before the responses do: what follows is not fitted",
+        )
     if repeated := int((steps == 0).sum()):
-        what = f"{name}: {repeated} of {len(samples)} stamps repeat the one before; the last counts"
-        yield Finding(Level.LOOK, "commands", what)
+        yield Finding(
+            Level.LOOK,
+            "commands",
+            f"{name}: {repeated} of {len(samples)} stamps repeat the one before; the last counts",
+        )
 
 
 def _rate(samples: Samples, period: float) -> str:
@@ -297,8 +331,11 @@ def _excitation(samples: Samples) -> Iterator[Finding]:
     band = float(f[np.searchsorted(share, 0.95)])
     lines = int((power > 1e-3 * power.max()).sum())
     level = Level.LOOK if lines < LINES_FEW or band * period > BAND_LOOK else Level.GOOD
-    what = f"{name}: 95 % of its power below {band:.3g} Hz, {lines} frequency lines carry power"
-    yield Finding(level, "excitation", what)
+    yield Finding(
+        level,
+        "excitation",
+        f"{name}: 95 % of its power below {band:.3g} Hz, {lines} frequency lines carry power",
+    )
 
 
 def _range(samples: Samples) -> Iterator[Finding]:
@@ -309,13 +346,19 @@ def _range(samples: Samples) -> Iterator[Finding]:
     for end, what in ((np.max(x), "largest"), (np.min(x), "smallest")):
         share = float(((x[1:] == end) & (x[:-1] == end)).mean())
         if share > SATURATED and end != x[0]:
-            text = f"{name}: {100 * share:.0f} % of samples stay at its {what} value {end:g}"
-            yield Finding(Level.LOOK, "saturation", text)
+            yield Finding(
+                Level.LOOK,
+                "saturation",
+                f"{name}: {100 * share:.0f} % of samples stay at its {what} value {end:g}",
+            )
     levels = np.unique(x)
     step = float(np.min(np.diff(levels))) / float(np.ptp(x))
     coarse = len(levels) < LEVELS_FEW or step > STEP_COARSE
-    text = f"{name}: {len(levels)} distinct values, steps of {step:.1e} of its range"
-    yield Finding(Level.LOOK if coarse else Level.GOOD, "quantisation", text)
+    yield Finding(
+        Level.LOOK if coarse else Level.GOOD,
+        "quantisation",
+        f"{name}: {len(levels)} distinct values, steps of {step:.1e} of its range",
+    )
 
 
 def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> Iterator[Finding]:
@@ -326,11 +369,12 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> Ite
         for u in excitations:
             start, end = max(u.stamp_ns[0], y.stamp_ns[0]), min(u.stamp_ns[-1], y.stamp_ns[-1])
             if period_ns <= 0 or end - start < LEAST_OVERLAP * period_ns:
-                what = (
+                yield Finding(
+                    Level.BAD,
+                    "delay",
                     f"{u.path} and {y.path} overlap for {max(end - start, 0) / 1e9:.3g} s by their "
-                    f"stamps, less than {LEAST_OVERLAP} steps of the response"
+                    f"stamps, less than {LEAST_OVERLAP} steps of the response",
                 )
-                yield Finding(Level.BAD, "delay", what)
                 continue
             at = np.arange(start, end, period_ns)
             held = u.values[np.searchsorted(u.stamp_ns, at, side="right") - 1]
@@ -341,8 +385,9 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> Ite
         if found:
             best, command = max(found, key=lambda pair: abs(pair[0].correlation))
             level = Level.GOOD if abs(best.correlation) > RELATED else Level.LOOK
-            what = (
+            yield Finding(
+                level,
+                "delay",
                 f"{y.path} follows {command} after {best.seconds:.3g} s "
-                f"(correlation {best.correlation:+.2f})"
+                f"(correlation {best.correlation:+.2f})",
             )
-            yield Finding(level, "delay", what)

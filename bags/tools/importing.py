@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import FieldDesc
 
 from bags.recordings.cdr import Step
-from bags.recordings.message_types import fields_of, is_stamped, standard_types
+from bags.recordings.message_types import is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import stamp_text
@@ -26,6 +24,7 @@ from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
+LARGEST: Final = 2**16  # bytes of an empty message, and more
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
@@ -228,7 +227,9 @@ class _Stream:
         self.topic, self.msgtype = topic, msgtype
         self._columns = columns
         self._stamped = is_stamped(msgtype, store)
-        self._message = _empty(msgtype)
+        kind = store.get_msgdef(msgtype)
+        zeros = memoryview(bytes(LARGEST))  # in ROS 1 an empty string, too, is zeros
+        self._message, _ = kind.deserialize_ros1(zeros, 0, kind.cls, store)
         for path in columns:
             _make_room(self._message, path.steps)
 
@@ -261,28 +262,6 @@ def _stamps(times: FloatArray, start_ns: int) -> IntArray:
             f"({len(back)} such rows); keep one of the rows with one time"
         )
     return stamps
-
-
-def _empty(msgtype: str) -> Any:
-    """A message of zeros and empty strings."""
-    fields = fields_of(msgtype, standard_types())
-    values = [_zero(description) for description in fields.values()]
-    return standard_types().types[msgtype](*values)
-
-
-def _zero(description: FieldDesc) -> Any:
-    if description[0] == Nodetype.NAME:
-        return _empty(str(description[1]))
-    if description[0] == Nodetype.BASE:
-        name = description[1][0]
-        if name == "bool":
-            return False
-        return "" if name == "string" else 0.0 if "float" in name else 0
-    element, length = description[1]
-    count = int(str(length)) if description[0] == Nodetype.ARRAY else 0
-    if element[0] == Nodetype.BASE and element[1][0] != "string":
-        return np.zeros(count, dtype={"byte": "i1", "char": "u1"}.get(element[1][0], element[1][0]))
-    return [_zero(element) for _ in range(count)]
 
 
 def _make_room(message: Any, steps: Sequence[Step]) -> None:

@@ -136,21 +136,16 @@ def _paths(
 
 def _transforms(topic: str, message: Any) -> Iterator[tuple[Listed, Sequence[SignalPath]]]:
     """Position and angles of each frame."""
-    for frame in _frames(message):
+    sent = [part.child_frame_id for each in message or () for part in each.transforms]
+    for frame in dict.fromkeys(sent):
+        if not frame or set("[]=|") & set(frame):
+            continue  # a path cannot name it
         for text, unit in (
             *((f"translation.{axis}", "m") for axis in "xyz"),
             *((f"rotation.{angle}", "rad") for angle in ANGLES),
         ):
             path = SignalPath.parse(f"{topic}:transforms[child_frame_id={frame}].transform.{text}")
             yield Listed(str(path), "float64", unit), [path]
-
-
-def _frames(messages: Any) -> list[str]:
-    """The frames in decoded messages, each once, if a path can name them."""
-    found = dict.fromkeys(
-        t.child_frame_id for message in messages or () for t in message.transforms
-    )
-    return [frame for frame in found if frame and not set("[]=|") & set(frame)]
 
 
 def _named(

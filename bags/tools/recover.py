@@ -2,15 +2,13 @@
 
 import fcntl
 import tempfile
-import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from bags.recordings.bag import Bag
-from bags.recordings.description import METADATA
+from bags.recordings.folders import METADATA
 from bags.recordings.message_types import decode
 from bags.recordings.writer import RESERVE
 from bags.signals.timing import missing
@@ -48,13 +46,17 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -
     with Bag(path, salvage=True) as bag:
         copied = convert([bag], out, nearly=True, progress=progress)
         statements, topics = bag.statements, bag.topics
-    counts = {topic: copied.sums.get(topic, (0, 0))[0] for topic in topics}
-    return Recovery(out, counts, (*copied.notes, *_verify(out, copied.sums)), statements)
+    found, lost = _read_back(out)
+    if sum(found.values()) != copied.messages:
+        raise BagError(f"{out} does not read back as it was written; is the disk damaged?")
+    counts = {topic: found.get(topic, 0) for topic in topics}
+    return Recovery(out, counts, (*copied.notes, *lost), statements)
 
 
-def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
-    """What the new bag says of losses; BagError unless it reads back as it was written."""
-    found: dict[str, tuple[int, int]] = {}
+def _read_back(out: Path) -> tuple[dict[str, int], list[str]]:
+    """Messages on each topic of a new bag, and what it says of losses; BagError if damaged."""
+    found: dict[str, int] = {}
+    lost = []
     looked_into: set[int] = set()
     sequences: dict[tuple[str, int], list[IntArray]] = {}
     with Bag(out) as bag:
@@ -63,17 +65,14 @@ def _verify(out: Path, written: dict[str, tuple[int, int]]) -> Iterator[str]:
             if channel.encoding == "cdr" and channel.key not in looked_into:
                 looked_into.add(channel.key)
                 if why := _unreadable(bag, topic, batch.data(0)):
-                    yield f"{topic}: its messages are kept, and cannot be read: {why}"
-            count, total = found.get(topic, (0, 0))
-            total += sum(zlib.crc32(batch.data(k)) for k in range(len(batch)))
-            found[topic] = count + len(batch), total
-            strand = topic, bag.strand(channel)
+                    lost.append(f"{topic}: its messages are kept, and cannot be read: {why}")
+            found[topic] = found.get(topic, 0) + len(batch)
+            strand = topic, bag.storage.strands[channel.key]
             sequences.setdefault(strand, []).append(batch.sequence)
-    if found != written:
-        raise BagError(f"{out} does not read back as it was written; is the disk damaged?")
     for (topic, _), parts in sequences.items():
         if gaps := missing(np.concatenate(parts)):
-            yield f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
+            lost.append(f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost")
+    return found, lost
 
 
 def _unreadable(bag: Bag, topic: str, data: bytes) -> str:

@@ -9,7 +9,7 @@ import csv
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,7 +85,12 @@ def export_topics(
     writer = _Csv if form == "csv" else _Parquet
     left_out: list[str] = []
     wanted = _wanted(bag, signals, left_out)
-    with _temporary(out) as folder, ExitStack() as stack:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as beside,
+        ExitStack() as stack,
+    ):
+        folder = Path(beside) / out.name
         folder.mkdir()
         files: dict[str, _Csv | _Parquet] = {}
         for topic in wanted:
@@ -105,6 +110,8 @@ def export_topics(
         if not kept:
             what = "; ".join(left_out) or "there are no messages"
             raise BagError(f"{bag.path}: nothing was exported: {what}")
+        stack.close()
+        folder.rename(out)
     return Exported(
         {out / file.path.name: counts[topic] for topic, file in kept.items()},
         tuple(left_out),
@@ -314,15 +321,6 @@ def _plain(value: Any) -> Any:
         names = [name for name in vars(value) if name != "__msgtype__"]
         return {name: _plain(getattr(value, name)) for name in names}
     return value
-
-
-@contextmanager
-def _temporary(out: Path) -> Iterator[Path]:
-    """A place beside `out` that gets its name in the end; nothing is left after an error."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        yield Path(folder) / out.name
-        (Path(folder) / out.name).rename(out)
 
 
 class _Csv:

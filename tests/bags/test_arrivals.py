@@ -1,4 +1,4 @@
-"""Rates, jitter and gaps of stamps, and the ring of the last seconds."""
+"""What publishers count, and the ring of the last seconds."""
 
 from pathlib import Path
 
@@ -6,24 +6,10 @@ import numpy as np
 import pytest
 
 from bags.recordings.bag import Bag
-from bags.signals.arrivals import Arrival, Recent, Regularity
+from bags.signals.arrivals import Arrival, Recent
 from bags.signals.publishers import counted_in_turn
 from bags.signals.timing import Sequence
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
-
-PERIOD_NS = 1_000_000
-
-
-def test_rate_jitter_and_gaps_are_those_of_the_stamps() -> None:
-    rng = np.random.default_rng(2)
-    stamps = np.arange(5000) * PERIOD_NS + (5e4 * rng.standard_normal(5000)).astype(int)
-    regularity = Regularity()
-    for k, stamp in enumerate(stamps.tolist()):
-        if k not in (1000, 2000, 2001, 4000):
-            regularity.update(stamp)
-    assert regularity.gaps == 3
-    assert regularity.rate == pytest.approx(1000.0, rel=0.02)
-    assert regularity.jitter == pytest.approx(5e-5 * 2**0.5, rel=0.3)
 
 
 def test_a_publishers_count_tells_what_is_missing_until_there_is_another_publisher() -> None:

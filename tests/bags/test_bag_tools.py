@@ -264,7 +264,7 @@ def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: P
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.parametrize(("how", "count"), [(("--every", "30"), 4), (("--max-size", "0.02"), 4)])
+@pytest.mark.parametrize(("how", "count"), [(("--every", "30"), 4), (("--max-size", "0.02"), 5)])
 def test_parts_of_a_bag_merge_to_the_whole(
     tmp_path: Path, how: tuple[str, str], count: int
 ) -> None:

@@ -31,7 +31,7 @@ recording.add_topic(CMD, standard_definition(CMD_TYPE))
 for k in range(2000):
     stamp = START_NS + k
     data = command(stamp, k**0.5)  # does not compress away
-    recording.add(Arrival(CMD, CMD_TYPE, data, stamp, stamp), stamp)
+    recording.add(Arrival(CMD, CMD_TYPE, data, stamp, stamp))
     if k % 50 == 49:
         recording.keep_up()
 recording.close()
@@ -85,10 +85,10 @@ def test_it_ends_while_there_is_room_left_and_says_so(tmp_path: Path) -> None:
     recording = Recording(BagWriter(tmp_path / "run", in_place=True), least_free=1e12)
     recording.expect(CMD)
     first = Arrival(CMD, CMD_TYPE, command(START_NS, 0.0), START_NS, START_NS)
-    recording.add(first, START_NS)
+    recording.add(first)
     recording.keep_up()
     assert "are to stay free" in recording.ended
-    recording.add(first, START_NS)
+    recording.add(first)
     recording.close()
     with Bag(tmp_path / "run") as source:
         assert source.count(CMD) == 1

@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
+from shutil import rmtree
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,7 @@ from bags.recordings.mcap_file import McapFile
 from bags.recordings.message_types import standard_types
 from bags.signals.reader import read_signals
 from bags.signals.signal import numeric_paths
+from bags.tools.convert import convert
 from bags.tools.info import bag_info
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError, NlsidError
@@ -273,7 +275,14 @@ def _recover(file: Path, out: Path) -> None:
     recover(file, out)
 
 
-STEPS: Final[tuple[Callable[[Path, Path], None], ...]] = (_info, _read, _recover)
+def _convert(file: Path, out: Path) -> None:
+    with Bag(file, unfinished=True) as bag:
+        convert([bag], out)
+    assert bag_info(out, messages=True).ending is None
+    rmtree(out)
+
+
+STEPS: Final[tuple[Callable[[Path, Path], None], ...]] = (_info, _read, _convert, _recover)
 
 
 def _too_long(_signal: int, _frame: object) -> None:
@@ -305,7 +314,7 @@ def test_a_few_mutated_files_give_data_or_our_error(tmp_path: Path) -> None:
         rng = random.Random(-number)
         file = tmp_path / "mutated.mcap"
         file.write_bytes(mutated(rng.choice(contents), rng))
-        for step in STEPS[:2]:
+        for step in STEPS[:3]:
             try:
                 step(file, tmp_path / "out")
             except NlsidError as error:

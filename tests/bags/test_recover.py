@@ -13,6 +13,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.mcap_file import McapFile
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import bag_origin, read_signals
+from bags.tools.convert import convert
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import ODOM, ODOM_TYPE, SPEED, START_NS, odometry, speed_bag
@@ -73,6 +74,8 @@ def test_a_damaged_chunk_is_named_and_the_others_come_back(chunked: Path, tmp_pa
     file.write_bytes(content)
     with pytest.raises(BagError):
         read_signals(chunked, [SPEED])
+    with pytest.raises(BagError, match=f"the chunk at byte {block.offset}"), Bag(chunked) as bag:
+        convert([bag], tmp_path / "copy")
     recovery = recover(chunked, tmp_path / "whole")
     assert recovery.messages == (CHUNKS - 1) * PER_CHUNK
     assert any("states 120 messages, 110 are there" in what for what in recovery.lost)

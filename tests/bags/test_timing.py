@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import bags
-from bags.signals.delays import delay
 from bags.signals.reader import read_signals
 from bags.signals.sampling import Grid
-from bags.signals.timing import clock_relation
+from bags.signals.timing import clock_relation, delay
 from nlsid_core.data.repeats import same_excitation
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag

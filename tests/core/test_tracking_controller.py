@@ -11,7 +11,7 @@ from bags.monitoring.announcement import Run
 from bags.monitoring.replay import announced_runs, replay_messages
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
-from bags.signals.vector import SignalVector
+from bags.signals.message_reader import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import AnyDesign

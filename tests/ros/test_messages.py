@@ -19,9 +19,9 @@ from bags.recordings.message_types import (
     is_stamped,
     standard_types,
 )
+from bags.signals.message_reader import SignalVector
 from bags.signals.sampling import Sampler
 from bags.signals.signal import SignalPath, numeric_paths
-from bags.signals.vector import SignalVector
 from nlsid_core.errors import BagError
 from nlsid_ros.message_classes import _describe, installed_types, message_class
 from nlsid_ros.messages import SignalMessage, numbers_at

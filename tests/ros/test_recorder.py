@@ -208,24 +208,18 @@ def test_bags_begin_and_end_when_asked_and_nothing_between_them_is_lost(
     assert three_readers(Path(f"{bag}_2"), "/joints") == [robot.sent[8:]] * 3
 
 
-def test_gaps_in_the_stamps_rate_and_jitter_are_in_the_diagnostics_and_the_bag(
-    robot: Joints, tmp_path: Path
-) -> None:
+def test_counts_are_in_the_diagnostics_and_the_bag(robot: Joints, tmp_path: Path) -> None:
     bag = tmp_path / "run"
-    base, period = 10**18, 10_000_000
     recorder = robot.records(topics="[/joints]", bag=bag)
-    for k in [*range(50), *range(53, 80), *range(82, 100)]:
-        robot.publish(1, stamp_ns=base + k * period + (100_000 if k % 2 else 0))
+    robot.publish(95)
     robot.received("/joints", 95)
     said = robot.said[RECORDER][-1][1]
     assert (said["topics"], said["messages"], said["lost"]) == ("1", "95", "0")
-    assert said["/joints"].startswith("received 95, lost 0, gaps 2, rate [Hz] ")
+    assert said["/joints"] == "received 95, lost 0"
     stop(recorder)
     with Bag(bag) as source:
         kept = source.custom
-    assert [kept[f"/joints {what}"] for what in ("received", "lost", "gaps")] == ["95", "0", "2"]
-    assert float(kept["/joints rate [Hz]"]) == pytest.approx(100.0, rel=0.02)
-    assert float(kept["/joints jitter [ms]"]) == pytest.approx(0.1, rel=0.1)
+    assert [kept[f"/joints {what}"] for what in ("received", "lost")] == ["95", "0"]
 
 
 def test_messages_that_dds_lost_are_counted(robot: Joints, tmp_path: Path) -> None:
