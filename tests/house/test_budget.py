@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_831,
+    ("nlsid_core",): 18_828,
     ("bags",): 12_001,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_291,
+    ("tests",): 23_289,
     ("benchmarks", "examples"): 3_808,
 }
 ARGUMENTS, FIELDS = 6, 8
