@@ -184,7 +184,7 @@ def fitted_to_all(choice: Choice) -> Model:
     data = choice.held_out.data
     for row in choice.ranked:
         try:
-            return fitted(data, row.attempt, data)
+            return fitted(data, row.attempt, data).model
         except NlsidError as reason:
             print(f"    {row.attempt}, fitted to all data: {reason}", flush=True)
     raise AssertionError("nothing that was tried has a model of all data")

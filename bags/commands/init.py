@@ -118,7 +118,8 @@ def tried_table(choice: Choice) -> Table:
     """What was tried, the best first, and what it is held against."""
     table = Table(
         title=f"tried on {choice.held_out.on} that were held out",
-        caption="error: of the simulation, in % of the response's spread",
+        caption="error: of the simulation, in % of the response's spread, with what the data leave "
+        "open",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,

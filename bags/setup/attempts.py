@@ -1,13 +1,12 @@
 """What identification is proposed: what the one rule of `learn` takes of all that is tried."""
 
-import math
 from typing import Any, Final
 
 from bags.chain.identification_config import section_of
 from bags.setup.ladder import STAGES, Stages, choose
 from bags.setup.proposal import Proposal
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, NlsidError
+from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.identification import Choice
 from nlsid_core.identification.choosing import HeldOut
 from nlsid_core.progress import Progress
@@ -25,22 +24,17 @@ def tried(train: Dataset, stages: Stages = STAGES, *, progress: Progress) -> Cho
 
 def say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> None:
     """Take what the rule takes, say what else was tried, and what to expect."""
-    try:
-        best = None if choice is None else choice.best
-    except Infeasible:
-        best = None
-    if choice is None or best is None:
+    if choice is None or not choice.found:
         _say_untried(proposal, train)
         return
 
-    kept = {key: proposal.content["identification"].get(key) for key in ("input_range",)}
-    section: dict[str, Any] = section_of(best.attempt, choice.held_out.data)
-    if section["model"] == "state_affine":
-        section |= {key: value for key, value in kept.items() if value is not None}
+    known = proposal.content["identification"]
+    section: dict[str, Any] = section_of(choice.best.attempt, choice.held_out.data)
+    if section["model"] == "state_affine" and "input_range" in known:
+        section["input_range"] = known["input_range"]
     proposal.content["identification"] = section
     proposal.choice = choice
-    shown = [row for row in choice.ranked if math.isfinite(row.percent)][:SHOWN]
-    said = "; ".join(f"{row.attempt}: {row.percent:.3g} %" for row in shown)
+    said = "; ".join(f"{row.attempt}: {row.percent:.3g} %" for row in choice.ranked[:SHOWN])
     proposal.why["model"] = (
         f"{len(choice.rows)} were tried on {choice.held_out.on} that were held out, and the "
         f"simplest that is as good as the best is taken: {said}"

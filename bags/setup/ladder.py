@@ -1,7 +1,7 @@
 """What is tried for recordings, in which order; the one rule (`choosing`) takes what is best.
 
 It is a list, cheap first: linear models, what bends them, networks, then the best of them with more
-or fewer lags, higher degrees, more or fewer steps, and a shorter memory.
+or fewer lags, higher degrees, one step in place of several, and a shorter memory.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification.choosing import Attempt, Choice, Fold, HeldOut, Row, shortened
+from nlsid_core.identification.choosing import Attempt, Choice, HeldOut, Row
 from nlsid_core.identification.methods.options import LeastSquares, Method, Rse, Sem
 from nlsid_core.identification.network.options import (
     CellRow,
@@ -21,16 +21,16 @@ from nlsid_core.identification.network.options import (
 )
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
+from nlsid_core.identification.rates import rate_of_memory
 from nlsid_core.progress import Progress, silent
 
 LAGS = (1, 2, 3, 4, 6, 8, 10)  # of one input and output
 FEW_LAGS = (1, 2, 3, 4)
 STEPS = 6  # of a search while it is one of many
-MORE_STEPS = 20  # of the best
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
-GLANCE = 1000  # samples, to which an attempt is fitted to see whether it is worth a closer look
-DROPPED = 1.25  # times the best glance of a stage: worse ones are not looked at again
-MOST_FILTERED = 6  # states of filters
+EVERY = 100  # least squares is quick
+DROPPED = 1.1  # times the best: what is worse on the first fold is not judged on the others
+MOST_FILTERED = 6  # states of filters: as many as lags of the best by least squares, or fewer
 SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
 ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
 
@@ -42,31 +42,30 @@ def choose(
     *,
     progress: Progress = silent,
 ) -> Choice:
-    """Try what there is for such data: a glance at all, and the best of each stage judged.
+    """Try what there is for such data: all on the first fold, the best of each stage on all.
 
     known: what was tried before.
     """
-    rows, best = list(known), math.inf
-    first = held_out.folds[0]
-    few = Fold(shortened(first.fitted.trajectories, GLANCE), first.judged)
-    glance = replace(held_out, folds=(few,))
+    rows = list(known)
     for number, (stage, kept) in enumerate(stages):
         before = {row.attempt for row in rows}
         attempts = [one for one in dict.fromkeys(stage(held_out.data, rows)) if one not in before]
         glances = []
         for attempt in attempts:
             progress(str(attempt), number / len(stages))
-            glances.append(glance.judged(attempt))
-            best = min(best, glances[-1].percent)
-        glances.sort(key=lambda row: row.percent)
-        for place, row in enumerate(glances):
+            glances.append(held_out.glance(attempt))
+        good = 0
+        for row in sorted(glances, key=lambda row: row.percent):
+            best = least(rows)
+            limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
                 rows.append(row)
-            elif place < kept and row.percent <= DROPPED * best:
+            elif kept == EVERY or (good < kept and row.percent <= limit):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
-                rows.append(held_out.judged(row.attempt))
+                rows.append(held_out.judged(row))
+                good += rows[-1].percent <= limit
             else:
-                rows.append(replace(row, refusal=f"{row.percent:.3g} % at a glance"))
+                rows.append(replace(row, refusal=f"{row.percent:.3g} % on one fold"))
     return Choice(held_out, tuple(rows))
 
 
@@ -79,35 +78,41 @@ Stage = Callable[[Dataset, Sequence[Row]], Iterator[Attempt]]
 
 
 def linear(data: Dataset, _rows: Sequence[Row]) -> Iterator[Attempt]:
-    """By least squares, and by simulation error."""
-    outputs, inputs = signals_of(data)
-    iterated: Method = Rse(STEPS) if outputs == 1 else Sem(STEPS, certified=True)
-    for lags in LAGS if outputs == inputs == 1 else FEW_LAGS:
-        delays: list[tuple[int, ...] | None] = [None]
-        if inputs > 1:
-            delays += [(k,) for k in range(1, lags + 1)]
-        for chosen in delays:
-            yield Attempt(Polynomial(lags, chosen), LeastSquares())
-            if lags in FEW_LAGS:
-                yield Attempt(Polynomial(lags, chosen), iterated)
+    """By least squares."""
+    for made in _linear_of(data, LAGS if signals_of(data) == (1, 1) else FEW_LAGS):
+        yield Attempt(made, LeastSquares())
+
+
+def iterated(data: Dataset, _rows: Sequence[Row]) -> Iterator[Attempt]:
+    """Linear, by simulation error."""
+    method: Method = Rse(STEPS) if signals_of(data)[0] == 1 else Sem(STEPS, certified=True)
+    for made in _linear_of(data, FEW_LAGS):
+        yield Attempt(made, method)
+
+
+def _linear_of(data: Dataset, most: Sequence[int]) -> Iterator[Polynomial]:
+    """With so many lags, of all inputs or of one sample of them."""
+    for lags in most:
+        yield Polynomial(lags)
+        if signals_of(data)[1] > 1:
+            yield from (Polynomial(lags, (k,)) for k in range(1, lags + 1))
 
 
 def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     """Polynomials of the inputs, factors of the outputs, increasing functions of the output."""
-    outputs, _ = signals_of(data)
     best = least(rows)
     if best is None or best.percent < ENOUGH:
         return
     certified = Sem(STEPS, certified=True)
     lags = max(2, min(_lags(best), FEW_LAGS[-1]))
-    for degree in (2, 3):
+    for degree in (2, 3, 4):
         delays = excited(data, lags, degree)
         yield Attempt(Polynomial(lags, delays, Degrees(inputs=degree)), Rse(STEPS))
     delays = excited(data, lags, 2)
     yield Attempt(Polynomial(lags, delays, Degrees(inputs=2, leading=1)), certified)
     delays = excited(data, lags, 3)
     yield Attempt(Polynomial(lags, delays, Degrees(left=3, inputs=3)), certified)
-    if outputs == 1:
+    if signals_of(data)[0] == 1:
         yield Attempt(Polynomial(lags, degrees=Degrees(left=3)), certified)
 
 
@@ -122,7 +127,7 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     for cells, limit in limits:
         yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
     if inputs == 1:
-        straight = least(row for row in rows if row.attempt.model_class == Polynomial(_lags(row)))
+        straight = least(row for row in rows if row.attempt.method == LeastSquares())
         n = 4 if straight is None else max(2, min(_lags(straight), MOST_FILTERED))
         for orders in dict.fromkeys(((n, 0), (0, n), (n - n // 2, n // 2))):
             filters = FilterMapFilter(orders, intervals=12, starts=4)
@@ -145,17 +150,21 @@ def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         if made.degrees.leading:
             higher = replace(made.degrees, inputs=3, leading=2 if signals_of(data) == (1, 1) else 1)
             yield replace(attempt, model_class=replace(made, lags=made.lags - 1, degrees=higher))
+    if isinstance(part := getattr(made, "structure", None), FilterMapFilter):
+        for phases, intervals in ((1, 24), (2, 24), (3, 48)):
+            finer = replace(part, phases=phases, intervals=intervals)
+            yield replace(attempt, model_class=Network(finer))
     if isinstance(method := attempt.method, Rse | Sem):
-        for iterations in (1, MORE_STEPS):
-            yield replace(attempt, method=replace(method, iterations=iterations))
+        yield replace(attempt, method=replace(method, iterations=1))
 
 
-def memories(_data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
-    """The best with a shorter memory."""
+def memories(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
+    """The best with a shorter memory than it has."""
     best = least(rows)
     if best is not None and best.attempt.method != LeastSquares():  # which knows no limit
         for memory in MEMORIES:
-            yield replace(best.attempt, memory=memory)
+            if best.rate > rate_of_memory(data, memory):
+                yield replace(best.attempt, memory=memory)
 
 
 def _lags(row: Row) -> int:
@@ -171,7 +180,9 @@ def signals_of(data: Dataset) -> tuple[int, int]:
 
 
 def excited(data: Dataset, lags: int, degree: int) -> tuple[int, ...] | None:
-    """All delays (None) where the inputs excite their products, else one."""
+    """All delays (None) of one input, where it excites their products; else one delay."""
+    if signals_of(data)[1] > 1:
+        return (1,)
     try:
         build_state_affine_rows(data, Polynomial(lags, degrees=Degrees(inputs=degree)))
     except DataError:
@@ -180,7 +191,7 @@ def excited(data: Dataset, lags: int, degree: int) -> tuple[int, ...] | None:
 
 
 Stages = Sequence[tuple[Stage, int]]  # with how many of each are judged
-LINEAR: Stages = ((linear, 4),)
+LINEAR: Stages = ((linear, EVERY), (iterated, 3))
 BEYOND: Stages = (
     (curved, 2),
     (networks, 1),

@@ -2,19 +2,21 @@
 
 The trials are put into folds; trials that repeat one excitation stay together, and where all have
 one excitation, stretches of time are held out instead. Each fold is simulated by models of the
-others, every stretch from a start that is found on its first samples, which are not scored. Taken
-is the simplest model that is within one standard error of the best.
+others, every stretch from a start that is found on its first samples, which are not scored. A class
+with curvature that the data do not determine may do well there and nowhere else: so it counts, too,
+how far the folds' models are apart over the recorded inputs played at twice their speed, where
+nothing was measured. Taken is the simplest model that is within one standard error of the best.
 
 What a person may expect is promised by the same errors: for each fold the model is chosen by the
 other folds alone, of what was tried, and its error on that fold counts. Which attempts were tried
-closely enough to be chosen is not held out: a glance at one fold, and the best so far, decide that.
+closely enough to be chosen is not held out: the first fold, and the best so far, decide that.
 Source: Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Section
 3.4.3 (the rule of one standard error).
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t as student
@@ -24,10 +26,11 @@ from nlsid_core.data.repeats import by_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.families import ModelClass, describe
+from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.identify import identify
 from nlsid_core.identification.methods.options import Method, Rse
 from nlsid_core.identification.polynomial.options import Polynomial
-from nlsid_core.identification.prediction import Model, simulate_started
+from nlsid_core.identification.prediction import Model, simulate_started, simulate_trial
 from nlsid_core.identification.rates import rate_of_memory
 
 FOLDS = 3
@@ -38,6 +41,7 @@ PLACES = (0.0, 0.15, 0.3, 0.45)  # of a trial, where it is tried how many are ne
 START_LAGS, START_STEPS, START_CLOSE = 4, 6, 1.04  # by a linear model, and its squared error
 SHORTEST = 20  # samples of a stretch
 SAMPLES = 8000  # that a fold is fitted to, at most
+FASTER = 2  # times the recorded speed, at which the models of the folds are compared
 CLOSE = 1.05  # times the best error: what is worse is not "as good", however few folds there are
 SURE = 0.9  # probability of the promised interval, were squared errors normal
 
@@ -61,19 +65,39 @@ class Attempt:
 class Row:
     """What became of an attempt: mean squared errors of the stretches, in squared spreads.
 
-    errors: of each stretch, NaN where there is none. size: numbers in the model's file. refusal:
-    why an error is missing.
+    errors: of each stretch, NaN where there is none yet. fits: of the folds that are judged.
+    refusal: why the others are not. apart: by how much the folds' models differ at twice the
+    recorded speed, in the same unit: what the data leave open.
     """
 
     attempt: Attempt
     errors: FloatArray
-    size: int = 0
+    fits: tuple[Fit[Model], ...] = ()
     refusal: str = ""
+    apart: float = 0.0
 
     @property
     def percent(self) -> float:
-        """The error over all stretches in % of the outputs' spread; infinite without one."""
-        return 100.0 * math.sqrt(self.errors.mean()) if not self.refusal else math.inf
+        """What is compared, in % of the outputs' spread: the root of error and `apart` together.
+
+        Of the folds that are judged; infinite where there is a refusal.
+        """
+        return 100.0 * math.sqrt(np.nanmean(self.judged)) if not self.refusal else math.inf
+
+    @property
+    def judged(self) -> FloatArray:
+        """By what attempts are compared: errors, and what the data leave open."""
+        return self.errors + self.apart
+
+    @property
+    def size(self) -> int:
+        """Numbers in a model's file, at most."""
+        return max(_numbers(fit.model.document()) for fit in self.fits)
+
+    @property
+    def rate(self) -> float:
+        """Of the slowest proof."""
+        return max(fit.proof.rate for fit in self.fits)
 
 
 @dataclass(frozen=True)
@@ -119,9 +143,12 @@ class HeldOut:
         """DataError if there is too little of it."""
         groups = by_excitation(data)
         if len(groups) == 1:
-            on, folds = "stretches of the only excitation", list(_folds_in_time(data))
-        else:
-            on, folds = "excitations", list(_folds_of(groups))
+            on = "stretches of the only excitation"
+            folds = list(_folds(_stretches(data.trajectories, STRETCHES), 1))
+        else:  # dealt out by how much the inputs vary, so that no fold has all that vary most
+            on = "excitations"
+            groups = sorted(groups, key=lambda group: float(np.var(group[0].u, axis=0).sum()))
+            folds = list(_folds(groups, FOLDS if len(groups) < FEW else 1))
         spread = np.concatenate([trial.y for trial in data]).std(axis=0)
         shortest = min(len(t) for fold in folds for group in fold.judged for t in group)
         return cls(
@@ -143,20 +170,40 @@ class HeldOut:
             error = float(np.mean(np.concatenate(squares)))
         return error if np.isfinite(error) else np.inf
 
-    def judged(self, attempt: Attempt) -> Row:
-        """The row of an attempt."""
-        errors, size = np.full(len(self.fold_of), np.nan), 0
-        for k, fold in enumerate(self.folds):
+    def apart(self, models: Sequence[Model]) -> float:
+        """The mean square of the models' distance from their mean, at twice the recorded speed."""
+        runs = []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for fold in self.folds:
+                for trial, *_ in fold.judged:
+                    half = trial.t[: len(trial.t[::FASTER])]
+                    faster = replace(trial, t=half, y=trial.y[::FASTER], u=trial.u[::FASTER])
+                    outputs = np.array([simulate_trial(model, faster) for model in models])
+                    runs.append((outputs - outputs.mean(axis=0)) / self.spread)
+            found = float(np.mean(np.square(np.concatenate(runs, axis=1))))
+        return found if np.isfinite(found) else np.inf
+
+    def glance(self, attempt: Attempt) -> Row:
+        """The row of an attempt, judged on the first fold."""
+        return self._judged(Row(attempt, np.full(len(self.fold_of), np.nan)), 1)
+
+    def judged(self, row: Row) -> Row:
+        """The row with the errors on all folds."""
+        return self._judged(row, len(self.folds))
+
+    def _judged(self, row: Row, count: int) -> Row:
+        """On so many folds; those that are judged already are not again."""
+        errors, fits = row.errors.copy(), list(row.fits)
+        for k in range(len(fits), count):
             try:
-                model = fitted(fold.fitted, attempt, self.data)
+                fits.append(fitted(self.folds[k].fitted, row.attempt, self.data))
             except (DataError, SolverError) as refusal:
-                return Row(attempt, errors, size, str(refusal))
-            here = self.fold_of == k
-            errors[here] = [self.error(model, stretch) for stretch in fold.judged]
-            size = max(size, _numbers(model.document()))
-            if not np.isfinite(errors[here]).all():
-                return Row(attempt, errors, size, "its simulation diverges")
-        return Row(attempt, errors, size)
+                return replace(row, refusal=str(refusal))
+            model = fits[-1].model
+            errors[self.fold_of == k] = [self.error(model, s) for s in self.folds[k].judged]
+        apart = self.apart([fit.model for fit in fits]) if count > 1 else 0.0
+        diverges = "its simulation diverges" if np.isinf(errors).any() else ""
+        return Row(row.attempt, errors, tuple(fits), diverges, apart)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +212,11 @@ class Choice:
 
     held_out: HeldOut
     rows: tuple[Row, ...]
+
+    @property
+    def found(self) -> bool:
+        """Whether anything that was tried has proved models."""
+        return any(not row.refusal for row in self.rows)
 
     @property
     def best(self) -> Row:
@@ -204,29 +256,28 @@ def simplest(rows: Sequence[Row], by: FloatArray) -> Row:
 
     The error is that of the difference, stretch by stretch. Of equally small ones the best.
     """
-    means = [float(np.mean(row.errors[by])) for row in rows]
+    means = [float(np.mean(row.judged[by])) for row in rows]
     best = rows[int(np.argmin(means))]
 
     def is_as_good(row: Row) -> bool:
-        worse = (row.errors - best.errors)[by]
+        worse = (row.judged - best.judged)[by]
         error = float(worse.std(ddof=1)) / math.sqrt(len(worse))
-        limit = (CLOSE**2 - 1.0) * float(np.mean(best.errors[by]))
+        limit = (CLOSE**2 - 1.0) * float(np.mean(best.judged[by]))
         return float(worse.mean()) <= min(error, limit)
 
     good = [(row.size, mean, i) for i, (row, mean) in enumerate(zip(rows, means, strict=True))]
     return rows[min(entry for entry in good if is_as_good(rows[entry[2]]))[2]]
 
 
-def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Model:
+def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Fit[Model]:
     """The attempt's proved model of a part of the data. Raises as `identify`."""
-    model: Model = identify(
+    return identify(
         train,
         attempt.model_class,
         method=attempt.method,
         comparators=(),
         max_rate=rate_of_memory(whole, attempt.memory),
-    ).model
-    return model
+    )
 
 
 def _start(data: Dataset, shortest: int) -> int:
@@ -237,7 +288,7 @@ def _start(data: Dataset, shortest: int) -> int:
     rows = [min(samples, shortest // 5) for samples in STARTS]
     attempt = Attempt(Polynomial(START_LAGS), Rse(START_STEPS))
     try:
-        model = fitted(shortened(data.trajectories), attempt, data)
+        model = fitted(shortened(data.trajectories), attempt, data).model
     except (DataError, SolverError):
         return rows[0]
     errors = []
@@ -252,56 +303,29 @@ def _start(data: Dataset, shortest: int) -> int:
     return next(n for n, e in zip(rows, errors, strict=True) if e <= START_CLOSE * min(errors))
 
 
-def _folds_of(groups: Sequence[Sequence[Trajectory]]) -> Iterator[Fold]:
-    """Every third excitation is judged, whole, or in stretches where there are few."""
+def _folds(groups: Sequence[Sequence[Trajectory]], parts: int) -> Iterator[Fold]:
+    """Every third group is judged, in so many stretches."""
     count = min(FOLDS, len(groups))
     for k in range(count):
         rest = [trial for i, group in enumerate(groups) if i % count != k for trial in group]
-        judged = [list(group) for i, group in enumerate(groups) if i % count == k]
-        if len(groups) < FEW:
-            judged = [part for group in judged for part in _stretches(group, FOLDS)]
-        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
-
-
-def _folds_in_time(data: Dataset) -> Iterator[Fold]:
-    """Every third of the stretches of each trial is judged, what is left between them is fitted."""
-    for k in range(FOLDS):
-        rest = []
-        for trial in data:
-            ends = _ends(trial, STRETCHES)
-            kept = [i for i in range(STRETCHES) if i % FOLDS != k]
-            runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
-            rest += [_part(trial, ends[run[0]], ends[run[-1] + 1]) for run in runs]
-        judged = _stretches(data.trajectories, STRETCHES)[k::FOLDS]
-        yield Fold(shortened(rest), tuple(tuple(_cut(part)) for part in judged))
+        judged = (part for group in groups[k::count] for part in _stretches(group, parts))
+        short = (tuple(t.rows(slice(SAMPLES // FOLDS)) for t in part) for part in judged)
+        yield Fold(shortened(rest), tuple(short))
 
 
 def _stretches(trials: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
     """The trials cut into so many stretches each, the first ones of all, the second ones, …."""
-    parts = []
-    for i in range(count):
-        ends = [(trial, _ends(trial, count)) for trial in trials]
-        parts.append([_part(trial, end[i], end[i + 1]) for trial, end in ends])
+    parts: list[list[Trajectory]] = [[] for _ in range(count)]
+    for trial in trials:
+        if count > 1 and len(trial) < count * SHORTEST:
+            raise DataError(
+                f"{trial.name}: {len(trial)} samples are too few to hold a part of them out; at "
+                f"least {count * SHORTEST} are needed"
+            )
+        ends = np.linspace(0, len(trial), count + 1).round().astype(int).tolist()
+        for part, first, end in zip(parts, ends, ends[1:], strict=False):
+            part.append(trial.rows(slice(first, end), f"{trial.name}[{first}:{end}]"))
     return parts
-
-
-def _ends(trial: Trajectory, count: int) -> list[int]:
-    if len(trial) < count * SHORTEST:
-        raise DataError(
-            f"{trial.name}: {len(trial)} samples are too few to hold a part of them out; at least "
-            f"{count * SHORTEST} are needed"
-        )
-    ends: list[int] = np.linspace(0, len(trial), count + 1).round().astype(int).tolist()
-    return ends
-
-
-def _part(trial: Trajectory, first: int, end: int) -> Trajectory:
-    return trial.rows(slice(first, end), f"{trial.name}[{first}:{end}]")
-
-
-def _cut(trials: Sequence[Trajectory]) -> list[Trajectory]:
-    """The first samples of each."""
-    return [trial.rows(slice(SAMPLES // FOLDS)) for trial in trials]
 
 
 def shortened(trials: Sequence[Trajectory], samples: int = SAMPLES) -> Dataset:

@@ -21,14 +21,12 @@ from nlsid_core.models import (
     StableModel,
     StateAffineModel,
 )
+from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.starts import nearest_start
 
 Model = StableModel
 # [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
 Step = Callable[[list[FloatArray], slice], FloatArray]
-
-BISECTIONS = 80  # at most: from any bracket to rounding
-ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it is found
 
 
 def history(model: Model) -> int:
@@ -153,13 +151,15 @@ def _explicit(
 
 
 def _monotone_step(model: MonotoneEquation, trial: Trajectory) -> Step:
-    forcing = model.forcing(trial.u)
+    forcing, e = model.forcing(trial.u), tuple(model.e.tolist())
 
     def step(past: list[FloatArray], rows: slice) -> FloatArray:
         target = forcing[rows] + sum(
             a * (y[:, 0] - model.y_offset) for a, y in zip(model.a, past, strict=True)
         )
-        return solve_increasing_at(model.e, target)[:, None] + model.y_offset
+        pairs = zip(target.tolist(), past[0][:, 0].tolist(), strict=True)
+        found = [solve_increasing(e, value, guess - model.y_offset) for value, guess in pairs]
+        return np.array(found)[:, None] + model.y_offset
 
     return step
 
@@ -171,20 +171,3 @@ def _implicit_step(model: ImplicitModel, trial: Trajectory) -> Step:
         return model.step(np.concatenate(past, axis=1), w[rows])[:, : model.unknowns]
 
     return step
-
-
-def solve_increasing_at(e: FloatArray, targets: FloatArray) -> FloatArray:
-    """The v (T,) with e₁v + e₂v² + e₃v³ = targets, e increasing: Newton's method in a bracket."""
-    first, second, third = e.tolist()
-    least = first - second**2 / (3.0 * third) if third else first  # e' is nowhere smaller
-    high = np.abs(targets) / least * (1.0 + ROUNDING)
-    low, v = -high, targets / max(first, least)
-    for _ in range(BISECTIONS):
-        residual = ((third * v + second) * v + first) * v - targets
-        high, low = np.where(residual > 0, v, high), np.where(residual < 0, v, low)
-        moved = v - residual / ((3.0 * third * v + 2.0 * second) * v + first)
-        moved = np.where((low <= moved) & (moved <= high), moved, 0.5 * (low + high))
-        step, v = np.abs(moved - v), moved
-        if (step <= ROUNDING * np.abs(v)).all():
-            break
-    return np.asarray(v)

@@ -23,9 +23,8 @@ from nlsid_core.identification import (
     predict,
     validate,
 )
-from nlsid_core.identification.prediction import simulate_trial, solve_increasing_at
+from nlsid_core.identification.prediction import simulate_trial
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
-from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.proofs import check
 from tests import repeated
 from tests.conftest import synthetic_dataset
@@ -206,14 +205,6 @@ def test_a_range_that_refuses_its_own_training_data_is_refused(train: Dataset) -
 
 
 # -- predictions of every model ----------------------------------------------------------------
-
-
-def test_many_increasing_cubics_are_inverted_at_once() -> None:
-    targets = np.concatenate([np.linspace(-50, 50, 41), [0.0, 1e-12, 1e6]])
-    for e in ((1.0, 0.0, 0.0), (3.0, 1.0, 1.0), (0.1, 0.0, 5.0), (1.0, -1.7, 1.0)):
-        found = solve_increasing_at(np.array(e), targets)
-        one_by_one = [solve_increasing(e, target, 0.0) for target in targets.tolist()]
-        np.testing.assert_allclose(found, one_by_one, rtol=1e-12, atol=1e-15)
 
 
 def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[MonotoneEquation]) -> None:

@@ -21,7 +21,7 @@ from nlsid_core.identification import (
     Sem,
     identify,
 )
-from nlsid_core.identification.choosing import HeldOut, simplest
+from nlsid_core.identification.choosing import HeldOut, fitted, simplest
 from nlsid_core.identification.prediction import simulate_started, simulate_trial
 from nlsid_core.running.stepping import Stepper
 
@@ -42,7 +42,7 @@ def clean(u: FloatArray) -> FloatArray:
 
 def judged(data: Dataset, attempts: list[Attempt]) -> Choice:
     held_out = HeldOut.of(data)
-    return Choice(held_out, tuple(map(held_out.judged, attempts)))
+    return Choice(held_out, tuple(held_out.judged(held_out.glance(one)) for one in attempts))
 
 
 LAGS = [Attempt(Polynomial(lags), LeastSquares()) for lags in (1, 2, 6)]
@@ -69,8 +69,11 @@ def test_the_simplest_that_is_as_good_as_the_best_is_taken(
     worse: tuple[float, ...], taken: str
 ) -> None:
     best = np.array([1.0, 2.0, 1.5, 3.0, 1.0, 2.0])
-    large = Row(LAGS[2], best, size=50)
-    small = Row(LAGS[0], best * worse, size=5)
+    data = Dataset((trial(0, samples=1200),))
+    large, small = (
+        Row(one, errors, (fitted(data, one, data),))
+        for one, errors in ((LAGS[2], best), (LAGS[0], best * worse))
+    )
     found = simplest([large, small], np.ones(6, dtype=bool))
     assert found is {"small": small, "large": large}[taken]
 
@@ -87,6 +90,14 @@ def test_repeats_of_an_excitation_stay_together_and_others_make_the_promise() ->
         assert not held & set(fold.fitted.names)
     mixed = identify(Dataset(tuple(runs[::2])), Polynomial(2), comparators=())
     assert choice.promise.percent > 1.5 * mixed.chosen.error_percent(Dataset(tuple(runs[1::2])))
+
+
+def test_no_fold_has_all_excitations_that_vary_most() -> None:
+    """Recordings that come in turn, such as a start from rest and two drives, would be one fold."""
+    held_out = HeldOut.of(Dataset(tuple(trial(k, size=0.1 if k % 3 else 1.0) for k in range(9))))
+    for fold in held_out.folds:
+        names = [group[0].name.split("[")[0] for group in fold.judged]
+        assert sum(name.endswith(" 1") for name in names) == 1
 
 
 def test_what_is_promised_holds_on_new_excitations() -> None:

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_831,
+    ("nlsid_core",): 18_828,
     ("bags",): 12_001,
     ("nlsid_ros",): 2_676,
-    ("tests",): 23_293,
+    ("tests",): 23_291,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
