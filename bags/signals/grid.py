@@ -89,8 +89,12 @@ def to_trajectories(
         _refuse_repeated_stamps(samples, name)
     signals = [Expression.parse(samples.path) for samples in responses]
     where = f"{name}: {responses[0].path}"
-    on_grid = signals[0].operation("hold", "linear") is not None
-    period_ns = _period_ns(responses[0].stamp_ns, grid.period, where, on_grid=on_grid)
+    period_ns = _period_ns(
+        responses[0].stamp_ns,
+        grid.period,
+        where,
+        on_grid=signals[0].operation("hold", "linear") is not None,
+    )
     gap_ns = round(BRIDGED * period_ns if grid.max_gap is None else grid.max_gap * 1e9)
     rules = [[Expression.parse(samples.path) for samples in part] for part in parts]
     held = [product(str(r.sampled("hold", window=gap_ns / 1e9)) for r in part) for part in rules]

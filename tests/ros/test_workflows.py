@@ -62,7 +62,7 @@ def margins(bench: Bench) -> dict[int, dict[str, float]]:
 @contextmanager
 def live(workflow: str, *arguments: str) -> Iterator[None]:
     """`nlsid run`, interrupted at the end and then expected to have ended well."""
-    command = [sys.executable, "-m", "bags.commands.cli", "run", workflow, *arguments]
+    command = [sys.executable, "-m", "bags.commands.main", "run", workflow, *arguments]
     running = subprocess.Popen(command, cwd=ROOT)
     try:
         yield
@@ -93,7 +93,7 @@ def test_nodes_end_with_the_command_that_started_them(
 ) -> None:
     model = funnel.with_name(documents.MODEL)
     arguments = [f"funnel:={funnel}", f"model:={model}", "plant:=true", "highest:=0.4", *PATIENT]
-    command = [sys.executable, "-m", "bags.commands.cli", "run", "control", *arguments]
+    command = [sys.executable, "-m", "bags.commands.main", "run", "control", *arguments]
     commands: list[float] = []
 
     def hear(message: TwistStamped) -> None:
@@ -293,7 +293,7 @@ def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
 
 
 def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
-    command = [sys.executable, "-m", "bags.commands.cli", "run", "control"]
+    command = [sys.executable, "-m", "bags.commands.main", "run", "control"]
     done = subprocess.run(
         [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
         capture_output=True,
