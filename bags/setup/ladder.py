@@ -55,12 +55,12 @@ def choose(
             progress(str(attempt), number / len(stages))
             glances.append(held_out.glance(attempt))
         good = 0
-        for row in sorted(glances, key=lambda row: row.percent):
+        for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
             best = least(rows)
             limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
                 rows.append(row)
-            elif kept == EVERY or (good < kept and row.percent <= limit):
+            elif kept == EVERY or (place <= kept and good < kept and row.percent <= limit):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
                 rows.append(held_out.judged(row))
                 good += rows[-1].percent <= limit
