@@ -266,7 +266,7 @@ def first_verdict(rate: int) -> float:
             while time.monotonic() < quiet:
                 executor.spin_once(timeout_sec=0.1)
             started, ear.verdict, sent = time.monotonic(), False, 0
-            with python("bags.commands.cli", "run", "monitor", folder):
+            with python("bags.commands.main", "run", "monitor", folder):
                 while not ear.verdict:
                     executor.spin_once(timeout_sec=0.5 / rate)
                     if (k := int(time.time() * rate)) > sent:

@@ -10,7 +10,7 @@ import typer
 from bags.commands import designs_cli, learn_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
 from bags.commands.fleet_cli import fleet_app
-from bags.commands.main import main
+from bags.commands.main import main as main  # of commands that were installed before
 from bags.commands.options import flat
 
 app = typer.Typer(
@@ -56,7 +56,3 @@ def nlsid(
     ] = False,
 ) -> None:
     """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
-
-
-if __name__ == "__main__":
-    main()

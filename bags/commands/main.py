@@ -89,3 +89,7 @@ def main() -> None:
         return
     print(f"error: {said}", file=sys.stderr)
     sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
