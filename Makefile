@@ -70,7 +70,7 @@ touch $@
 endef
 
 $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
-	$(call install,report)
+	$(call install,identify$(COMMA)report)
 
 $(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)fleet$(COMMA)test)

@@ -176,7 +176,7 @@ def _take(decoded: Iterator[tuple[str, Any]], messages: int) -> int:
 
 def info(bag: Path, messages: int) -> int:
     """The whole command line, as a person runs it."""
-    command = [sys.executable, "-m", "bags.commands.cli", "bag", "info", "--json", str(bag)]
+    command = [sys.executable, "-m", "bags.commands.main", "bag", "info", "--json", str(bag)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return messages
 

@@ -219,10 +219,20 @@ class Design(Generic[D, P, F, S]):
         return Monitor(self._held_stages, centre=centre)
 
     def controller(self, limits: Limits, settling: float) -> Controller:
-        """A controller for one run; `settling`: s to wait for a state where it may start."""
+        """A controller for one run; `settling`: s to wait for a state where it may start.
+
+        Raises DataError if there is no policy, or if a proof does not cover what a robot does: hold
+        each input until the next sample.
+        """
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
-        return Controller(self._held_stages, limits, settling)
+        stage = self._held_stages[0]
+        if stage.held is not None and stage.funnel is not None and not stage.held.hold:
+            raise DataError(
+                "the proof is about a policy that acts continuously, and a robot's input is held "
+                "until the next sample: design it with a hold (hold: largest finds the longest)"
+            )
+        return Controller(stage, limits, settling)
 
     @property
     def _held_stages(self) -> list[Stage]:

@@ -166,11 +166,20 @@ class DesignSubscription:
         return ""
 
     def _look(self) -> None:
-        """Take what the kernel has decided, and have the next one decided."""
+        """Have the newest design decided, and take what the kernel has decided."""
         if self._is_crowded():
             self.close()
         if (unheard := self._unheard()) and not self.refusal.endswith(unheard):
             self._refuse(unheard)
+        if self._check is None and self._waiting is not None:
+            text, self._waiting = self._waiting, None
+            try:
+                self._check = Check(text, self._limits)
+            except OSError as error:
+                self._refuse(f"it cannot be checked: {error}")
+                return
+            self.state = CHECKING
+            self._changed()
         if self._check is not None and (answer := self._check.poll()) is not None:
             text = self._check.text
             self.close()
@@ -183,15 +192,6 @@ class DesignSubscription:
             self.state = (
                 f"{CHECKING} for {seconds:.0f} s now: it is slow where others want the processors"
             )
-        if self._check is None and self._waiting is not None:
-            text, self._waiting = self._waiting, None
-            try:
-                self._check = Check(text, self._limits)
-            except OSError as error:
-                self._refuse(f"it cannot be checked: {error}")
-                return
-            self.state = CHECKING
-            self._changed()
 
     def _accept(self, text: str, verdict: str) -> None:
         try:

@@ -204,7 +204,7 @@ class Excitation(ManagedNode):
         return self._start_ns + k * round(self._period * 1e9)
 
     def _to_rest(self) -> None:
-        if base_stopped(self._sent, self._period):
+        if base_stopped(time.monotonic() - self._sent, self._period):
             self._input = self._shape.rest
         step = self._shape.slew * self._period
         self._input += min(max(self._shape.rest - self._input, -step), step)

@@ -26,9 +26,8 @@ from std_msgs.msg import Bool, String
 from bags.monitoring.announcement import UNANNOUNCED, Run
 from bags.monitoring.announcement import WAITING as RUN_WAITING
 from bags.monitoring.watch import WAITING, Stamped, Watch
-from bags.signals.arrivals import Sequence
-from bags.signals.grid import seconds
 from bags.signals.sampling import said_filled
+from bags.signals.timing import Sequence, seconds
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.designs import AnyDesign
@@ -153,7 +152,7 @@ class FunnelMonitor(ManagedNode):
         self._help = Help(self, (self.values.stop_service, self.values.snapshot_service))
         self.serve("restart", self._on_restart)
 
-        self._patience = self.get_clock() if self._simulated else self.steady
+        self._patience = self.data_clock
         self._stale = self.later(self._on_stale, self._patience)
         self._release = self.later(self._on_release, self._patience)
         self.every(LOOK, self._look)
@@ -190,6 +189,7 @@ class FunnelMonitor(ManagedNode):
         if self.values.forecast and not watch.monitor.goes_on:
             self.get_logger().warning("no forecasts: they are of tubes around a simulation")
         self._begin()
+        self._look()
 
     def _forget(self) -> None:
         """Whatever the next messages are compared with."""

@@ -1,8 +1,8 @@
 """Node `funnel_publisher`: checks a funnel's proof, then publishes the design, latched.
 
 Publishes ~/design (std_msgs/String, transient local): the files of model, policy, funnel and proof
-as one bundle, which whoever uses it has decided again. Publishes again when the files change.
-Refuses what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
+as one bundle, which whoever uses it has decided again; another one when the parameter `funnel` is
+set. Refuses what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
 from pathlib import Path
@@ -12,15 +12,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from bags.designs import documents
-from bags.designs.bundle import Bundle, Check
-from nlsid_core.errors import CertificateRejected, DataError, NlsidError
+from bags.designs.bundle import Bundle
+from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.documents import CHECK, limits_of
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
-
-LOOK = 0.2  # s between looks at the files, and at a check that is on
 
 
 class FunnelPublisher(ManagedNode):
@@ -41,15 +38,12 @@ class FunnelPublisher(ManagedNode):
     def read_parameters(self) -> None:
         """Begin with nothing published."""
         self._latched: Publisher | None = None
-        self._check: Check | None = None
 
     def tune(self, values: SimpleNamespace) -> None:
         """Publish another funnel, if it is proved."""
         path = Path(values.funnel)
         if self._latched is not None:
             self._publish(*self._load(path))
-            self._call_off()
-            self._seen = self._files(path)
         self._path = path
 
     def prepare(self) -> None:
@@ -61,53 +55,11 @@ class FunnelPublisher(ManagedNode):
         """Check, publish latched, and say what was proved."""
         self.keep_reporting(self._report)
         self._latched = self.create_publisher(String, "~/design", qos.DOCUMENT)
-        self._seen = self._files(self._path)
         self._publish(*self._load(self._path))
-        self.every(LOOK, self._look)
 
     def stop(self) -> None:
         """Publish no more."""
-        self._call_off()
         self._latched = None
-
-    def _files(self, path: Path) -> list[tuple[int, int]]:
-        """When each file last changed, and its size."""
-        names = (
-            documents.MODEL,
-            documents.VECTOR_FIELD,
-            documents.POLICY,
-            documents.FUNNEL_PROOF,
-            path.name,
-        )
-        found = [*map(path.with_name, names), *sorted(path.parent.glob("stage*.json"))]
-        states = (each.stat() for each in found if each.exists())
-        return [(state.st_mtime_ns, state.st_size) for state in states]
-
-    def _look(self) -> None:
-        """Have the files decided if they changed, in a process of its own; what was published stays
-        until they are.
-        """
-        files = self._files(self._path)
-        try:
-            if files != self._seen:
-                self._seen = files
-                self._call_off()
-                self._changed = Bundle.load(self._path)
-                self._check = Check(self._changed.text(), limits_of(self.values))
-            answer = self._check.poll() if self._check is not None else None
-            if answer is None:
-                return
-            self._call_off()
-            if "refused" in answer:
-                raise CertificateRejected(str(answer["refused"]))
-            self._publish(self._changed, str(answer["proved"]))
-        except (NlsidError, OSError) as refusal:
-            self._reject(refusal)
-
-    def _call_off(self) -> None:
-        if self._check is not None:
-            self._check.close()
-            self._check = None
 
     def _load(self, path: Path) -> tuple[Bundle, str]:
         """What to publish, and what is proved of it."""

@@ -205,11 +205,11 @@ def patience(stale_after: float, period: float) -> float:
     return stale_after or max(LEAST_PATIENCE, PATIENT_PERIODS * period)
 
 
-def base_stopped(sent: float, period: float) -> bool:
-    """Whether a base has stopped by itself, as no command of a period (s) went out since `sent`
-    (s, monotonic): what moved it before would set it in motion again.
+def base_stopped(silent: float, period: float) -> bool:
+    """Whether a base has stopped by itself, as no command of a period (s) went out for `silent` s:
+    what moved it before would set it in motion again.
     """
-    return time.monotonic() - sent > max(BASE_PATIENCE, PATIENT_PERIODS * period)
+    return silent > max(BASE_PATIENCE, PATIENT_PERIODS * period)
 
 
 def off_clock(stamp_ns: int, clock: Clock, most: float, what: str = "a response") -> str:

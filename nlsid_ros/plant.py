@@ -14,14 +14,14 @@ import numpy as np
 
 from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
-from bags.designs.documents import load_model
 from bags.signals.expressions import Expression
-from bags.signals.grid import seconds
 from bags.signals.message_reader import SignalVector
+from bags.signals.timing import seconds
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray
-from nlsid_core.dynamics import VectorField
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.dynamics import VectorField, vector_field
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.models import DifferenceEquation
 from nlsid_core.running.plants import FieldPlant, ModelPlant, Plant
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
@@ -29,9 +29,9 @@ from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
 MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
-KINDS = ("model", "vector_field", *MUJOCO)
+KINDS = ("model", *MUJOCO)
 JUMP = 1.0  # s that the clock may be ahead or behind
-FOR = "for kinds model and vector_field"
+FOR = "for kind model"
 PATHS = "of a vector field: topic:field paths separated by commas, all on one topic"
 
 
@@ -41,7 +41,7 @@ class PlantNode(ManagedNode):
     name = "plant"
     parameters = (
         Parameter("kind", "model", f"what is simulated: {', '.join(KINDS)}"),
-        Parameter("model", "", "model.json, for kind model; vector_field.json, for vector_field"),
+        Parameter("model", "", "model.json or vector_field.json, for kind model"),
         Parameter(
             "state",
             "",
@@ -77,8 +77,6 @@ class PlantNode(ManagedNode):
         match values.kind:
             case "model":
                 signals = self._make_model()
-            case "vector_field":
-                signals = self._make_field()
             case kind if kind in MUJOCO:
                 signals, types = self._make_robot(MUJOCO[kind]), [JOINTS, JOINTS]
             case kind:
@@ -89,22 +87,25 @@ class PlantNode(ManagedNode):
         self._command = SignalMessage(command, types[1])
 
     def _make_model(self) -> tuple[list[str], list[str]]:
-        """Simulate the model of a design; the paths of its response and its command."""
+        """Simulate the model of a design, or its equations; the paths of response and command."""
         if not self.values.model:
             raise DataError("no model to simulate; set the parameter model")
-        model = load_model(Path(self.values.model))
+        document = files.load_document(Path(self.values.model))
+        if document.get("format") == vector_field.FORMAT:
+            return self._make_field(document)
+        model = DifferenceEquation.from_document(document, source=self.values.model)
         self._plant: Plant = ModelPlant(model)
         y, u = (Expression.parse(signal.path).path for signal in (model.y, model.u))
         return [str(y)], [str(u)]
 
-    def _make_field(self) -> tuple[list[str], list[str]]:
+    def _make_field(self, document: Json) -> tuple[list[str], list[str]]:
         """Simulate a vector field; the paths that the parameters say."""
         values = self.values
         try:
             x = np.array([float(part) for part in values.state.split(",")])
         except ValueError as error:
             raise DataError(f"state should be numbers, is '{values.state}'") from error
-        field = VectorField.from_document(files.load_document(values.model), source=values.model)
+        field = VectorField.from_document(document, source=values.model)
         plant = FieldPlant(field, x, period=values.period, rng=self._rng)
         response, command = (
             [path.strip() for path in paths.split(",")]

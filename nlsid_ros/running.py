@@ -195,6 +195,11 @@ class ManagedNode(LifecycleNode):
         self._diagnostics.publish(message)
         return message
 
+    @property
+    def data_clock(self) -> Clock:
+        """The clock that patience counts on: simulated time, or one that nobody sets."""
+        return self.get_clock() if self.get_parameter("use_sim_time").value else self.steady
+
     def signal_topic(self, topic: str) -> str:
         """Where a signal that a bag or a model calls `topic` is: in the node's namespace.
 

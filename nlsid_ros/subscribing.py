@@ -16,7 +16,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import header_frames, header_stamp_ns
 from bags.recordings.quality import Profile, profile_of
-from bags.signals.arrivals import Sequence
+from bags.signals.timing import Sequence
 from nlsid_core.errors import NlsidError
 from nlsid_ros import graph, qos
 from nlsid_ros.message_classes import installed_types, message_class

@@ -3,6 +3,9 @@
 Of a difference equation sample k's input is known one period ahead; it is published when it comes
 into force, stamped a quarter of a period before its sample is due, so that a sample off the grid by
 that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
+Of equations that are proved with a hold samples may come at any time within it: each is answered at
+once, and the run ends when the input in force, on this node's clock, answers an older state than is
+proved. Without a hold nothing is proved of what a robot does, and nothing moves.
 `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
 digest, and then that it has ended. Stale or impossible state, `~/stop`, a required monitor that
 does not judge this run against this funnel, and the end of the plan ramp the input to `stop_at`.
@@ -28,8 +31,7 @@ from bags.designs.documents import load_unproved
 from bags.designs.wiring import read_at, written_at
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from bags.recordings.message_types import header_stamp_ns
-from bags.signals.arrivals import Sequence
-from bags.signals.grid import seconds
+from bags.signals.timing import Sequence, seconds
 from nlsid_core import files
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -184,8 +186,14 @@ class TrackingController(ManagedNode):
         """s without a response."""
         return patience(self.values.stale_after, self._design.period if self._design else 0.0)
 
+    @property
+    def _now(self) -> float:
+        """S on the clock of the data, on which silence counts."""
+        return self._patience.now().nanoseconds * 1e-9
+
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
+        self._patience = self.data_clock
         self._design: AnyDesign | None = None
         self._controller = None
         self._stopping = self._text = ""
@@ -194,7 +202,9 @@ class TrackingController(ManagedNode):
         self._run: Run | None = None  # as it was announced
         self._last_ns = 0  # the stamp of the last response under the policy's own input
         self._stamped_ns = 0  # the newest stamp of a response or command
-        self._sent = -math.inf  # when the last command went out, s of the wall's time
+        self._answered_ns = 0  # the stamp of the state that the input in force answers
+        self._oldest_ns = 0  # how old that was at most in the last second
+        self._sent = -math.inf  # when the last command went out, s of `_now`
         self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
         self._ramp = self._limits
 
@@ -216,6 +226,7 @@ class TrackingController(ManagedNode):
             )
         self._next = self.later(self._on_due, self.get_clock())
         self._step = self.later(self._on_step)
+        self._expiry = self.later(self._look_at_age, self.get_clock())
         self.every(LOOK, self._look)
 
     def stop(self) -> None:
@@ -252,6 +263,7 @@ class TrackingController(ManagedNode):
         elif (response, command) != (read_at(self._design), written_at(self._design)):
             raise DataError("it is about other signals; deactivate and activate again")
         self._design, self._digest = design, digest
+        self._hold_ns = round(design.held.hold * 1e9) if design.held else 0
         self._say_run(Run(0, digest, ended="the controller has another design, or began anew"))
         self._run = None
         self._tell("idle")
@@ -279,7 +291,7 @@ class TrackingController(ManagedNode):
             judging = f"{count} nodes publish" if count else "nobody publishes"
             return f"require_monitor is set and {judging} {self._margin.topic_name}"
         self._controller = controller
-        self._first_ns, self._run, self._stage = None, None, 1
+        self._first_ns, self._run = None, None
         self._stamped_ns, self._hears, self._accompanied = 0, False, not watched
         self._responses.silence, self._responses.numbers = Silence(), Sequence()
         self._responses.frame = self.values.response_frame or None
@@ -292,7 +304,7 @@ class TrackingController(ManagedNode):
         if controller is None:
             return
         assert design is not None
-        self._heard = time.monotonic()
+        self._heard = self._now
         if not self._hears:
             self._hears, self._judged, self._sent = True, self._heard, self._heard
         self._responses.silence.end(1)
@@ -327,9 +339,7 @@ class TrackingController(ManagedNode):
             if waiting and controller.k >= 1:
                 self._judged = self._heard
                 self._say_run(Run(stamp_ns, self._digest))
-                self._tell(self._tracking(controller))
-            elif controller.stage != self._stage:
-                self._tell(self._tracking(controller))
+                self._tell("tracking")
             u = controller.u
         self._due.append((stamp_ns + round(controller.lead * 1e9), u))
         self._on_due()
@@ -337,12 +347,6 @@ class TrackingController(ManagedNode):
     def _say_run(self, run: Run) -> None:
         self._run = run
         self._announce.publish(String(data=files.encode(run.document()).decode()))
-
-    def _tracking(self, controller: Controller) -> str:
-        """What is being done, and of a composition in which stage."""
-        self._stage = controller.stage
-        many = controller.stages > 1
-        return f"tracking, stage {self._stage} of {controller.stages}" if many else "tracking"
 
     def _on_due(self) -> None:
         """Publish every input that is due, and wait for the next; none that is long overdue.
@@ -360,9 +364,28 @@ class TrackingController(ManagedNode):
             if ahead < -most_ns:
                 self._halt(f"a command is {-ahead * 1e-9:.3g} s late")
                 return
+            self._look_at_age()  # of the input until now
+            if self._controller is None:
+                return
             self._due.popleft()
-            self._input = u
+            self._input, self._answered_ns = u, stamp_ns
             self._send(stamp_ns)
+            self._look_at_age()
+
+    def _look_at_age(self) -> None:
+        """End the run if the input in force answers an older state than is proved; else look again
+        when it will.
+        """
+        self._expiry.cancel()
+        if not self._hold_ns or self._run is None or self._answered_ns < self._run.start_ns:
+            return
+        age_ns = self.get_clock().now().nanoseconds - self._answered_ns
+        self._oldest_ns = max(self._oldest_ns, age_ns)
+        if age_ns > self._hold_ns:
+            proved = f"proved for {self._hold_ns * 1e-9:g} s"
+            self._halt(f"the input answers a state that is {age_ns * 1e-9:.3g} s old; {proved}")
+            return
+        arm(self._expiry, self._hold_ns - age_ns + 1)
 
     def _on_margin(self, message: JointState) -> None:
         """The required monitor has judged a sample; one not of this run and of now is none.
@@ -386,7 +409,7 @@ class TrackingController(ManagedNode):
             self._halt(f"{monitor} judges no run: set its controller and nominal:=profile")
             return
         if self._run is None and of_run == WAITING:
-            self._accompanied, self._judged = True, time.monotonic()
+            self._accompanied, self._judged = True, self._now
         if self._run is None or message.header.frame_id != self._run.name:
             return
         numbers = dict(zip(message.name, message.position, strict=False))
@@ -396,17 +419,17 @@ class TrackingController(ManagedNode):
         elif assumption > 1.0:
             self._halt(f"assumption violated: {monitor} says {assumption:.3g} of it is used")
         elif 0.0 <= margin <= 1.0:
-            self._judged = time.monotonic()
+            self._judged = self._now
 
     def _look(self) -> None:
-        """Watch on the wall's clock that responses come, commands go and the monitor judges."""
+        """Watch that responses come, commands go and the monitor judges."""
         if self._controller is None:
             return
         assert self._design is not None
         self._responses.look(self.values.response_type)
         if not self._hears:
             return
-        now = time.monotonic()
+        now = self._now
         unsent = 2.0 * (self._patient_for + self._design.period)
         if now - self._heard > self._patient_for:
             self._halt("the response stopped coming")
@@ -432,7 +455,7 @@ class TrackingController(ManagedNode):
         assert self._design is not None
         self._input = (
             self._limits.stop_at
-            if base_stopped(self._sent, self._design.period)
+            if base_stopped(self._now - self._sent, self._design.period)
             else self._ramp.towards_stop(self._input, self._design.period)
         )
         # Later than the last response, which is not to be judged under it, in simulated time too.
@@ -443,7 +466,7 @@ class TrackingController(ManagedNode):
             self._stopping = ""
 
     def _send(self, stamp_ns: int) -> None:
-        self._sent, self._stamped_ns = time.monotonic(), max(self._stamped_ns, stamp_ns)
+        self._sent, self._stamped_ns = self._now, max(self._stamped_ns, stamp_ns)
         self._commands.publish(self._command.make(stamp_ns, self._input))
 
     def _halt(self, reason: str) -> None:
@@ -453,6 +476,7 @@ class TrackingController(ManagedNode):
         assert self._design is not None
         self._controller = None
         self._next.cancel()
+        self._expiry.cancel()
         self._due.clear()
         self._stopping = reason
         if self._run is not None:
@@ -497,9 +521,11 @@ class TrackingController(ManagedNode):
         values = {
             "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",
+            "oldest of the last second [ms]": f"{self._oldest_ns * 1e-6:.3f}",
             "funnel": self._funnel.digest,
             "design": self._funnel.state,
         }
+        self._oldest_ns = 0
         self.report(level, text, values)
 
     def _others_here(self) -> str:

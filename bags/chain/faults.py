@@ -7,8 +7,8 @@ from types import MappingProxyType
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns, is_stamped
 from bags.recordings.writer import BagWriter
-from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
+from bags.signals.timing import seconds
 from nlsid_core.errors import BagError
 
 Fault = Callable[[float, float], float]  # (s since the signal's first message, value) -> value

@@ -22,7 +22,7 @@ from bags.commands.options import (
 )
 from bags.commands.progress import progress_bar
 from bags.tools.copies import Into, Rows, What
-from nlsid_core.errors import BagError, DataError
+from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -127,13 +127,9 @@ def plot(
     picture: Annotated[Path, typer.Option("--out", help="A .png or .svg file.")] = PICTURE,
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
-    from bags.pictures.report import report_available
+    from bags.pictures.signal_plots import draw_signals, write_picture
     from bags.signals.reader import read_signals
     from bags.signals.sampling import Grid
-
-    if not report_available():
-        raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
-    from bags.pictures.signal_plots import draw_signals, write_picture
 
     drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
     texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
@@ -291,7 +287,9 @@ def import_command(
     ] = None,
     types: Annotated[
         list[str] | None,
-        typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState"),
+        typer.Option(
+            "--type", help="topic=type: /joints=sensor_msgs/msg/JointState. /topic:data: a Float64."
+        ),
     ] = None,
     custom: Annotated[
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")

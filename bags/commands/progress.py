@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from nlsid_core.progress import Progress
+from nlsid_core.progress import Progress, silent
 
 PATIENCE = 1.0  # s
 
@@ -16,6 +16,9 @@ def progress_bar(task: str) -> Iterator[Progress]:
 
     It is shown only to a terminal, and only of work that takes longer than PATIENCE.
     """
+    if not sys.stderr.isatty():
+        yield silent
+        return
     from rich.console import Console
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -23,7 +26,7 @@ def progress_bar(task: str) -> Iterator[Progress]:
     started = time.monotonic()
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     console = Console(stderr=True)
-    bar = Bar(*columns, console=console, transient=True, disable=not sys.stderr.isatty())
+    bar = Bar(*columns, console=console, transient=True)
     identifier = bar.add_task(task, total=1.0)
 
     def show(what: str, fraction: float) -> None:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bags.designs.wiring import sampler_of
-from bags.signals.grid import seconds
 from bags.signals.sampling import LOST, NOT_FINITE, Sample
+from bags.signals.timing import seconds
 from nlsid_core.designs import AnyDesign
 from nlsid_core.running.alarm import State, state_of
 from nlsid_core.running.comparison import Centre

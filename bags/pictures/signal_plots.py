@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bags.pictures.plots import BLUE, LINE, ORANGE, png, svg, thinned
-from bags.signals.grid import seconds
 from bags.signals.reader import Samples
+from bags.signals.timing import seconds
 from nlsid_core.errors import DataError
 from nlsid_core.files import write_atomically
 

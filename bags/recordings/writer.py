@@ -1,28 +1,58 @@
-"""Write a bag: a rosbag2 folder of one MCAP file, from messages that are already serialised."""
+"""Write a bag: a rosbag2 folder of one MCAP file, from messages that are already serialised.
 
+In the file, schemas and channels stand before the chunk whose messages need them, so that a chunk
+holds messages only and can be copied again. A chunk is written with its indexes at once, or not at
+all.
+
+Source: the MCAP specification, https://mcap.dev/spec.
+"""
+
+import errno
+import fcntl
+import os
 import shutil
+import struct
 import tempfile
+import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import Any, Final
 
+import lz4.frame
+import numpy as np
 import yaml
-from mcap.records import Channel as McapChannel
-from mcap.records import Metadata, Schema
+import zstandard
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 
 from bags.recordings.definitions import Definition, standard_definition
 from bags.recordings.folders import METADATA, NEWEST_VERSION
-from bags.recordings.mcap_records import CUSTOM_DATA
-from bags.recordings.mcap_writer import PACKING, McapWriter
-from bags.recordings.output import Output, Reserve
+from bags.recordings.mcap_file import Whole
+from bags.recordings.mcap_records import (
+    CUSTOM_DATA,
+    INDEX,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_FIXED,
+    RECORD,
+)
 from bags.recordings.quality import KEY, TYPE_HASH, Profile, offered_text
 from bags.recordings.storage import Channel
 from nlsid_core.errors import BagError
 from nlsid_core.files import write_atomically
+
+RESERVE_BYTES: Final = 8 * 2**20  # a chunk, the summary of hours, and metadata.yaml
+FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+CHUNK_BYTES: Final = 2**20
+PACKING: Final = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "none": bytes}
+_HEAD: Final = struct.Struct("<BQHIQQ")  # of a message's record, as MESSAGE
+_FOOTER: Final = struct.Struct("<BQQQ")  # what the summary's checksum has of the footer
 
 MOST_CHANNELS: Final = 2**16
 MAX_COUNT: Final = 2**32  # an MCAP file counts the messages of a topic in 32 bits
@@ -33,6 +63,88 @@ def refuse_existing(path: Path) -> None:
     """Raise a BagError if something is at `path`."""
     if path.exists():
         raise BagError(f"{path} exists already; take another name or move it away")
+
+
+class Reserve:
+    """Disk space held by a file, so that a bag can still be closed once the disk is full.
+
+    Raises OSError if there is not even that much.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.spent = ""
+        with path.open("xb") as stream:
+            try:
+                os.posix_fallocate(stream.fileno(), 0, RESERVE_BYTES)
+            except OSError as error:
+                path.unlink()
+                raise OSError(error.errno, error.strerror, str(path)) from error
+
+    def spend(self, why: str) -> None:
+        """Give the space back because of `why`."""
+        self.spent = why
+        self.release()
+
+    def release(self) -> None:
+        """Give the space back."""
+        self.path.unlink(missing_ok=True)
+
+
+class Output:
+    """A new file that other processes see locked while it is open. `size`: bytes written.
+
+    A write that fails leaves nothing of itself behind. On a full disk it spends the reserve and is
+    tried again; whoever writes should then look at `reserve.spent` and come to an end.
+    """
+
+    def __init__(self, path: Path, reserve: Reserve | None = None) -> None:
+        self.size = 0
+        self._path, self._reserve = path, reserve
+        self._stream = path.open("xb", buffering=0)
+        fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._stream.closed
+
+    def write(self, data: bytes) -> int:
+        """Append `data`; OSError if there is no room and no reserve."""
+        try:
+            self._append(data)
+        except OSError as error:
+            if self._reserve is None or self._reserve.spent or error.errno not in FULL:
+                raise
+            self._reserve.spend(str(error))
+            self._append(data)
+        return len(data)
+
+    def _append(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._stream.write(rest) :]
+        except OSError:
+            self._stream.truncate(self.size)
+            self._stream.seek(self.size)
+            raise
+        self.size += len(data)
+
+    def refuse_loss(self) -> None:
+        """OSError unless the file is still there under its name, with all that was written."""
+        ours, there = os.fstat(self._stream.fileno()), self._path.stat()
+        if not os.path.samestat(ours, there) or there.st_size != self.size:
+            raise OSError(f"{self._path} was replaced or cut by another program")
+
+    def sync(self) -> None:
+        """Wait until the bytes are on the disk; OSError as `refuse_loss`."""
+        self.refuse_loss()
+        os.fsync(self._stream.fileno())
+
+    def close(self) -> None:
+        """Close and unlock the file."""
+        self._stream.close()
 
 
 class BagWriter:
@@ -152,12 +264,14 @@ class BagWriter:
         if key not in self._schemas:
             encoding, content = channel.schema
             self._schemas[key] = len(self._schemas) + 1
-            self.mcap.declare(Schema(self._schemas[key], content, encoding, channel.msgtype))
+            self.mcap.declare(
+                records.Schema(self._schemas[key], content, encoding, channel.msgtype)
+            )
         notes = {**channel.metadata, KEY: offered_text(channel.offered)}
         numbers = chain([wanted], range(1, MOST_CHANNELS))
         number = next(n for n in numbers if n not in self._topics)
         self.mcap.declare(
-            McapChannel(number, channel.topic, channel.encoding, notes, self._schemas[key])
+            records.Channel(number, channel.topic, channel.encoding, notes, self._schemas[key])
         )
         self._topics[number] = channel
         return number
@@ -188,7 +302,7 @@ class BagWriter:
         """Add to the bag's own key-value pairs; the newest of those with one key counts."""
         self._custom.update(custom)
         if custom:
-            self.mcap.keep(Metadata(CUSTOM_DATA, dict(custom)))
+            self.mcap.keep(records.Metadata(CUSTOM_DATA, dict(custom)))
 
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
@@ -248,6 +362,152 @@ class BagWriter:
             self.close()
         else:
             self.discard()
+
+
+class McapWriter:
+    """An MCAP file that grows in `output`; compression: one of PACKING. OS errors pass through.
+
+    counts: messages of each channel.
+    """
+
+    def __init__(self, output: Output, compression: str) -> None:
+        self.counts: dict[int, int] = {}
+        self._output, self._compression = output, compression
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._attachments: list[records.AttachmentIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._declared = b""  # what the next chunk needs before it
+        self._content = bytearray()
+        self._entries: dict[int, list[tuple[int, int]]] = {}
+        output.write(MAGIC + _record(records.Header("ros2", "nlsid")))
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """The first and the last log time in closed chunks; zeros without one."""
+        first_ns = min((chunk.message_start_time for chunk in self._chunks), default=0)
+        return first_ns, max((chunk.message_end_time for chunk in self._chunks), default=0)
+
+    def declare(self, record: records.Schema | records.Channel) -> None:
+        """Declare a schema, or a channel."""
+        if isinstance(record, records.Schema):
+            self._schemas.append(record)
+        else:
+            self._channels.append(record)
+            self.counts[record.id] = 0
+        self._declared += _record(record)
+
+    def add(self, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
+        """Append a message to the chunk at hand."""
+        size = MESSAGE_FIXED + len(data)
+        head = _HEAD.pack(Opcode.MESSAGE, size, channel, sequence, log_ns, publish_ns)
+        self._entries.setdefault(channel, []).append((log_ns, len(self._content)))
+        self.counts[channel] += 1
+        self._content += head
+        self._content += data
+        if len(self._content) > CHUNK_BYTES:
+            self.close_chunk()
+
+    def close_chunk(self) -> None:
+        """Write the chunk at hand."""
+        if not self._entries:
+            return
+        entries = {c: np.array(found, INDEX_ENTRY) for c, found in self._entries.items()}
+        times = np.concatenate([found["log"] for found in entries.values()])
+        content = bytes(self._content)
+        chunk = records.Chunk(
+            compression="" if self._compression == "none" else self._compression,
+            data=PACKING[self._compression](content),
+            message_end_time=int(np.max(times)),
+            message_start_time=int(np.min(times)),
+            uncompressed_crc=zlib.crc32(content),
+            uncompressed_size=len(content),
+        )
+        self._content, self._entries = bytearray(), {}
+        self._put(chunk, entries)
+
+    def copy_chunk(self, whole: Whole) -> None:
+        """Append a whole chunk of another file, whose channels have the same numbers here."""
+        self.close_chunk()
+        entries = {}
+        for channel, batch in whole.messages.items():
+            at = batch.start - MESSAGE.itemsize
+            entries[channel] = np.rec.fromarrays([batch.log_ns, at], INDEX_ENTRY)
+            self.counts[channel] += len(batch)
+        self._put(whole.chunk, entries)
+
+    def _put(self, chunk: records.Chunk, entries: Mapping[int, Any]) -> None:
+        content, indexes = _record(chunk), b""
+        start = self._output.size + len(self._declared)
+        places = {}
+        for channel, found in entries.items():
+            places[channel] = start + len(content) + len(indexes)
+            length = INDEX.size - RECORD.size + found.nbytes
+            indexes += INDEX.pack(Opcode.MESSAGE_INDEX, length, channel, found.nbytes)
+            indexes += found.tobytes()
+        self._output.write(self._declared + content + indexes)
+        self._declared = b""
+        self._chunks.append(
+            records.ChunkIndex(
+                chunk_length=len(content),
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=len(indexes),
+                message_index_offsets=places,
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+
+    def keep(self, record: records.Metadata | records.Attachment) -> None:
+        """Append what is no message."""
+        content, at = _record(record), self._output.size
+        self._output.write(content)
+        if isinstance(record, records.Metadata):
+            self._metadata.append(records.MetadataIndex(at, len(content), record.name))
+            return
+        self._attachments.append(
+            records.AttachmentIndex(
+                offset=at,
+                length=len(content),
+                log_time=record.log_time,
+                create_time=record.create_time,
+                data_size=len(record.data),
+                name=record.name,
+                media_type=record.media_type,
+            )
+        )
+
+    def finish(self) -> None:
+        """Write the chunk at hand, the summary and the end of the file."""
+        self.close_chunk()
+        self._output.write(self._declared + _record(records.DataEnd(0)))
+        first_ns, last_ns = self.span_ns
+        statistics = records.Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts={c: count for c, count in self.counts.items() if count},
+            chunk_count=len(self._chunks),
+            message_count=sum(self.counts.values()),
+            message_end_time=last_ns,
+            message_start_time=first_ns,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+        listed = [*self._schemas, *self._channels, statistics]
+        listed += [*self._chunks, *self._attachments, *self._metadata]
+        start, summary = self._output.size, b"".join(map(_record, listed))
+        crc = zlib.crc32(summary + _FOOTER.pack(Opcode.FOOTER, 20, start, 0))
+        self._output.write(summary + _record(records.Footer(start, 0, crc)) + MAGIC)
+
+
+def _record(record: records.McapRecord) -> bytes:
+    builder: Any = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
 
 
 def _write_metadata(

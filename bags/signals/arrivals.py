@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
-from bags.signals.timing import SOON
 
 SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
 
@@ -47,42 +46,6 @@ class LogClock:
         if not first or not first <= wall_ns <= last:
             return now
         return begun + (now - begun) * (wall_ns - first) // max(last - first, 1)
-
-
-@dataclass
-class Sequence:
-    """Messages missing from a publisher's own count of what it sent.
-
-    A count that begins anew is a publisher that came back. One that goes back, or stays, again
-    within SOON messages is that of several publishers, of which the middleware does not say who
-    sent what: `mixed`, and from then on `missing` says nothing.
-    """
-
-    missing: int = 0
-    mixed: bool = False
-    _last: int | None = None
-    _counts: bool = False
-    _since_back: int = SOON
-    _in_turn: bool = False  # whether it went back so soon after the time before
-
-    def update(self, number: int) -> None:
-        """Take the next message's number."""
-        last, self._last = self._last, number
-        self._since_back += 1
-        if last is None or (number == last and not self._counts):  # the middleware may not count
-            return
-        if number > last:
-            self._counts = True
-            self.missing += number - last - 1
-            return
-        self._in_turn = self._since_back <= SOON
-        self.mixed |= self._in_turn
-        self._since_back = 0
-
-    @property
-    def alternates(self) -> bool:
-        """Whether several publishers sent the last messages."""
-        return self._in_turn and self._since_back <= SOON
 
 
 @dataclass

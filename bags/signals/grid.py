@@ -5,7 +5,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Final, overload
+from typing import Final
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from bags.signals.sampling import (
     held_values,
     one_clock,
 )
+from bags.signals.timing import seconds
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
@@ -47,18 +48,6 @@ MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamic
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
 log = logging.getLogger(__name__)
-
-
-@overload
-def seconds(stamp_ns: IntArray, origin_ns: int) -> FloatArray: ...
-@overload
-def seconds(stamp_ns: int, origin_ns: int) -> float: ...
-def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
-    """Stamps in ns as float seconds after `origin_ns`: the one place where the unit changes.
-
-    The difference is taken in integers and divided once, so equal stamps give equal seconds.
-    """
-    return (stamp_ns - origin_ns) / 1e9
 
 
 def to_trajectories(
@@ -100,8 +89,12 @@ def to_trajectories(
         _refuse_repeated_stamps(samples, name)
     signals = [Expression.parse(samples.path) for samples in responses]
     where = f"{name}: {responses[0].path}"
-    on_grid = signals[0].operation("hold", "linear") is not None
-    period_ns = _period_ns(responses[0].stamp_ns, grid.period, where, on_grid=on_grid)
+    period_ns = _period_ns(
+        responses[0].stamp_ns,
+        grid.period,
+        where,
+        on_grid=signals[0].operation("hold", "linear") is not None,
+    )
     gap_ns = round(BRIDGED * period_ns if grid.max_gap is None else grid.max_gap * 1e9)
     rules = [[Expression.parse(samples.path) for samples in part] for part in parts]
     held = [product(str(r.sampled("hold", window=gap_ns / 1e9)) for r in part) for part in rules]
@@ -218,7 +211,9 @@ def _numbers(
     u = np.ones((len(grid), len(drives)))
     for column, part, rules in zip(u.T, drives, sampler.excitations, strict=True):
         for samples, signal in zip(part, rules, strict=True):
-            column *= held_values(samples, signal, at_ns.tolist())
+            column *= held_values(
+                signal, samples.stamp_ns.tolist(), samples.values.tolist(), at_ns.tolist()
+            )
     return y, u, {"filled": len(grid) - len(rows), "restarts": restarts}
 
 

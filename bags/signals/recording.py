@@ -8,7 +8,8 @@ from typing import Final
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Sequence
+from bags.signals.arrivals import Arrival
+from bags.signals.timing import Sequence
 
 COUNTED: Final = ("received", "lost")
 UNCOUNTED: Final = "lost messages are not counted: several publishers send on it"

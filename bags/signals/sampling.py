@@ -51,7 +51,6 @@ from bags.signals.expressions import (
     product,
 )
 from bags.signals.message_reader import MessageReader
-from bags.signals.reader import Samples
 from nlsid_core.errors import BagError, apart
 from nlsid_core.running.grid import TOLERANCE
 
@@ -505,11 +504,12 @@ def one_clock(signals: Sequence[Expression]) -> str:
     return next(iter(clocks.values()))
 
 
-def held_values(samples: Samples, signal: Expression, at_ns: Sequence[int]) -> list[float]:
-    """What an excitation recorded as `samples` is at each of `at_ns`, ascending, however old."""
+def held_values(
+    signal: Expression, stamps: Sequence[int], numbers: Sequence[float], at_ns: Sequence[int]
+) -> list[float]:
+    """What an excitation with these stamps (ns) is at each of `at_ns`, ascending, however old."""
     kept, k = _Kept(signal, None), 0
     kept.limit_ns = math.inf
-    stamps, numbers = samples.stamp_ns.tolist(), samples.values.tolist()
     found = []
     for at in at_ns:
         while k < len(stamps) and stamps[k] + kept.delay_ns <= at:

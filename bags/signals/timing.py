@@ -1,7 +1,7 @@
 """The times of a recording: offset and drift between clocks, losses, commands held, delays."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, overload
 
 import numpy as np
 
@@ -17,6 +17,54 @@ SOON: Final = 100  # messages: a publisher does not begin anew twice in so many
 STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
 ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
 RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
+
+
+@overload
+def seconds(stamp_ns: IntArray, origin_ns: int) -> FloatArray: ...
+@overload
+def seconds(stamp_ns: int, origin_ns: int) -> float: ...
+def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
+    """Stamps in ns as float seconds after `origin_ns`: the one place where the unit changes.
+
+    The difference is taken in integers and divided once, so equal stamps give equal seconds.
+    """
+    return (stamp_ns - origin_ns) / 1e9
+
+
+@dataclass
+class Sequence:
+    """Messages missing from a publisher's own count of what it sent.
+
+    A count that begins anew is a publisher that came back. One that goes back, or stays, again
+    within SOON messages is that of several publishers, of which the middleware does not say who
+    sent what: `mixed`, and from then on `missing` says nothing.
+    """
+
+    missing: int = 0
+    mixed: bool = False
+    _last: int | None = None
+    _counts: bool = False
+    _since_back: int = SOON
+    _in_turn: bool = False  # whether it went back so soon after the time before
+
+    def update(self, number: int) -> None:
+        """Take the next message's number."""
+        last, self._last = self._last, number
+        self._since_back += 1
+        if last is None or (number == last and not self._counts):  # the middleware may not count
+            return
+        if number > last:
+            self._counts = True
+            self.missing += number - last - 1
+            return
+        self._in_turn = self._since_back <= SOON
+        self.mixed |= self._in_turn
+        self._since_back = 0
+
+    @property
+    def alternates(self) -> bool:
+        """Whether several publishers sent the last messages."""
+        return self._in_turn and self._since_back <= SOON
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
 from bags.recordings.quality import Profile
 from bags.signals.timing import ClockRelation, clock_relation, missing
-from nlsid_core.arrays import IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
@@ -239,17 +239,22 @@ def _log_times(log_ns: IntArray) -> LogTimes:
     if len(log_ns) == 1:
         return LogTimes(first_ns, last_ns)
     intervals = np.diff(log_ns) / 1e9
-    median = float(np.quantile(intervals, 0.5))  # np.median imports a slow part of NumPy
+    median = _quantile(intervals, 0.5)
     scale = median if median > 0 else float(np.max(intervals)) or 1.0
     return LogTimes(
         first_ns,
         last_ns,
         1e9 * len(intervals) / (last_ns - first_ns) if last_ns > first_ns else float("nan"),
         median,
-        float(np.quantile(np.abs(intervals - median), 0.95)),
+        _quantile(np.abs(intervals - median), 0.95),
         int((intervals > GAP * scale).sum()),
         float(np.max(intervals)),
     )
+
+
+def _quantile(values: FloatArray, share: float) -> float:
+    """As np.quantile, which imports a slow part of NumPy."""
+    return float(np.interp(share * (len(values) - 1), np.arange(len(values)), np.sort(values)))
 
 
 def _stamps(stamp_ns: IntArray, log_ns: IntArray) -> Stamps:

@@ -78,8 +78,6 @@ def export_topics(
     """
     if form not in FORMATS:
         raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
-    if form == "parquet" and find_spec("pyarrow") is None:
-        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv")
     out = Path(out)
     refuse_existing(out)
     writer = _Csv if form == "csv" else _Parquet
@@ -145,7 +143,7 @@ def frame(
         BagError: without pandas, as `read_signals` for damage, and if nothing is there.
     """
     if find_spec("pandas") is None:
-        raise BagError("a frame needs pandas: pip install pandas")
+        raise BagError("a frame needs pandas: pip install 'nlsid[export]'")
     import pandas
 
     parts: dict[str, list[Table]] = {}

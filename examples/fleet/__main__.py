@@ -70,7 +70,7 @@ def upload() -> int:
 def nlsid(*arguments: str) -> int:
     """Run a command of nlsid as a person would; returns its status."""
     print("\n$ nlsid", *arguments, flush=True)
-    return subprocess.run([sys.executable, "-m", "bags.commands.cli", *arguments]).returncode
+    return subprocess.run([sys.executable, "-m", "bags.commands.main", *arguments]).returncode
 
 
 def run(out: Path) -> dict[str, int]:

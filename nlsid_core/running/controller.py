@@ -6,7 +6,6 @@ acts. Of the other kinds input k answers sample k and has the period to get ther
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -87,48 +86,43 @@ class Controller:
     most for `settling` s. `k` is the number of the next sample, negative before. `ended` says why
     it is over, empty while it runs: the sample is missing, not finite, off the grid of the start or
     later than an input may be held, the input would not be finite or not one that the proof covers,
-    or the proof ends. Stopping is the caller's then. `lead`: s from a sample to the stamp of its
+    or the proof ends. Where a hold is proved samples may come at any time within it. Stopping is
+    the caller's then. `lead`: s from a sample to the stamp of its
     input, not quite a period where the input is that of the next sample, so that a sample off the
     grid still finds it in force.
 
-    stages: of a composition one after another, `stage` is which; see `Monitor`. Without a funnel
-    nothing is proved of the policy: it runs from any state, to be commissioned. Raises
-    CertificateMismatch if the parts do not belong together, DataError if the limits cut off an
-    input of the plan.
+    stage: what belongs together. Without a funnel nothing is proved of the policy: it runs from any
+    state, to be commissioned. Raises CertificateMismatch if the parts do not belong together,
+    DataError if the limits cut off an input of the plan.
     """
 
-    def __init__(self, stages: Sequence[Stage], limits: Limits, settling: float = 0.0) -> None:
-        self._stages: list[tuple[Any, Any, Any]] = []
-        for model, policy, funnel, _ in stages:
-            planned: Any = policy
-            if isinstance(policy, TubePolicy):
-                planned = policy.plan(model)  # type: ignore[arg-type]
-            self._stages.append((model, planned, funnel))
-        for each in stages:
-            each.refuse_mismatch()
-        model, policy, funnel = self._stages[0]
+    def __init__(self, stage: Stage, limits: Limits, settling: float = 0.0) -> None:
+        stage.refuse_mismatch()
+        parts: tuple[Any, Any, Any] = stage[:3]
+        model, policy, funnel = parts
+        if isinstance(policy, TubePolicy):
+            policy = policy.plan(model)
+        self._model, self._policy, self._funnel = model, policy, funnel
         self.limits, self._settling = limits, settling
         self._continuous = isinstance(model, VectorField)
-        self._held = stages[0].applied if self._continuous else None
+        self._held = stage.applied if self._continuous else None
         if self._held is not None:
             self.period, self._origin = self._held.period, float(policy.t[0])
-            held_so_long = (1.0 - TOLERANCE) * self.period  # each input
-            self._end = self._stages[-1][1].last - held_so_long
+            held_so_long = self._held.hold or (1.0 - TOLERANCE) * self.period  # each input
+            self._end = policy.last - held_so_long
         else:
             self.period, self._origin = float(model.period), 0.0
             self._end = policy.last if funnel is None else min(policy.last, funnel.last)
         self._observer = _observer(model, policy)
         self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
-        for _, planned, _ in self._stages:
-            limits.refuse(np.size(planned.planned[0]))
-            self._refuse_cut(planned.planned)
+        limits.refuse(np.size(policy.planned[0]))
+        self._refuse_cut(policy.planned)
         self.ended = ""
-        self.stage = 1  # of a composition, counted from 1
         self.k = -1
         self.u: Any = limits.clip(policy.planned[0])  # the input in force at the next sample
         if self._observer.ahead:
             self.u = float(self.u)
-        self._grid = Grid(self.period)
+        self._grid = Grid(self.period, tolerance=self._held.tolerance if self._held else TOLERANCE)
         self._recent: deque[tuple[Any, Any]] = deque(maxlen=max(1, self._observer.lags))
         self._first_t = self._answered = math.nan  # s, of the first sample and the newest
 
@@ -156,21 +150,11 @@ class Controller:
         self._answer(self._when(t), x)
         return self.u
 
-    @property
-    def stages(self) -> int:
-        """How many stages there are: 1 but for a composition."""
-        return len(self._stages)
-
     def _when(self, t: float) -> float:
         """The moment of the next input, as the funnels count."""
         if self._continuous:
             return max(self._origin, self._origin + t - self._grid.start)
         return self.k - 1 + int(self._observer.ahead)
-
-    def _stage(self, when: float) -> tuple[Any, Any, Any]:
-        """The stage that is on: of a composition the first that has not ended."""
-        self.stage = 1 + sum(when >= stage[1].last for stage in self._stages[:-1])
-        return self._stages[self.stage - 1]
 
     def _settle(self, t: float, y: Any) -> None:
         """Wait for a state from which the funnel may start."""
@@ -180,10 +164,9 @@ class Controller:
         if len(self._recent) < self._observer.lags:
             return
         x = self._observer.begin([y for y, _ in self._recent], [u for _, u in self._recent])
-        _, policy, funnel = self._stages[0]
-        size = 0.0
+        size, funnel = 0.0, self._funnel
         if funnel is not None:
-            nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
+            nominal = funnel.nominal(self._origin) if self._continuous else self._policy.x[0]
             size = funnel.start_size(x - nominal)
             if self._held is not None:
                 size += self._held.reach(funnel.shape(self._origin))
@@ -198,14 +181,13 @@ class Controller:
 
     def _answer(self, when: float, x: FloatArray) -> None:
         """Set the input for the state x at `when`, if it is one that the proof covers."""
-        model, policy, _ = self._stage(when)
         if when > self._end:
-            self.ended = "the plan is over" if when > policy.last else "the proof is over"
+            self.ended = "the plan is over" if when > self._policy.last else "the proof is over"
             return
-        wanted = policy(when if self._continuous else int(when), x)
-        lowest, highest = _range(model, when)
+        wanted = self._policy(when if self._continuous else int(when), x)
+        lowest, highest = _range(self._model, when)
         u = self.limits.clip(np.clip(wanted, lowest, highest))
-        low, high = policy.covers(when, x)
+        low, high = self._policy.covers(when, x)
         if not (np.isfinite(wanted).all() and (low <= u).all() and (u <= high).all()):
             self.ended = (
                 f"the policy's input {wanted} at sample {self._grid.k} is not proved: it is beyond "
@@ -218,7 +200,7 @@ class Controller:
     def _fault(self, t: float, y: Any) -> str:
         if np.isfinite(y).all():
             return ""
-        name = getattr(getattr(self._stages[0][0], "y", None), "name", "the state")
+        name = getattr(getattr(self._model, "y", None), "name", "the state")
         return f"{name} is {y} at t = {t:g} s"
 
     def _overdue(self, t: float) -> str:

@@ -19,12 +19,13 @@ def early(t: float, last: float, period: float) -> str:
 class Grid:
     """Stamps of a run whose sample k is due at start + k·period (s); `k`: the next one's number.
 
-    Without an announced start the first stamp is that of sample `first`.
+    Without an announced start the first stamp is that of sample `first`. tolerance: of a period,
+    how far off a later sample may be; infinite: they may come at any time, in order.
     """
 
-    def __init__(self, period: float, *, first: int = 0) -> None:
+    def __init__(self, period: float, *, first: int = 0, tolerance: float = TOLERANCE) -> None:
         self.period, self.first = period, first
-        self._tolerance = TOLERANCE * period
+        self._tolerance = tolerance * period
         self.begin()
 
     def begin(self, start: float | None = None, *, at: int | None = None) -> None:
@@ -35,7 +36,8 @@ class Grid:
 
     def take(self, t: float) -> str:
         """Count the sample stamped t (s); why it is not the next one, empty if it is."""
-        if abs(t - self.start - self.k * self.period) <= self._tolerance:
+        near = TOLERANCE * self.period if self.k == self.first else self._tolerance
+        if self._last < t < math.inf and abs(t - self.start - self.k * self.period) <= near:
             self.k += 1
             self._last = t
             return ""

@@ -1,5 +1,6 @@
 """How a continuous policy is applied: how often, how old its input is, how wrong its state."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,6 +46,11 @@ class Held:
         hold = files.member(stated, "hold", (int, float), source="claim")
         error = files.array(stated, "error", (None,), source="claim")
         return cls(period, float(hold), error)
+
+    @property
+    def tolerance(self) -> float:
+        """Of a period, how far off the grid a sample may be: any, where the proof has a hold."""
+        return math.inf if self.hold else TOLERANCE
 
     def overdue(self, age: float, t: float) -> str:
         """How an input that is `age` s old at t (s) is older than is proved; empty if it is not."""

@@ -26,7 +26,7 @@ from nlsid_core.running.comparison import (
     SampledComparison,
 )
 from nlsid_core.running.forecast import Forecast
-from nlsid_core.running.grid import Grid
+from nlsid_core.running.grid import TOLERANCE, Grid
 from nlsid_core.running.reading import Level, Reading, Status, Trend
 from nlsid_core.running.stage import Stage
 from nlsid_core.running.tubes import Ahead, TubeRun
@@ -54,7 +54,7 @@ class Monitor:
     def __init__(self, stages: Sequence[Stage], *, centre: Centre = Centre.COMMAND) -> None:
         for stage in stages:
             stage.refuse_mismatch()
-        model, policy, funnel, _ = stages[0]
+        model, policy, funnel, held = stages[0]
         self.funnels = tuple(stage.funnel for stage in stages)
         # Whether a sample that is missing is only that, and no end of the run.
         followed = centre is Centre.PROFILE and policy is not None
@@ -66,7 +66,11 @@ class Monitor:
             return
         self._comparison = _comparison(stages)
         self.lags = self._comparison.lags  # samples before an announced start
-        self._grid = Grid(self._comparison.period, first=-self.lags)
+        self._grid = Grid(
+            self._comparison.period,
+            first=-self.lags,
+            tolerance=held.tolerance if held else TOLERANCE,
+        )
         self.restart()
 
     def restart(self, start: float | None = None) -> None:

@@ -12,6 +12,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.models import DifferenceEquation
 
 STEP = 1e-3  # s, the longest step of integration
+FAR = 1e6  # of a state, its unit: equations that went there are of no robot any more
 
 
 class Plant(Protocol):
@@ -48,7 +49,8 @@ class FieldPlant:
     """ẋ = f(t, x, u, w) of any vector field: measured x. w is drawn from its box at every sample.
 
     It rests at x until the first input that is not zero; its time, which equations may depend on,
-    starts at t0 s then. x: (n,).
+    starts at t0 s then. So it does again after a state that is FAR away, as of what falls after a
+    stop. x: (n,).
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class FieldPlant:
         if period <= 0.0 or x.shape != (field.n,) or not np.isfinite(x).all():
             raise DataError(f"a plant of {field.n} states starts at so many numbers, not at {x}")
         self.period, self._field, self._rng = period, field, rng
+        self._start, self._t0 = x, t0
         self._x, self._t, self._rests = x, t0, True
         self.inputs = field.m
 
@@ -93,8 +96,12 @@ class FieldPlant:
                 speed = self._field(float(z[-1]), z[None, :-1], applied, w, span=span)[0]
                 return np.append(speed, 1.0)
 
-            z = advanced(rate, z, self.period / count)
+            with np.errstate(over="ignore", invalid="ignore"):
+                z = advanced(rate, z, self.period / count)
             self._x, self._t = z[:-1], float(z[-1])
+            if not (np.abs(self._x) < FAR).all():
+                self._x, self._t, self._rests = self._start, self._t0, True
+                return
 
 
 def advanced(rate: Callable[[FloatArray], FloatArray], x: FloatArray, h: float) -> FloatArray:

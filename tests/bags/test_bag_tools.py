@@ -93,15 +93,35 @@ def test_verbs_are_few_and_an_option_means_the_same_in_all_of_them() -> None:
     assert not {flag: names for flag, names in said.items() if len(names) > 1}
 
 
-@pytest.mark.slow
-def test_an_error_shows_a_path_with_brackets_whole(bag: Path) -> None:
-    command = [sys.executable, "-m", "bags.commands.cli", "bag", "plot", str(bag), "--out", "x.png"]
-    signal = f"{ODOM}:twist.twist.linear[name=elbow].x"
-    run = subprocess.run([*command, "-s", signal], capture_output=True, text=True, check=False)
-    assert run.returncode == 2
-    assert signal in run.stderr
-    assert "is a 'geometry_msgs/msg/Vector3', not an array" in run.stderr
-    assert "Traceback" not in run.stderr
+SCRIPT = """
+import sys
+
+sys.modules.update(dict.fromkeys(("scipy", "cvxpy", "clarabel")))
+import nlsid
+from bags.commands.main import main
+
+assert len(nlsid.frame(sys.argv[3], ["/odom"])) == 400
+sys.argv[0] = "nlsid"
+main()
+"""
+
+
+def test_bag_tools_need_no_solver_and_what_does_says_which_extra(bag: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    verbs: dict[int, list[tuple[object, ...]]] = {
+        0: [
+            ("bag", "info", bag),
+            ("bag", "check", bag, "-u", COMMAND, "-y", SPEED),
+            ("bag", "convert", bag, "--out", copy),
+        ],
+        2: [("identify", copy, bag)],
+    }
+    for status, verb in ((status, verb) for status, some in verbs.items() for verb in some):
+        command = [sys.executable, "-c", SCRIPT, *map(str, verb)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == status, done.stderr
+    assert done.stderr == "error: this needs scipy: pip install 'nlsid[identify]'\n"
+    assert bag_info(copy).messages == 800
 
 
 def test_a_folder_holds_bags_of_one_file_or_one_bag_of_several(bag: Path, tmp_path: Path) -> None:
@@ -541,6 +561,8 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
         f"{CMD}:twist.linear.x=cmd",
         "-s",
         f"{ODOM}:twist.twist.linear.x=speed",
+        "-s",
+        "/power:data=cmd",
         "--type",
         f"{CMD}=geometry_msgs/msg/TwistStamped",
         "--type",
@@ -550,9 +572,10 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
         "--custom",
         "robot=car",
     )
-    read = read_signals(tmp_path / "bag", [COMMAND, SPEED])
+    read = read_signals(tmp_path / "bag", [COMMAND, SPEED, "/power:data"])
     written = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(read[COMMAND].values, written[:, 0])
+    for path in (COMMAND, "/power:data"):  # a topic with one number needs no type
+        np.testing.assert_array_equal(read[path].values, written[:, 0])
     np.testing.assert_array_equal(read[SPEED].values, written[:, 1])
     assert np.diff(read[SPEED].stamp_ns).tolist() == [20_000_000] * 49
     assert read[SPEED].stamp_ns[0] == 1000 * 10**9

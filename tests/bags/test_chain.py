@@ -479,14 +479,14 @@ def test_the_status_is_the_same_where_nobody_reads_what_is_said(
     words = {"DIR": chain, "BAG": trial("05")}
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "bags.commands.cli", *(str(words.get(w, w)) for w in verb)]
+    command = [sys.executable, "-m", "bags.commands.main", *(str(words.get(w, w)) for w in verb)]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
     os.close(writer)
     assert done.returncode == 0, done.stderr
 
 
 def test_what_cannot_be_written_is_said_in_a_line() -> None:
-    command = [sys.executable, "-m", "bags.commands.cli", "bag", "info", str(trial("05"))]
+    command = [sys.executable, "-m", "bags.commands.main", "bag", "info", str(trial("05"))]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
     assert done.returncode == 2

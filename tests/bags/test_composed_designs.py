@@ -19,7 +19,6 @@ from bags.viewing.scene import Scene
 from nlsid_core import designs
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.controller import Limits
 from nlsid_core.running.reading import Reading, Status
 from tests.bags.deciding import decide
 from tests.continuous_stage import composed, write_run
@@ -60,21 +59,16 @@ def test_a_stage_that_was_changed_is_refused(folder: Path, tmp_path: Path) -> No
         load(path.with_name(designs.COMPOSITION))
 
 
-def test_it_is_driven_from_stage_to_stage_and_held_against_each(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_run_from_stage_to_stage_is_held_against_each(folder: Path, tmp_path: Path) -> None:
     design = load(folder / designs.COMPOSITION, wiring=WIRING)
-    controller = design.controller(Limits(lowest=-9.0, highest=9.0, stop_rate=9.0), 1.0)
     monitor, x = design.monitor(Centre.PROFILE), np.array([0.05])
     stages, readings, samples = [], [], []
     for k in range(40):
-        u = controller.update(k * 50_000_000 / 1e9, x)
-        stages.append(controller.stage)
+        stages.append(1 + int(k >= 20))
+        u = design.stages[stages[-1] - 1].policy(k * 50_000_000 / 1e9, x)
         readings.append(monitor.update(k * 50_000_000 / 1e9, x, u))
         samples.append((x, np.atleast_1d(u)))
         x = x + 0.05 * u
-    assert not controller.ended
-    assert stages == [1] * 20 + [2] * 20
     assert {reading.status for reading in readings} == {Status.INSIDE}
     assert [int(reading.assuming[6]) for reading in readings] == stages
     write_run(tmp_path / "bag", design, samples)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from bags.recordings.bag import Bag
-from bags.recordings.output import Output
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import BagWriter, Output
 from bags.signals.arrivals import Arrival
 from bags.signals.recording import Recording
 from bags.tools.recover import repair, unfinished_bags

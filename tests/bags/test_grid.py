@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.signals.grid import read_dataset, seconds, to_trajectories
+from bags.signals.grid import read_dataset, to_trajectories
 from bags.signals.reader import Samples, bag_digest
 from bags.signals.sampling import Grid
+from bags.signals.timing import seconds
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag

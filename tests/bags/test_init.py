@@ -573,7 +573,7 @@ def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
 def test_on_a_terminal_the_likeliest_signals_are_asked_about(tmp_path: Path) -> None:
     """A real pseudo-terminal: what the speed command drives, and yes."""
     keyboard, terminal = os.openpty()
-    command = [sys.executable, "-m", "bags.commands.cli", "init", str(tmp_path), "-u", CMD]
+    command = [sys.executable, "-m", "bags.commands.main", "init", str(tmp_path), "-u", CMD]
     os.write(keyboard, b"y\n")
     done = subprocess.run(
         [*command, *map(str, f1tenth()[:6])],

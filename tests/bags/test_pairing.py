@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from bags.recordings.bag import Bag
 from bags.samples import f1tenth
-from bags.signals.grid import read_dataset, seconds
+from bags.signals.grid import read_dataset
 from bags.signals.sampling import LOST, Sample, Sampler
+from bags.signals.timing import seconds
 from tests.bag_messages import COMMAND, SPEED
 
 

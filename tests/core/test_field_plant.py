@@ -5,7 +5,7 @@ import pytest
 
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError
-from nlsid_core.running.plants import FieldPlant
+from nlsid_core.running.plants import FAR, FieldPlant
 
 PERIOD = 0.02  # s
 
@@ -30,6 +30,18 @@ def test_equations_that_change_in_time_do_so_from_the_first_input_on() -> None:
     for _ in range(50):
         plant.step(np.ones(1), np.zeros(1))
     assert plant.measure(np.zeros(1)) == pytest.approx([0.5], abs=1e-9)
+
+
+def test_equations_that_leave_every_number_begin_anew_and_rest() -> None:
+    """ẋ = x + x³ + u, which is at infinity in finite time."""
+    field = VectorField.from_function(lambda x, u: [x[0] + x[0] ** 3 + u[0]], 1, 1)
+    plant = FieldPlant(field, np.full(1, 0.1), period=PERIOD, rng=np.random.default_rng(0))
+    states = []
+    for k in range(200):
+        plant.step(np.full(1, float(k < 2)), np.zeros(1))
+        states.append(float(plant.measure(np.zeros(1))[0]))
+    assert 1.0 < max(states) < FAR
+    assert states[-1] == 0.1
 
 
 def test_w_is_drawn_from_its_box() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bags.chain.problems import load_problem
-from bags.commands import cli
+from bags.commands.main import main
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate_nominal, tvlqr
@@ -166,7 +166,7 @@ def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line
     given = ["nlsid", "funnel", str(out), "--problem", str(problem)]
     monkeypatch.setattr(sys, "argv", given)
     with pytest.raises(SystemExit) as stopped:
-        cli.main()
+        main()
     assert stopped.value.code == 2
     said = " ".join(capsys.readouterr().err.split())
     assert said.startswith("error: ")

@@ -93,7 +93,7 @@ def test_an_estimate_that_is_no_number_is_outside_and_ends_the_run() -> None:
 
 def test_a_controller_never_sends_an_input_that_is_no_number() -> None:
     model, policy, funnel = overflowing()
-    controller = Controller([Stage(model, policy, funnel)], WIDE, 1.0)
+    controller = Controller(Stage(model, policy, funnel), WIDE, 1.0)
     before = controller.update(0.0, np.array([1.0]))
     assert np.isfinite(before).all()
     controller._observer.begin([np.array([1e3])], [])
@@ -354,7 +354,7 @@ def test_a_controller_stops_where_the_proof_ends_though_the_plan_goes_on(
     assert design.policy is not None
     assert len(design.policy) > samples
     limits = Limits(lowest=-1.0, highest=1.0, stop_rate=1.0)
-    controller = Controller([Stage(design.model, design.policy, funnel)], limits, 30.0)
+    controller = Controller(Stage(design.model, design.policy, funnel), limits, 30.0)
     model, n = design.model, len(design.model)
     plan = design.policy.plan(model)
     y_rest = plan.y[0]
@@ -375,7 +375,7 @@ def test_an_input_is_never_beyond_the_range_of_the_model_and_what_is_sent_is_pro
     assert policy is not None
     plan, (lowest, highest) = policy.plan(model), model.u_range
     funnel = wide_start(design.funnel)
-    controller = Controller([Stage(model, policy, funnel)], WIDE, 30.0)
+    controller = Controller(Stage(model, policy, funnel), WIDE, 30.0)
     n = len(model)
     y_rest = plan.y[0]
     sent, asked = [], []

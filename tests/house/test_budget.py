@@ -12,13 +12,13 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_828,
-    ("bags",): 11_998,
-    ("nlsid_ros",): 2_676,
-    ("tests",): 23_288,
-    ("benchmarks", "examples"): 3_809,
+    ("bags",): 11_996,
+    ("nlsid_ros",): 2_664,
+    ("tests",): 23_289,
+    ("benchmarks", "examples"): 3_808,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 11, 14  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 7, 14  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

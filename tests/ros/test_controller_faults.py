@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files
-from bags.designs.documents import FUNNEL, FUNNEL_PROOF, MODEL, POLICY, VECTOR_FIELD, load_model
+from bags.designs.documents import FUNNEL, MODEL, POLICY, VECTOR_FIELD, load_model
 from bags.monitoring.announcement import UNANNOUNCED, WAITING, Run
 from nlsid_core import files
 from nlsid_ros import qos
@@ -347,13 +347,12 @@ def test_a_robot_that_falls_silent_is_stopped(stage: Callable[..., Stage]) -> No
 
 
 def test_the_same_design_again_in_mid_run_does_not_stop_it(
-    stage: Callable[..., Stage], funnel: Path, tmp_path: Path
+    stage: Callable[..., Stage], funnel: Path
 ) -> None:
-    shutil.copytree(funnel.parent, tmp_path / "used")
-    robot = stage(funnel=tmp_path / "used" / FUNNEL)
+    robot = stage()
     robot.track()
     heard = len(robot.designs)
-    (tmp_path / "used" / FUNNEL).touch()
+    assert robot.set("funnel_publisher", "funnel", str(funnel)) == ""
     robot.spin_until(lambda: len(robot.designs) > heard)
     count = len(robot.commands)
     robot.spin_until(lambda: len(robot.commands) > count + 10)
@@ -376,8 +375,7 @@ def test_another_design_in_mid_run_stops_it(
         design_funnel_files(folder / MODEL, settings, folder)
     robot = stage(funnel=used / FUNNEL)
     robot.track()
-    for name in (POLICY, FUNNEL, FUNNEL_PROOF):
-        shutil.copyfile(other / name, used / name)
+    assert robot.set("funnel_publisher", "funnel", str(other / FUNNEL)) == ""
     robot.expect_ramp_down("the design was replaced")
 
 

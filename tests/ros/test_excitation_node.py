@@ -199,7 +199,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
     topics = "[/joint_states, /joint_commands]"
     kind, types = "sensor_msgs/msg/JointState", ("response_type", "command_type")
     wiring = {"response": RESPONSE, "command": COMMAND} | dict.fromkeys(types, kind)
-    bench.start("plant", kind="vector_field", model=field, state="'0.0'", **wiring)
+    bench.start("plant", model=field, state="'0.0'", **wiring)
     recorder = bench.start("trajectory_recorder", topics=topics, bag=bags / "trial", at_once=False)
     bench.start("excitation", **(JOINTS | SIGNAL), repeats=3, recorder="trajectory_recorder")
     bench.spin_until(lambda: bench.node.count_subscribers("/joint_states") == 1)

@@ -23,6 +23,11 @@ CONFIGURE, ACTIVATE = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACT
 DEACTIVATE, CLEANUP = Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP
 UNCONFIGURED = State.PRIMARY_STATE_UNCONFIGURED
 INACTIVE, ACTIVE = State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE
+DOWN = [  # in nav2's order: transitions, and the states after them
+    (DEACTIVATE, INACTIVE),
+    (CLEANUP, UNCONFIGURED),
+    (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, State.PRIMARY_STATE_FINALIZED),
+]
 SAYS = {  # once it is active
     "excitation": "idle",
     "trajectory_recorder": "nothing on /joints yet",
@@ -87,6 +92,20 @@ def test_a_node_that_started_itself_is_taken_over_by_a_manager_which_wrong_reque
     for bag in sorted(tmp_path.glob("run*")):
         with Bag(bag) as source:
             assert source.ending is None
+
+
+def test_nav2s_manager_brings_nodes_up_in_order_and_down_in_reverse(
+    bench: Bench, funnel: Path
+) -> None:
+    """Its transitions, by the names of the services that it calls."""
+    names = ["robot/funnel_publisher", "robot/funnel_monitor"]
+    bench.start("funnel_publisher", funnel=funnel, autostart=False, __ns="/robot")
+    bench.start("funnel_monitor", autostart=False, __ns="/robot")
+    for transition, state in ((CONFIGURE, INACTIVE), (ACTIVATE, ACTIVE)):
+        assert [asked(bench, name, transition) for name in names] == [(True, state)] * 2
+    bench.hears("no speed yet", "robot/funnel_monitor")
+    for transition, state in DOWN:
+        assert [asked(bench, name, transition) for name in names[::-1]] == [(True, state)] * 2
 
 
 def test_what_is_still_on_its_way_when_a_node_is_deactivated_does_not_end_it(bench: Bench) -> None:

@@ -34,7 +34,7 @@ def cart(tmp_path: Path) -> dict[str, object]:
     files.write_document(tmp_path / VECTOR_FIELD, stage()[0].document())
     paths = {"response": "/joint_states:position[0]", "command": "/joint_commands:effort[0]"}
     types = {"response_type": JOINTS, "command_type": JOINTS}
-    field = {"kind": "vector_field", "model": tmp_path / VECTOR_FIELD, "state": "'0.0'"}
+    field = {"model": tmp_path / VECTOR_FIELD, "state": "'0.0'"}
     return {**field, **paths, **types}
 
 

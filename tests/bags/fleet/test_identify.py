@@ -318,7 +318,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, config: Path) -> None
     command = [
         sys.executable,
         "-m",
-        "bags.commands.cli",
+        "bags.commands.main",
         "identify",
         str(out),
         str(pattern),
