@@ -287,7 +287,9 @@ def import_command(
     ] = None,
     types: Annotated[
         list[str] | None,
-        typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState"),
+        typer.Option(
+            "--type", help="topic=type: /joints=sensor_msgs/msg/JointState. /topic:data: a Float64."
+        ),
     ] = None,
     custom: Annotated[
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")

@@ -54,16 +54,14 @@ def choose(
         for attempt in attempts:
             progress(str(attempt), number / len(stages))
             glances.append(held_out.glance(attempt))
-        good = 0
-        for row in sorted(glances, key=lambda row: row.percent):
+        for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
             best = least(rows)
             limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
                 rows.append(row)
-            elif kept == EVERY or (good < kept and row.percent <= limit):
+            elif kept == EVERY or (place < kept and row.percent <= limit):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
                 rows.append(held_out.judged(row))
-                good += rows[-1].percent <= limit
             else:
                 rows.append(replace(row, refusal=f"{row.percent:.3g} % on one fold"))
     return Choice(held_out, tuple(rows))
@@ -108,10 +106,9 @@ def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
     for degree in (2, 3, 4):
         delays = excited(data, lags, degree)
         yield Attempt(Polynomial(lags, delays, Degrees(inputs=degree)), Rse(STEPS))
-    delays = excited(data, lags, 2)
-    yield Attempt(Polynomial(lags, delays, Degrees(inputs=2, leading=1)), certified)
-    delays = excited(data, lags, 3)
-    yield Attempt(Polynomial(lags, delays, Degrees(left=3, inputs=3)), certified)
+    for degrees in (Degrees(inputs=2, leading=1), Degrees(left=3, inputs=3)):
+        delays = excited(data, lags, degrees.inputs)
+        yield Attempt(Polynomial(lags, delays, degrees), certified)
     if signals_of(data)[0] == 1:
         yield Attempt(Polynomial(lags, degrees=Degrees(left=3)), certified)
 
@@ -194,7 +191,7 @@ Stages = Sequence[tuple[Stage, int]]  # with how many of each are judged
 LINEAR: Stages = ((linear, EVERY), (iterated, 3))
 BEYOND: Stages = (
     (curved, 2),
-    (networks, 1),
+    (networks, 2),
     (nearby, 2),
     (memories, 1),
 )

@@ -25,6 +25,7 @@ from nlsid_core.errors import BagError, DataError
 MAX_TABLE_BYTES: Final = 2**31
 STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
 LARGEST: Final = 2**16  # bytes of an empty message, and more
+NUMBER: Final = "std_msgs/msg/Float64"  # of a topic with one column, `data`, and no type
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
@@ -127,7 +128,7 @@ def import_table(
         file: the table.
         out: the bag.
         assignments: `signal=column` each.
-        types: topic -> message type, a standard one.
+        types: topic -> message type, a standard one; a number where only `topic:data` is assigned.
         rows: when the rows were recorded.
         custom: key-value pairs of the bag's own.
 
@@ -154,11 +155,13 @@ def import_table(
     stamps = _stamps(times, round(rows.start * 1e9))
     streams = []
     for topic, columns in topics.items():
-        if topic not in types:
+        is_number = [str(path) for path in columns] == [f"{topic}:data"]
+        msgtype = types.get(topic, NUMBER if is_number else "")
+        if not msgtype:
             raise BagError(
                 f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
             )
-        streams.append(_Stream(topic, types[topic], columns))
+        streams.append(_Stream(topic, msgtype, columns))
     said = _said_times(times, rows, unit)
     with BagWriter(out, custom=custom) as writer:
         for row, stamp in enumerate(stamps.tolist()):

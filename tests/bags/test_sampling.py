@@ -443,7 +443,7 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
         y[k + 1] = 0.8 * y[k] + 0.2 * u[k] + 1e-3 * rng.standard_normal()
     whole, lossy = tmp_path / "whole", tmp_path / "lossy"
     speed_bag(whole, y, u)
-    speed_bag(lossy, y, u, lost=lost)
+    speed_bag(lossy, [None if k in lost else speed for k, speed in enumerate(y)], u)
     grid = Grid(max_gap=0.08, resample="linear")
     data, gappy = (
         read_dataset([bag], responses=[SPEED], excitations=[COMMAND], grid=grid)

@@ -14,11 +14,11 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 12_000,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_290,
+    ("tests",): 23_291,
     ("benchmarks", "examples"): 3_808,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 11, 14  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 7, 14  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

@@ -67,7 +67,6 @@ class Robot(Bench):
         *,
         speed: float = 0.0,
         since_ns: int = 10**18,
-        period_ns: int = PERIOD_NS,
         slower: float = 1.0,
         frame: str = "",
         clock: bool = False,
@@ -80,13 +79,13 @@ class Robot(Bench):
         for k in samples:
             command, state = TwistStamped(), Odometry()
             for message in (command, state):
-                message.header.stamp = stamp_of(since_ns + k * period_ns)
+                message.header.stamp = stamp_of(since_ns + k * PERIOD_NS)
             state.header.frame_id, state.twist.twist.linear.x = frame, speed
             if clock:
                 self.clock.publish(Clock(clock=state.header.stamp))
             self.command.publish(command)
             self.odom.publish(state)
-            self.waits(slower * period_ns * 1e-9)
+            self.waits(slower * PERIOD_NS * 1e-9)
 
     def drive_now(self, samples: int, *, ahead: float = 0.0, **how: Any) -> None:
         """As `drive`, with stamps of now, or so many s later."""

@@ -184,9 +184,11 @@ def direct(tube: Json, j: int) -> tuple[Fraction, Fraction]:
     return exact(tube["direct"][j]), exact(peaks[j])
 
 
-def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, kept: int) -> bool:
-    """(D) and every (O_j); the first `kept` entries of the box are not split."""
-    box, ray, hull = shape
+def holds(
+    rows: tuple[Rows, Rows], m: int, tube: Json, tree: Json | None, shape: Any, kept: int
+) -> bool:
+    """(D) and every (O_j) for (F, H); the first `kept` entries of the box are not split."""
+    (F, H), (box, ray, hull) = rows, shape
     n, p = len(F), len(H)
     size, rho = m + n + p, exact(tube["rho"])
     P, R = matrix(tube["P"], n, n), matrix(tube["R"], p, p)
@@ -312,7 +314,7 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
         ):
             return False
         kept = m + len(F) if model["kind"] == "implicit" and m > 1 and box else 0
-        if not all(holds(F, H, m, tube, tree, (box, ray, hull), kept) for F, H in modes):
+        if not all(holds(rows, m, tube, tree, (box, ray, hull), kept) for rows in modes):
             return False
         for j, (tau, width) in enumerate(zip(tube["tau"], tube["half_widths"], strict=True)):
             c, peak = direct(tube, j)

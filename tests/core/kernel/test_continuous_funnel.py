@@ -137,7 +137,7 @@ def random_claim(rng: np.random.Generator) -> Files:
     for k, mode, vertex in product(range(intervals), modes, range(vertices)):
         level = int(rng.integers(0, 2))
         for index in range(2**level):
-            proof["pieces"].append(random_piece(rng, proof, k, vertex, level, index, mode))
+            proof["pieces"].append(random_piece(rng, proof, k, vertex, (level, index), mode))
     if "hold" in claimed:
         proof["rates"] = rng.uniform(0.5, 2, (intervals, m)).tolist()
         proof["rate_pieces"] = []
@@ -147,7 +147,7 @@ def random_claim(rng: np.random.Generator) -> Files:
         ):
             if i >= limited or not mode[i]:
                 rated = proof | {"multiplier": []}
-                piece = random_piece(rng, rated, k, v, 0, 0, (0, *mode))
+                piece = random_piece(rng, rated, k, v, (0, 0), (0, *mode))
                 del piece["mu"]
                 piece |= {"input": i, "sign": sign, "mode": list(mode)}
                 if not mode:
@@ -200,11 +200,10 @@ def random_piece(
     proof: Any,
     k: int,
     vertex: int,
-    level: int,
-    index: int,
+    half: tuple[int, int],
     mode: tuple[int, ...],
 ) -> Any:
-    """A piece with random multipliers."""
+    """A piece with random multipliers; half: the level and index of its part of time."""
     size, count = len(proof["basis"]), len(proof.get("multiplier", []))
     shell = 0 if "multiplier" in proof else 2
     mu = {
@@ -225,8 +224,8 @@ def random_piece(
     piece = {
         "interval": k,
         "vertex": vertex,
-        "level": level,
-        "index": index,
+        "level": half[0],
+        "index": half[1],
         "mu": {key: row.tolist() for key, row in mu.items()},
         **squares[0],
     }
