@@ -8,7 +8,8 @@ Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
 deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
 machine does not count; the memory is that process's. Likewise `nlsid bag info` of the whole bag;
-and of one of FRAMED messages a DataFrame, as rosbags-dataframe makes it.
+and of one of FRAMED messages a DataFrame, as rosbags-dataframe makes it, and a copy, as rosbags
+makes it.
 """
 
 import os
@@ -23,15 +24,20 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stdout
+from io import StringIO
 from itertools import cycle, islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
+from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
+from bags.tools.convert import convert
 from bags.tools.tables import frame
 from benchmarks.cache import cache_folder
 from benchmarks.machine import parser, peers, tell
@@ -57,6 +63,16 @@ SIGNALS: Final = (
     f"{IMU}:linear_acceleration.x",
     f"{IMU}:linear_acceleration.y",
 )
+TAKEN: Final[dict[str, Callable[[Any], list[float]]]] = {
+    JOINTS: lambda m: [*m.position, *m.velocity],
+    ODOM: lambda m: [
+        m.pose.pose.position.x,
+        m.pose.pose.position.y,
+        m.twist.twist.linear.x,
+        m.twist.twist.angular.z,
+    ],
+    IMU: lambda m: [m.angular_velocity.z, m.linear_acceleration.x, m.linear_acceleration.y],
+}
 START_NS: Final = 1_700_000_000 * 10**9
 PERIOD_NS: Final = 1_000_000
 
@@ -156,22 +172,12 @@ def read_rosbags(bag: Path, messages: int) -> int:
 
 def _take(decoded: Iterator[tuple[str, Any]], messages: int) -> int:
     columns: dict[str, list[list[float]]] = {topic: [] for topic in TYPES}
-    done = 0
-    for topic, m in decoded:
-        if topic == JOINTS:
-            row = [*m.position, *m.velocity]
-        elif topic == ODOM:
-            p, v = m.pose.pose.position, m.twist.twist
-            row = [p.x, p.y, v.linear.x, v.angular.z]
-        else:
-            row = [m.angular_velocity.z, m.linear_acceleration.x, m.linear_acceleration.y]
-        columns[topic].append([m.header.stamp.sec * 1e9 + m.header.stamp.nanosec, *row])
-        done += 1
-        if done == messages:
-            break
+    for topic, m in islice(decoded, messages):
+        stamp = m.header.stamp.sec * 1e9 + m.header.stamp.nanosec
+        columns[topic].append([stamp, *TAKEN[topic](m)])
     for rows in columns.values():
         np.array(rows)
-    return done
+    return messages
 
 
 def info(bag: Path, messages: int) -> int:
@@ -196,6 +202,22 @@ def framed_by_rosbags(bag: Path, _messages: int) -> int:
         return len(get_dataframe(reader, ODOM, fields))
 
 
+def converted(bag: Path, _messages: int) -> int:
+    """A copy of the bag."""
+    with TemporaryDirectory() as folder, Bag(bag) as source:
+        return convert([source], Path(folder) / "copy").messages
+
+
+def converted_by_rosbags(bag: Path, messages: int) -> int:
+    """The same by rosbags, without compressing it."""
+    import rosbags.convert.converter as peer
+
+    with TemporaryDirectory() as folder, redirect_stdout(StringIO()):
+        copy = Path(folder) / "copy"
+        peer.convert([bag], copy, "mcap", 9, None, "none", None, None, (), (), (), ())
+    return messages
+
+
 def _timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[float, float]:
     started = sum(os.times()[:4])  # with the processes that it starts
     done = read(bag, messages)
@@ -213,26 +235,24 @@ def timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[f
 def measure(bag: Path, messages: int) -> dict[str, float]:
     """Run every reader side by side and return the promised keys."""
     readers = {"ours": read_ours, "mcap_ros2": read_mcap_ros2, "rosbags": read_rosbags}
-    rates: dict[str, list[float]] = {name: [] for name in readers}
-    peaks: list[float] = []
-    for _ in range(REPEATS):
-        for name, read in readers.items():
-            rate, peak = timed(read, bag, min(SAMPLE, messages))
-            rates[name].append(rate)
-            if name == "ours":
-                peaks.append(peak)
+    runs: dict[str, list[tuple[float, float]]] = {
+        name: [timed(read, bag, min(SAMPLE, messages)) for _ in range(REPEATS)]
+        for name, read in readers.items()
+    }
+    median = {name: statistics.median(rate for rate, _ in found) for name, found in runs.items()}
     small = generated_bag(None, FRAMED)
     frames = [timed(make, small, FRAMED)[0] for make in (framed, framed_by_rosbags)]
-    median = {name: statistics.median(found) for name, found in rates.items()}
+    copies = [timed(make, small, FRAMED)[0] for make in (converted, converted_by_rosbags)]
     return {
         "messages_per_s": median["ours"],
         "mcap_ros2_per_s": median["mcap_ros2"],
         "rosbags_per_s": median["rosbags"],
         "ratio_mcap_ros2": median["ours"] / median["mcap_ros2"],
         "ratio_rosbags": median["ours"] / median["rosbags"],
-        "peak_mb": max(peaks),
+        "peak_mb": max(peak for _, peak in runs["ours"]),
         "info_s": messages / timed(info, bag, messages)[0],
         "frame_ratio_rosbags_dataframe": frames[0] / frames[1],
+        "convert_ratio_rosbags": copies[0] / copies[1],
         "bag_mb": sum(file.stat().st_size for file in bag.iterdir()) / 1e6,
     }
 
