@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 12_000,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_291,
+    ("tests",): 23_290,
     ("benchmarks", "examples"): 3_808,
 }
 ARGUMENTS, FIELDS = 6, 8
