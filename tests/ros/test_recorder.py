@@ -325,7 +325,6 @@ def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(
     assert (values["messages"], values["lost"]) == ("361", "0")
     with Bag(bag) as source:
         assert source.custom["/odom received"] == "121"
-        assert float(source.custom["/odom rate [Hz]"]) == pytest.approx(40.0, rel=0.01)
     for topic in TOPICS:
         assert messages_on(bag, topic) == messages_on(TRIAL_05, topic)
     with (bag / "recorded.mcap").open("rb") as stream:
