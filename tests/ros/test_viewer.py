@@ -78,7 +78,7 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
     drive_until("inside")
     assert reader.names == ["speed [m/s]"]
     assert reader.signals[1] == pytest.approx(width, rel=1e-4)
-    assert reader.samples > 5
+    robot.spin_until(lambda: reader.samples > 5)
     robot.spin_until(lambda: reader.verdict == "late")
     monitor.send_signal(signal.SIGSTOP)
     robot.spin_until(lambda: reader.verdict == "stale")
