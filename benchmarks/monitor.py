@@ -112,9 +112,9 @@ def timing_funnel(rate: int) -> OutputTubeDesign:
         t = np.arange(samples) * period
         trials.append(Trajectory(t=t, y=y, u=u, name=f"run_{index}", digest=f"sha256:{index:064x}"))
     design = design_output_tube(OutputTube(blank, Dataset(tuple(trials))))
-    (tube,) = design.funnel.tubes
+    tube = replace(design.funnel.tubes[0], level=2.0, peak=None)
     widths = np.sqrt(2.0 / tube.tau) * (1.0 + 1e-12)  # rounded up
-    funnel = replace(design.funnel, tubes=(replace(tube, level=2.0, half_widths=widths),))
+    funnel = replace(design.funnel, tubes=(replace(tube, half_widths=widths),))
     return Design.proved(blank, None, funnel, claim=design.claim, proof=design.proof, found=None)
 
 

@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 11_996,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_288,
+    ("tests",): 23_293,
     ("benchmarks", "examples"): 3_808,
 }
 ARGUMENTS, FIELDS = 6, 8

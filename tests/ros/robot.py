@@ -61,6 +61,8 @@ class Robot(Bench):
         self.spin_until(restart.call_async(Trigger.Request()).done)
         self.spin_until(lambda: self.has_said("restarted"))
 
+    period_ns = PERIOD_NS
+
     def drive(
         self,
         samples: Iterable[int],
@@ -79,13 +81,13 @@ class Robot(Bench):
         for k in samples:
             command, state = TwistStamped(), Odometry()
             for message in (command, state):
-                message.header.stamp = stamp_of(since_ns + k * PERIOD_NS)
+                message.header.stamp = stamp_of(since_ns + k * self.period_ns)
             state.header.frame_id, state.twist.twist.linear.x = frame, speed
             if clock:
                 self.clock.publish(Clock(clock=state.header.stamp))
             self.command.publish(command)
             self.odom.publish(state)
-            self.waits(slower * PERIOD_NS * 1e-9)
+            self.waits(slower * self.period_ns * 1e-9)
 
     def drive_now(self, samples: int, *, ahead: float = 0.0, **how: Any) -> None:
         """As `drive`, with stamps of now, or so many s later."""
