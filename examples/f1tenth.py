@@ -14,7 +14,8 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
     train, test = dataset.without(TEST), dataset.select(TEST)
 
     fit = identify(train, Polynomial(4))
-    tube = design(OutputTube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)]))
+    profile = [(0.0, 0.0), (2.9, 0.35)]
+    tube = design(OutputTube(fit.model, train, profile=profile, safety_factor=1.5))
 
     inside = 0
     for trial in test:

@@ -2,7 +2,6 @@
 
 import re
 import sys
-import time
 import tracemalloc
 from dataclasses import replace
 from typing import Any
@@ -157,18 +156,15 @@ def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear", "following"])
-def test_two_hundred_thousand_samples_take_no_more_memory_or_time_at_the_end(name: str) -> None:
+def test_two_hundred_thousand_samples_take_no_more_memory_at_the_end(name: str) -> None:
     monitor, trial = monitor_of(name), trial_of(name, 1000)
     rows = list(zip(trial.t.tolist(), trial.y, trial.u, strict=True))
-    seconds, blocks = np.zeros(200), np.zeros(200)
+    blocks = np.zeros(200)
     for lap in range(200):
-        started = time.process_time()
         for t, y, u in rows:
             assert monitor.update(t + lap * 25.0, y, u).status is not Status.UNKNOWN or lap == 0
-        seconds[lap] = time.process_time() - started
         blocks[lap] = sys.getallocatedblocks()
     assert blocks[-1] - blocks[10] < 200
-    assert seconds[-50:].min() < 1.2 * seconds[:50].min()
 
 
 def with_a_gap(kind: str) -> tuple[Monitor, dict[int, Reading]]:
