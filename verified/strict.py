@@ -327,7 +327,7 @@ def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
     need(type(given) is dict, f"{where}.assumption should be an object")
     kind = word(given.get("kind"), f"{where}.assumption", ("fading", "energy"))
     samples = " samples" if kind == "energy" else ""
-    members(given, f"{where}.assumption", f"kind {MEASURED}{samples}")
+    members(given, f"{where}.assumption", f"kind {MEASURED}{samples}", "rank")
     if samples:
         whole(given["samples"], "samples", 1, COUNT)
     need((rho == 1) == (kind == "energy"), f"{where}: rho is 1 exactly for an energy")
