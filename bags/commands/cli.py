@@ -10,7 +10,6 @@ import typer
 from bags.commands import designs_cli, learn_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
 from bags.commands.fleet_cli import fleet_app
-from bags.commands.main import main as main  # of commands that were installed before
 from bags.commands.options import flat
 
 app = typer.Typer(

@@ -24,7 +24,7 @@ from bags.commands.options import (
 from bags.commands.progress import progress_bar
 from nlsid_core import deciding
 from nlsid_core import second as second_kernel
-from nlsid_core.errors import CertificateRejected
+from nlsid_core.errors import CertificateRejected, DocumentError
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
@@ -233,6 +233,9 @@ def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False)
         except OSError as error:
             status = 2
             typer.echo(f"NOT READ {name}: {error.strerror}")
+        except DocumentError as error:  # of what the kernel does not read
+            status = 2
+            typer.echo(f"  NOT READ {error}")
     return status
 
 

@@ -55,7 +55,10 @@ class Provenance:
 
 
 def of_proof(proof: Path) -> Provenance:
-    """Of the funnel of a proof that was decided; nothing where no bound was measured."""
+    """Of the funnel of a proof that was decided; nothing where no bound was measured.
+
+    Raises DocumentError for what the kernel does not read and is not as its page says.
+    """
     about = json.loads(proof.read_bytes())["claim"]["about"]
     if not {"model", "funnel"} <= set(about):
         return Provenance()
@@ -63,7 +66,11 @@ def of_proof(proof: Path) -> Provenance:
         json.loads((proof.parent / about[role]["file"]).read_bytes())
         for role in ("model", "funnel")
     )
-    return of_funnel(model, funnel)
+    try:
+        return of_funnel(model, funnel)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        what = "what its assumption was measured on is not as its page says"
+        raise DocumentError(f"{about['funnel']['file']}: {what} ({error})") from error
 
 
 def of_funnel(model: Json, funnel: Json) -> Provenance:
@@ -105,15 +112,16 @@ def _judged(
         for name, bound, needed in bounds
         if bound < needed
     ]
-    rank = given.get("rank", 1)
-    if min(given["safety_factor"], rank) < 1:
-        wrong.append(f"{what}: the safety factor or the rank is below 1")
+    rank, count = given.get("rank", 1), distinct(trials)
+    if given["safety_factor"] < 1:
+        wrong.append(f"{what}: the safety factor is below 1")
+    if trials and (type(rank) is not int or not 1 <= rank <= len(trials)):
+        wrong.append(f"{what}: the rank is no whole number from 1 to that of the trials")
     if not trials:
         wrong.append(f"{what}: it was measured on no trial")
     if any(trial.shares(other) for trial in trials for other in before):
         wrong.append(f"{what}: a trial that chose it cannot measure it")
     measured, factor = Fraction(given["measured"]), Fraction(given["safety_factor"])
-    count = distinct(trials)
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}{'s' if count != 1 else ''}"
     scale = f"{text.above(measured)} by the scale of {those}"

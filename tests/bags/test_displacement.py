@@ -69,5 +69,6 @@ def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path
     assert moves
     assert 3 * float(found[1]) <= float(moves[1]) * 1.0001 < 0.5
     test = [bag for bag in bags if bag.name in ("trial_37", "trial_41")]
-    held = nlsid("monitor", out, *test, status=(0, 1))  # 1: one of them may set off an alarm
-    assert re.findall(r"^trial_\d+ (\w+)", held, re.MULTILINE) == ["inside", "inside"]
+    held = nlsid("monitor", out, *test, status=1)  # an alarm of which nothing is proved
+    verdicts = re.findall(r"^trial_\d+ (\w+(?:, \w+)?)", held, re.MULTILINE)
+    assert verdicts == ["inside", "inside, alarm"]

@@ -1,5 +1,6 @@
 """What is said of the trials behind a proof: counted once, and contradicted where they are."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -86,8 +87,8 @@ def test_a_design_that_was_measured_above_its_level_is_decided_and_not_run(
     [
         ("level", {"level": 0.02}, "its level is below"),
         ("peak", {"peak": {"at_most": [0.01], "measured": [0.007]}}, "a peak is below"),
-        ("assumption", {"safety_factor": 0.5}, "the safety factor or the rank is below 1"),
-        ("assumption", {"rank": 0}, "the safety factor or the rank is below 1"),
+        ("assumption", {"safety_factor": 0.5}, "the safety factor is below 1"),
+        *(("assumption", {"rank": rank}, "the rank is no whole") for rank in (0, 1.5, True, 99)),
         ("assumption", {"measured_on": []}, "measured on no trial"),
         (
             "assumption",
@@ -103,3 +104,31 @@ def test_what_contradicts_itself_is_said(
     tube = funnel["tubes"][0]
     tube |= {"assumption": tube["assumption"] | change} if place == "assumption" else change
     assert any(says in line for line in of_funnel(model, funnel).wrong)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("rank", "one"),
+        ("safety_factor", "much"),
+        ("measured", [1.0]),
+        ("measured_on", 7),
+        ("designed_on", [{}]),
+    ],
+)
+def test_what_cannot_be_read_is_said_in_a_line_below_the_verdict(
+    documents: tuple[Json, Json], key: str, value: object, tmp_path: Path
+) -> None:
+    _, funnel = documents
+    funnel["tubes"][0]["assumption"][key] = value
+    case = next(case for case in corpus() if (case.kind, case.name) == ("tube", "following"))
+    forged = case.copied()
+    forged.about["funnel.json"] = funnel
+    bind_again(forged)
+    for name, document in {**forged.about, "claim.proof.json": forged.document}.items():
+        (tmp_path / name).write_bytes(encoded(document))
+    said = CliRunner().invoke(app, ["check", str(tmp_path)])
+    assert said.exit_code == 2
+    proved, *_, unread = said.output.splitlines()
+    assert proved.startswith("PROVED tube: ")
+    assert unread.startswith("  NOT READ funnel.json: what its assumption was measured on")

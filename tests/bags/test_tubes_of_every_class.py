@@ -89,8 +89,11 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
         bad = (Status.OUTSIDE, Status.ASSUMPTION_VIOLATED)
         first = next((r.reason for r in replayed.readings if r.status in bad), "")
         assert "the assumption was kept" not in first
-    # Two trials of calibration: an untouched one may break what the proof assumes.
     assert calibrated.verdict == Status.INSIDE.value
+    if name == "block_cascade":  # two trials of calibration: one in three breaks what is assumed
+        assert "times what is assumed" in first
+    else:
+        assert untouched.verdict == Status.INSIDE.value
 
 
 def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
