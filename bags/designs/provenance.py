@@ -115,8 +115,10 @@ def _judged(
     rank, count = given.get("rank", 1), distinct(trials)
     if given["safety_factor"] < 1:
         wrong.append(f"{what}: the safety factor is below 1")
-    if trials and (type(rank) is not int or not 1 <= rank <= len(trials)):
-        wrong.append(f"{what}: the rank is no whole number from 1 to that of the trials")
+    if type(rank) is not int:
+        raise DocumentError("a rank is a whole number")
+    if trials and not 1 <= rank <= len(trials):
+        wrong.append(f"{what}: the rank is not from 1 to the number of trials")
     if not trials:
         wrong.append(f"{what}: it was measured on no trial")
     if any(trial.shares(other) for trial in trials for other in before):

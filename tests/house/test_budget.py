@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_828,
-    ("bags",): 12_001,
+    ("bags",): 12_003,
     ("nlsid_ros",): 2_664,
     ("tests",): 23_308,
     ("benchmarks", "examples"): 3_809,
