@@ -230,12 +230,9 @@ def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False)
         except CertificateRejected as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")
-        except OSError as error:
+        except (OSError, DocumentError) as error:  # the latter of what the kernel does not read
             status = 2
-            typer.echo(f"NOT READ {name}: {error.strerror}")
-        except DocumentError as error:  # of what the kernel does not read
-            status = 2
-            typer.echo(f"  NOT READ {error}")
+            typer.echo(f"NOT READ {name}: {getattr(error, 'strerror', error)}")
     return status
 
 
