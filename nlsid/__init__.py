@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         Degrees,
         Feedback,
         FilterMapFilter,
+        Follower,
         Fit,
         LeastSquares,
         Network,
@@ -57,6 +58,7 @@ __all__ = [
     "Design",
     "Feedback",
     "FilterMapFilter",
+    "Follower",
     "Fit",
     "Goal",
     "Grid",
@@ -95,6 +97,7 @@ _FAMILIES: Final = (
     "Degrees",
     "Network",
     "FilterMapFilter",
+    "Follower",
     "CellRow",
     "Feedback",
 )
