@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import ShapeError
 from nlsid_core.identification.fit import Step
@@ -59,7 +59,7 @@ class Loop:
     f: Knotted
 
     @property
-    def slopes(self) -> FloatArray:
+    def slopes(self) -> IntArray:
         """Where the slopes of f are in θ."""
         return 3 + np.arange(self.f.rows.shape[1])
 
@@ -81,7 +81,8 @@ class Loop:
 
     def errors(self, theta: FloatArray, trial: Trial) -> FloatArray:
         """e (N,) of the measured outputs."""
-        return theta[0] * delayed(trial.u[:, 0], self.delay, trial) + theta[1] - trial.y
+        late = delayed(trial.u[:, 0], self.delay, trial)
+        return np.asarray(theta[0] * late + theta[1] - trial.y)
 
     def fitted(
         self, theta: FloatArray, trials: Sequence[Trial], slowest: float, steps: int

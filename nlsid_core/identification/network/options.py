@@ -95,8 +95,8 @@ class Network(Generic[S]):
     """Filters and static maps in a structure that makes every such model stable.
 
     structure: `FilterMapFilter`, `CellRow`, `Feedback` or `Follower`, with its options.
-    start_samples: at the start of a trial, that show the first state of a row of cells or a loop and
-    are not scored, 1 to 10000. seed: of what is drawn at random, starts or inputs.
+    start_samples: at the start of a trial, that show the first state of cells or of a loop and are
+    not scored, 1 to 10000. seed: of what is drawn at random, starts or inputs.
     """
 
     structure: S
