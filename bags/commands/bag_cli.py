@@ -47,7 +47,7 @@ SignalsOption = Annotated[
     typer.Option(
         "--signal",
         "-s",
-        help=r"topic:field.path\[index], [*] or \[name=elbow]; then |to(deg), |derivative(0.1 s), ...",
+        help=r"topic:field.path\[0], [*] or \[name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
 
