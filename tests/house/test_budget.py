@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_828,
     ("bags",): 12_007,
     ("nlsid_ros",): 2_666,
-    ("tests",): 23_316,
+    ("tests",): 23_309,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
