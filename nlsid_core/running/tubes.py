@@ -203,7 +203,7 @@ class TubeRun:
         """Which input leaves the range or the pace that it had in training; empty if none does."""
         if self._trained is None:
             return ""
-        change = 0.0 if self._u_before is None else np.abs(u - self._u_before)
+        change = np.abs(u - (u if self._u_before is None else self._u_before))
         least, most, fastest = self._trained.T
         room = CLEARLY * (most - least)
         out = (u < least - room) | (u > most + room) | (change > fastest + room)

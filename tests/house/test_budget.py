@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_506,
-    ("bags",): 12_019,
+    ("bags",): 12_023,
     ("nlsid_ros",): 2_666,
     ("tests",): 22_917,
     ("benchmarks", "examples"): 3_809,
