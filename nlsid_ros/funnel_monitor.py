@@ -164,10 +164,12 @@ class FunnelMonitor(ManagedNode):
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """A proved design came, or another one: watch its signals from scratch."""
-        announced = bool(self.values.controller)
-        centre = Centre(self.values.nominal)
-        margin = self.values.warning_margin
-        watch = Watch(design, centre=centre, warning_margin=margin, announced=announced)
+        watch = Watch(
+            design,
+            centre=Centre(self.values.nominal),
+            warning_margin=self.values.warning_margin,
+            announced=bool(self.values.controller),
+        )
         for topic in self._topics.values():
             topic.drop()
         self._topics = {

@@ -311,8 +311,7 @@ class TrackingController(ManagedNode):
         self._responses.numbers.update(info["publication_sequence_number"])
         try:
             stamp_ns, numbers = header_stamp_ns(data), self._reader.numbers(data)
-            clock_ns = now_ns(self.get_clock())
-            distrust = self._responses.distrust(data, clock_ns, self._patient_for)
+            distrust = self._responses.distrust(data, now_ns(self.get_clock()), self._patient_for)
         except BagError as error:
             self._halt(str(error))
             return
@@ -397,8 +396,9 @@ class TrackingController(ManagedNode):
         if self._controller is None or not self._hears:
             return
         start_ns = 0 if self._run is None else self._run.start_ns
-        clock_ns = now_ns(self.get_clock())
-        if stamp_ns < start_ns or off_clock(stamp_ns, clock_ns, self.values.monitor_patience):
+        if stamp_ns < start_ns or off_clock(
+            stamp_ns, now_ns(self.get_clock()), self.values.monitor_patience
+        ):
             return
         funnel, _, of_run = message.header.frame_id.partition(" ")
         if funnel != self._digest:

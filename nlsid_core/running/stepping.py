@@ -87,15 +87,6 @@ class Stepper:
         state: FloatArray = self._kind.begin(y, u)
         return state
 
-    def rest(self, u: FloatArray) -> None:
-        """Go on as if the inputs (n_u,) had always been u."""
-        self._past.extend([u] * (self.delays + 1))
-
-    def after(self, x: FloatArray, window: FloatArray) -> FloatArray:
-        """The next state (n,) of x (n,) under the inputs (delays + 1, n_u), the oldest first."""
-        _, after = self._kind.advance(x[None], deque(window))
-        return np.asarray(after[0])
-
     def ahead(self) -> "Stepper":
         """Another one in the same place, whose steps leave this one where it is."""
         other = copy.copy(self)

@@ -11,7 +11,7 @@ rests on. Source: docs/certificate_tube.md.
 import copy
 import math
 from collections.abc import Sequence
-from itertools import repeat
+from itertools import chain, repeat
 from operator import add, gt, mul, sub, truediv
 from typing import Any, NamedTuple
 
@@ -25,14 +25,14 @@ from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
-from nlsid_core.running.forecast import OUTWARD, linear_form, reach
+from nlsid_core.running.forecast import OUTWARD, Forecast, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status, Trend, unsaid
 from nlsid_core.running.stepping import Rows, Stepper
 
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
-TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
+TINY, LEAST = 1e-100, 1e-300  # g, and what it makes, where no command opens a level: not 0
 STARTING = "waiting for the first"
 PACE = 0.01  # of what a gap is too long, by which the mean follows: over some 100 samples
 OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
@@ -56,7 +56,6 @@ class TubeRun:
         if any(tube.L.shape != (n, p) for tube in tubes):
             raise DataError("the funnel is not one of this model")
         self._limits = list(map(Limits.of, tubes))
-        self._widths = [limits.widths for limits in self._limits]  # where no commands move them
         self._follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
@@ -101,9 +100,8 @@ class TubeRun:
 
         NaN, or None for u, is a sample without a measurement.
         """
-        if u is None:
-            u = np.full(len(self._stepper.u), np.nan)
-        measured, applied = _floats(y), _floats(u)
+        measured = _floats(y)
+        applied = [math.nan] * len(self._stepper.u) if u is None else _floats(u)
         fault = self._take(t)
         if fault:
             return self._unknown(t, measured, fault)
@@ -128,6 +126,50 @@ class TubeRun:
         nothing = [math.nan] * len(self._names)
         fault = self._take(t) or self._without(_floats(u), reason)
         return self._unknown(t, nothing, fault or reason)
+
+    def forecast(self, u: FloatArray) -> Forecast:
+        """What the outputs can be under the inputs u (h, n_u) of the next samples.
+
+        By a second simulation from the present estimate, and by the tubes; the run goes on as if it
+        were not there.
+        """
+        if len(u) > len(self._reach):
+            self._reach = np.stack(
+                [reach(t, self._linear, 2 * len(u)) for t in self._tubes], axis=1
+            )
+        x, stepper = self._x or [], self._stepper.ahead()
+        g, meters = self._g, copy.deepcopy(self._meters)
+        ended = "" if x else "no run has begun"
+        found: list[tuple[FloatArray, FloatArray]] = []
+        rho, spent = np.array([limits.rho for limits in self._limits]), np.array(self._spent)
+        total = np.zeros(len(rho))
+        for now, reached in zip(u.tolist() if x else [], self._reach, strict=False):
+            outputs, x, ended = self._advance(stepper, x, now)
+            g = _followed(meters, g, now)
+            limits = list(map(Limits.at, self._limits, g))
+            spent = rho * spent
+            total = rho * total + np.maximum(g, 1.0)
+            level, most = (
+                np.array([getattr(each, name) for each in limits]) for name in ("level", "single")
+            )
+            left = np.minimum(
+                level * (1.0 + OUTWARD) - spent * (1.0 - OUTWARD), most * total * (1.0 + OUTWARD)
+            )
+            lasting = self._lasting(self._k + len(found) + 1)
+            if not (lasting and (left[lasting] >= 0.0).all()):
+                ended = ended or "what the tube assumes is broken, or over"
+            if ended:
+                break
+            widths = np.array([each.widths for each in limits])
+            centres = np.vstack([np.array(outputs)[lasting], [outputs[-1]] * len(lasting)])
+            room = np.vstack([np.sqrt(left[lasting, None] * reached[lasting]), widths[lasting]])
+            room = room * (1.0 + OUTWARD) + np.tile(
+                np.array(self._hides(outputs[-1]))[lasting], (2, 1)
+            )
+            found.append(((centres - room).max(axis=0), (centres + room).min(axis=0)))
+        bounds = np.reshape(found, (len(found), 2, len(self._names)))
+        t = self.period * np.arange(1, len(found) + 1)
+        return Forecast(t, bounds[:, 0], bounds[:, 1], ended)
 
     def _take(self, t: float) -> str:
         """Count the sample stamped t; a new run starts where some before it did not come."""
@@ -167,11 +209,10 @@ class TubeRun:
     def _fault(self, t: float, y: list[float], u: list[float]) -> str:
         if len(y) != len(self._names) or len(u) != len(self._stepper.u):
             return f"{len(y)} outputs and {len(u)} inputs at t = {t:g} s"
-        if _are_finite(y) and _are_finite(u):
-            return ""
-        values = zip((*y, *u), self._signals, strict=True)
-        value, signal = next(each for each in values if not math.isfinite(each[0]))
-        return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
+        for value, signal in zip((*y, *u), self._signals, strict=True):
+            if not math.isfinite(value):
+                return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
+        return ""
 
     def _without(self, u: list[float], fault: str) -> str:
         """A step with e = 0 under the input u, or a new run if that is not known.
@@ -223,21 +264,21 @@ class TubeRun:
             self._begin(refused)
             return self._unknown(t, y, f"{refused}; a new run starts")
         g = self._g = _followed(self._meters, self._g, u)
+        limits = list(map(Limits.at, self._limits, g)) if self._follow else self._limits
         *predicted, simulated = outputs
         deviation = list(map(sub, y, simulated))
         innovations = [list(map(sub, y, each)) for each in predicted]
-        self._spent = list(map(Limits.spend, self._limits, self._spent, innovations))
+        self._spent = list(map(Limits.spend, limits, self._spent, innovations))
         hidden = self._hides(simulated)
-        widths = list(map(Limits.at, self._limits, g)) if self._follow else self._widths
-        away = list(map(_sizes, repeat(deviation), hidden, widths))
-        self._x = [*map(Limits.corrected, self._limits, after, innovations), after[-1]]
+        away = list(map(Limits.sizes, limits, repeat(deviation), hidden))
+        self._x = [*map(Limits.corrected, limits, after, innovations), after[-1]]
         self._k += 1
         followed = all(map(math.isfinite, g))
-        if not (followed and all(map(_are_finite, (self._spent, simulated, *self._x)))):
+        if not (followed and all(map(math.isfinite, chain(self._spent, simulated, *self._x)))):
             what = "the model's state" if followed else "the level that follows the commands"
             reason = f"{what} is not finite at t = {t:g} s"
             self._begin(reason)
-            if _are_finite(simulated) and max(map(max, away)) > 1.0:
+            if all(map(math.isfinite, simulated)) and max(map(max, away)) > 1.0:
                 return Reading(
                     t,
                     Status.OUTSIDE,
@@ -249,9 +290,9 @@ class TubeRun:
                     reason=f"outside the tube; {reason}",
                 )
             return self._unknown(t, y, reason)
-        for hides, room in zip(hidden, widths, strict=True):
-            if not max(map(_part, hides, room)) <= MOST_ROUNDING:
-                most, least = f"{max(hides):.2g}", f"{min(room):.2g}"
+        for hides, each in zip(hidden, limits, strict=True):
+            if not max(map(truediv, hides, each.widths)) <= MOST_ROUNDING:
+                most, least = f"{max(hides):.2g}", f"{min(each.widths):.2g}"
                 return self._unknown(
                     t,
                     y,
@@ -265,13 +306,13 @@ class TubeRun:
             return self._unknown(t, y, over)._replace(alarm=alarm)
         nearest = max(lasting, key=lambda j: max(away[j]))
         size = max(away[nearest])
-        share, reason = self._used(t, lasting, innovations)
+        share, reason = self._used(t, lasting, limits, innovations)
         status = Status.ASSUMPTION_VIOLATED if reason else Status.INSIDE
         if not size <= 1.0:
             status = Status.OUTSIDE
             kept = "although the assumption was kept: what runs is not what was proved"
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
-        narrowest = zip(*[widths[j] for j in lasting], strict=True) if self._follow else ()
+        moved = [limits[j].widths for j in lasting] if self._follow else []
         return Reading(
             t,
             status,
@@ -286,22 +327,21 @@ class TubeRun:
             self._assuming,
             [*deviation, *innovations[0]],
             alarm,
-            tuple(map(min, narrowest)),
+            tuple(map(min, zip(*moved, strict=True))),
         )
 
     def _used(
-        self, t: float, lasting: list[int], innovations: list[list[float]]
+        self, t: float, lasting: list[int], limits: "list[Limits]", innovations: Rows
     ) -> tuple[float, str]:
         """The most of what the tubes that last assume that is used, and what is exceeded."""
-        limits, g = self._limits, self._g
-        spent, most = max((_part(self._spent[j], limits[j].level_at(g[j])), j) for j in lasting)
-        peak, sharpest = max((limits[j].sharpest(innovations[j], g[j]), j) for j in lasting)
+        spent, most = max((self._spent[j] / limits[j].level, j) for j in lasting)
+        peak, sharpest = max((limits[j].sharpest(innovations[j]), j) for j in lasting)
         used = max(spent, peak)
         if not spent <= 1.0:
             unit = self._tubes[most].energy_unit(self._stepper.y)
             return used, (
                 f"innovation energy {self._spent[most]:.4g}{unit} above the level "
-                f"{limits[most].level_at(g[most]):.4g}{unit} at t = {t:g} s"
+                f"{limits[most].level:.4g}{unit} at t = {t:g} s"
             )
         if not peak <= 1.0:
             assumed = self._tubes[sharpest].peak
@@ -339,67 +379,12 @@ class TubeRun:
             f"side, above {cusum.threshold:.4g}; nothing is proved of this"
         )
 
-    def _reached(self, steps: int) -> FloatArray:
-        """(tubes, p) of `reach` after so many steps; found for twice as many where they are new."""
-        if steps > len(self._reach):
-            parts = [reach(tube, self._linear, 2 * steps) for tube in self._tubes]
-            self._reach = np.stack(parts, axis=1)
-        return np.asarray(self._reach[steps - 1])
-
     def _lasting(self, k: int) -> list[int]:
         """The tubes whose proof covers k samples."""
         return [j for j, tube in enumerate(self._tubes) if k <= (tube.samples or k)]
 
     def _unknown(self, t: float, y: list[float], reason: str) -> Reading:
         return Reading(t, Status.UNKNOWN, measured=tuple(y), reason=reason)
-
-
-class Ahead:
-    """A second simulation from a run's present estimate, and how far the robot can be from it.
-
-    `step` once for each next sample, with its inputs. Where it says nothing, `ended` says why, and
-    it never says anything again. The run goes on as if this were not there.
-    """
-
-    def __init__(self, run: TubeRun) -> None:
-        self._run = run
-        self._x, self._k, self._spent, self._g = run._x, run._k, run._spent, run._g
-        self._stepper, self._meters = run._stepper.ahead(), copy.deepcopy(run._meters)
-        self.steps, self._total = 0, [0.0] * len(run._limits)
-        self.ended = "no run has begun" if self._x is None else ""
-
-    def step(self, u: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Between which values (p,) the outputs are at the next sample, under its inputs u (n_u,).
-
-        Within the funnel's tubes too.
-        """
-        run = self._run
-        if self.ended or self._x is None:
-            return None
-        now = u.tolist()
-        rows, self._x, self.ended = run._advance(self._stepper, self._x, now)
-        self.steps += 1
-        self._g = g = _followed(self._meters, self._g, now)
-        left = np.array(list(map(self._left, range(len(g)))))
-        lasting = run._lasting(self._k + self.steps)
-        if not lasting or not (left[lasting] >= 0.0).all():
-            self.ended = self.ended or "what the tube assumes is broken, or over"
-        if self.ended:
-            return None
-        outputs, widths = np.array(rows), np.array(list(map(Limits.at, run._limits, g)))
-        beside = np.sqrt(left[lasting, None] * run._reached(self.steps)[lasting])
-        centres = np.vstack([outputs[lasting], np.tile(outputs[-1], (len(lasting), 1))])
-        room = np.vstack([beside, widths[lasting]]) * (1.0 + OUTWARD)
-        room += np.tile(np.array(run._hides(rows[-1]))[lasting], (2, 1))
-        return (centres - room).max(axis=0), (centres + room).min(axis=0)
-
-    def _left(self, j: int) -> float:
-        """The most that the innovations from here on can have spent of tube j's level."""
-        limits, g = self._run._limits[j], self._g[j]
-        spent = limits.rho**self.steps * self._spent[j] * (1.0 - OUTWARD)
-        self._total[j] = limits.rho * self._total[j] + max(g, 1.0)
-        left = limits.level_at(g) * (1.0 + OUTWARD) - spent
-        return min(left, limits.single * self._total[j] * (1.0 + OUTWARD))
 
 
 def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
@@ -455,37 +440,28 @@ class Limits(NamedTuple):
         """The observer's next state: the model's, and L e."""
         return [each + sum(map(mul, row, e)) for each, row in zip(after, self.L, strict=True)]
 
-    def sharpest(self, e: list[float], g: float) -> float:
+    def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
         parts = list(map(truediv, e, self.peak))
-        return float(max(map(mul, parts, parts)) / max(g, 1.0))
+        return float(max(map(mul, parts, parts)))
 
-    def level_at(self, g: float) -> float:
-        """The level where the commands give it this much room."""
-        return self.level * max(g, TINY)
+    def sizes(self, deviation: list[float], hidden: list[float]) -> list[float]:
+        """(p,) how far out of the tube the outputs can be: 1 on its boundary."""
+        return list(map(truediv, map(add, map(abs, deviation), hidden), self.widths))
 
-    def at(self, g: float) -> list[float]:
-        """The half-widths there."""
-        room = math.sqrt(max(g, TINY))
-        return [width * room for width in self.widths]
+    def at(self, g: float) -> "Limits":
+        """Those where the commands give the level this much room."""
+        room, sample = max(g, TINY), math.sqrt(max(g, 1.0))
+        return self._replace(
+            level=max(self.level * room, LEAST),
+            peak=[each * sample for each in self.peak],
+            widths=[max(each * math.sqrt(room), LEAST) for each in self.widths],
+        )
 
 
 def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> list[float]:
     """By what each tube's level is multiplied at the next sample, whose inputs are u (n_u,)."""
-    if not meters:
-        return g
     return [meters[j].update(u) if j in meters else each for j, each in enumerate(g)]
-
-
-def _sizes(deviation: list[float], hidden: list[float], widths: list[float]) -> list[float]:
-    """(p,) how far out of a tube the outputs can be: 1 on its boundary."""
-    most = map(add, map(abs, deviation), hidden)
-    return list(map(_part, most, widths))
-
-
-def _part(amount: float, whole: float) -> float:
-    """Their ratio; inf beside what is so small that it is 0."""
-    return amount / whole if whole else math.inf
 
 
 def _floats(values: Any) -> list[float]:
@@ -493,10 +469,6 @@ def _floats(values: Any) -> list[float]:
     if isinstance(values, float | int):
         return [float(values)]
     return np.array(values, dtype=np.float64).ravel().tolist()
-
-
-def _are_finite(values: list[float]) -> bool:
-    return all(map(math.isfinite, values))
 
 
 def _within(rows: Rows, box: Rows) -> bool:

@@ -11,9 +11,9 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_868,
+    ("nlsid_core",): 18_828,
     ("bags",): 12_007,
-    ("nlsid_ros",): 2_669,
+    ("nlsid_ros",): 2_664,
     ("tests",): 23_316,
     ("benchmarks", "examples"): 3_807,
 }
