@@ -47,7 +47,7 @@ SignalsOption = Annotated[
     typer.Option(
         "--signal",
         "-s",
-        help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
+        help=r"topic:field.path\[0], [*] or \[name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
 
@@ -282,7 +282,7 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help="signal=column: /joints:position[name=elbow]=angle; repeat.",
+            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat.",
         ),
     ] = None,
     types: Annotated[

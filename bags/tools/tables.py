@@ -157,7 +157,7 @@ def frame(
                 raise BagError(f"{source.path}: {topic} has no messages")
             rows = {n: np.concatenate([p[n] for p in parts[topic]]) for n in parts[topic][0]}
             by = "stamp_ns" if clock == "header" and "stamp_ns" in rows else "log_time_ns"
-            index = pandas.to_datetime(rows[by]).rename("time")
+            index = pandas.DatetimeIndex(rows[by].view("M8[ns]"), name="time")
             named = {n: v for n, v in rows.items() if n not in TIMES}
             if len(tables) > 1:
                 named = {f"{topic}:{n}": v for n, v in named.items()}

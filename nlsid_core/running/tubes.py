@@ -26,7 +26,7 @@ from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, Forecast, linear_form, reach
-from nlsid_core.running.grid import TOLERANCE, early
+from nlsid_core.running.grid import OTHER_PACE, TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status, Trend, unsaid
 from nlsid_core.running.stepping import Rows, Stepper
 
@@ -35,8 +35,9 @@ ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY, LEAST = 1e-100, 1e-300  # g, and what it makes, where no command opens a level: not 0
 STARTING = "waiting for the first"
 PACE = 0.01  # of what a gap is too long, by which the mean follows: over some 100 samples
-OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
 COARSE = "float64 cannot tell where the simulation is"
+BEYOND = "commanded beyond training"
+CLEARLY = 0.01  # of the range in training, by which a command is beyond it
 WATCHED = "watched as well, not needed for the tube's sentence"
 
 
@@ -61,6 +62,9 @@ class TubeRun:
         }
         if any(level.inputs > len(self._stepper.u) for level in self._follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
+        self._trained: Rows = [] if funnel.commands is None else funnel.commands.tolist()
+        if self._trained and len(self._trained) != len(self._stepper.u):
+            raise DataError("the funnel's commands are not those of this model")
         self._cusum = funnel.cusum
         self._deviation = [] if self._cusum is None else self._cusum.deviation.tolist()
         self._signals = (*self._stepper.y, *self._stepper.u)
@@ -91,6 +95,8 @@ class TubeRun:
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
         self._g = [1.0] * len(self._tubes)
+        self._u_before: list[float] | None = None
+        self._beyond = ""
         alarm = self._cusum
         self._sums = None if alarm is None else CusumMeter(len(self._names), alarm.drift)
         self._trend = Trend()
@@ -108,6 +114,8 @@ class TubeRun:
         fault = self._fault(t, measured, applied)
         if fault:
             return self._unknown(t, measured, self._without(applied, fault) or fault)
+        self._beyond = self._beyond or self._beyond_training(t, applied)
+        self._u_before = applied
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
@@ -212,6 +220,21 @@ class TubeRun:
         for value, signal in zip((*y, *u), self._signals, strict=True):
             if not math.isfinite(value):
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
+        return ""
+
+    def _beyond_training(self, t: float, u: list[float]) -> str:
+        """Which input leaves the range or the pace that it had in training; empty if none does."""
+        signals, before = self._stepper.u, self._u_before or u
+        for signal, now, last, (least, most, fastest) in zip(
+            signals, u, before, self._trained, strict=False
+        ):
+            room, change = CLEARLY * (most - least), abs(now - last)
+            inside = least - room <= now <= most + room
+            if inside and change <= fastest + room:
+                continue
+            said = f"changed by {change:.4g} in a sample" if inside else f"{now:.4g}"
+            trained = f"{least:.4g} to {most:.4g}, changes to {fastest:.4g}"
+            return f"; {BEYOND} from t = {t:g} s on: {signal.name} {said}, in training {trained}"
         return ""
 
     def _without(self, u: list[float], fault: str) -> str:
@@ -324,7 +347,7 @@ class TubeRun:
             tuple(y),
             Level.TUBE if size <= 1.0 else Level.NONE,
             reason,
-            self._assuming,
+            self._assuming + self._beyond,
             [*deviation, *innovations[0]],
             alarm,
             tuple(map(min, zip(*moved, strict=True))),
