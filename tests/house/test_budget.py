@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_502,
+    ("nlsid_core",): 18_544,
     ("bags",): 12_023,
     ("nlsid_ros",): 2_664,
-    ("tests",): 22_917,
+    ("tests",): 22_989,
     ("benchmarks", "examples"): 3_807,
 }
 ARGUMENTS, FIELDS = 6, 8
