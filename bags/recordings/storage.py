@@ -96,8 +96,11 @@ class Raw(NamedTuple):
 
 
 def defined(channel: Channel, given: Mapping[str, Definition], release: str) -> Channel:
-    """The channel, with a definition where its file has none: the given one, or the release's."""
-    if channel.schema[0] in FORMATS:
+    """The channel, with a definition where its file has none: the given one, or the release's.
+
+    rosbag2 writes those of services' events without the event's own fields: the given one is used.
+    """
+    if channel.schema[0] in FORMATS and "/srv/" not in channel.msgtype:
         return channel
     if channel.msgtype in given:
         text = given[channel.msgtype].text

@@ -230,25 +230,51 @@ def test_operations_are_exported(bag: Path, tmp_path: Path) -> None:
     assert np.isnan(column[: -len(expected)]).all()
 
 
-def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path: Path) -> None:
-    (tmp_path / "my_robot" / "msg").mkdir(parents=True)
-    text = "std_msgs/Header header\nfloat64 throttle\n"
-    (tmp_path / "my_robot" / "msg" / "Drive.msg").write_text(text)
+STAMPED = "std_msgs/Header header\nfloat64 throttle\n"
+DEFINED = {  # place -> its text, the type, the bytes before the number and the signal
+    "msg/Drive.msg": (STAMPED, "my/msg/Drive", (b"\1" + bytes(7)) * 2, "throttle"),
+    "msg/Drive.idl": (
+        "module my { module msg { struct Drive { long count; double throttle; }; }; };",
+        "my/msg/Drive",
+        bytes(8),
+        "throttle",
+    ),
+    "srv/Drive.srv": (
+        "float64 throttle\n---\nbool done\n",
+        "my/srv/Drive_Event",
+        bytes(40) + b"\1" + bytes(7),
+        "request[0].throttle",
+    ),
+    "action/Drive.action": (
+        "float64 far\n---\nbool done\n---\nfloat64 throttle\n",
+        "my/action/Drive_FeedbackMessage",
+        bytes(16),
+        "feedback.throttle",
+    ),
+}
+
+
+@pytest.mark.parametrize("place", DEFINED)
+def test_a_type_that_the_bag_does_not_define_is_read_from_its_file(
+    tmp_path: Path, place: str
+) -> None:
+    text, msgtype, before, field = DEFINED[place]
+    file = tmp_path / "my" / place
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
     bare = tmp_path / "bare.mcap"
     with bare.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start(profile="ros2")
-        schema = writer.register_schema("my_robot/msg/Drive", "", b"")
-        channel = writer.register_channel("/drive", "cdr", schema)
+        channel = writer.register_channel("/drive", "cdr", writer.register_schema(msgtype, "", b""))
         for k in range(50):
-            stamp = START_NS + k * PERIOD_NS
-            data = struct.pack("<4s2II4sd", b"\0\1\0\0", *divmod(stamp, 10**9), 1, b"", k)
-            writer.add_message(channel, stamp, data, stamp)
+            data = b"\0\1\0\0" + before + struct.pack("<d", k) + b"\0" * 4 * ("srv" in place)
+            writer.add_message(channel, START_NS + k, data, START_NS + k)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates half of its writer
-    signal = "/drive:throttle"
-    with pytest.raises(BagError, match=r"'my_robot/msg/Drive' is not known: .*--definitions"):
+    signal = f"/drive:{field}"
+    with pytest.raises(BagError, match=rf"'{msgtype}' is not known: .*--definitions"):
         read_signals(bare, [signal])
-    given = ["--definitions", tmp_path / "my_robot"]
+    given = ["--definitions", tmp_path / "my"]
     assert "throttle" in run("signals", bare, *given)
     run("export", bare, "--out", tmp_path / "tables", *given)
     run("info", bare, *given)
