@@ -295,7 +295,7 @@ class Storage:
 
     @property
     def start_ns(self) -> int:
-        """The first log time; 0 if there are no messages."""
+        """The first log time in ns; 0 if there are no messages."""
         first = min(map(_first_ns, self.files), default=NEVER)
         return 0 if first == NEVER else first
 

@@ -232,24 +232,24 @@ def test_operations_are_exported(bag: Path, tmp_path: Path) -> None:
 
 STAMPED = "std_msgs/Header header\nfloat64 throttle\n"
 DEFINED = {  # place -> its text, the type, the bytes before the number and the signal
-    "msg/Drive.msg": (STAMPED, "my/msg/Drive", (b"\1" + bytes(7)) * 2, "throttle"),
+    "msg/Drive.msg": (STAMPED, "my/msg/Drive", (b"\1" + bytes(7)) * 2, "/drive:throttle"),
     "msg/Drive.idl": (
         "module my { module msg { struct Drive { long count; double throttle; }; }; };",
         "my/msg/Drive",
         bytes(8),
-        "throttle",
+        "/drive:throttle",
     ),
     "srv/Drive.srv": (
         "float64 throttle\n---\nbool done\n",
         "my/srv/Drive_Event",
         bytes(40) + b"\1" + bytes(7),
-        "request[0].throttle",
+        "/drive:request[0].throttle",
     ),
     "action/Drive.action": (
         "float64 far\n---\nbool done\n---\nfloat64 throttle\n",
         "my/action/Drive_FeedbackMessage",
         bytes(16),
-        "feedback.throttle",
+        "/drive:feedback.throttle",
     ),
 }
 
@@ -258,7 +258,7 @@ DEFINED = {  # place -> its text, the type, the bytes before the number and the 
 def test_a_type_that_the_bag_does_not_define_is_read_from_its_file(
     tmp_path: Path, place: str
 ) -> None:
-    text, msgtype, before, field = DEFINED[place]
+    text, msgtype, before, signal = DEFINED[place]
     file = tmp_path / "my" / place
     file.parent.mkdir(parents=True)
     file.write_text(text)
@@ -271,7 +271,6 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_file(
             data = b"\0\1\0\0" + before + struct.pack("<d", k) + b"\0" * 4 * ("srv" in place)
             writer.add_message(channel, START_NS + k, data, START_NS + k)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates half of its writer
-    signal = f"/drive:{field}"
     with pytest.raises(BagError, match=rf"'{msgtype}' is not known: .*--definitions"):
         read_signals(bare, [signal])
     given = ["--definitions", tmp_path / "my"]
@@ -279,8 +278,8 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_file(
     run("export", bare, "--out", tmp_path / "tables", *given)
     run("info", bare, *given)
     run("convert", bare, "--out", tmp_path / "defined", *given)
-    values = read_signals(tmp_path / "defined", [signal])[signal].values
-    assert values.tolist() == np.arange(50.0).tolist()
+    read = read_signals(tmp_path / "defined", [signal])
+    assert read[signal].values.tolist() == np.arange(50.0).tolist()
 
 
 @pytest.mark.pictures
@@ -451,7 +450,10 @@ def table_in(path: Path) -> Any:
 
 
 def test_what_changes_its_length_and_what_is_nested_are_lists_of_true_types(tmp_path: Path) -> None:
-    text = "byte[] codes\nbool on\nstring word\nstring[] words\ngeometry_msgs/Point[] points\n"
+    text = (
+        "byte[] codes\nbool on\nstring word\nstring[] words\n"
+        "geometry_msgs/Point[] points\nuint8[] pixels\n"
+    )
     defined = definitions_from({"my/msg/All": text})["my/msg/All"]
     embedded = MessageDefinition(MessageDefinitionFormat.MSG, defined.text)
     types = types_in_bag("my/msg/All", embedded)
@@ -461,10 +463,13 @@ def test_what_changes_its_length_and_what_is_nested_are_lists_of_true_types(tmp_
         for k in range(40):
             codes = np.full(k % 3, 200, np.uint8)
             words, points = ["a"] * (k % 2), [point(float(k), 0.0, 0.0)] * (k % 2 + 1)
-            message: Any = types.types["my/msg/All"](codes, k > 5, f"w{k}", words, points)
+            message: Any = types.types["my/msg/All"](
+                codes, k > 5, f"w{k}", words, points, np.zeros(5000, np.uint8)
+            )
             data = bytes(types.serialize_cdr(message, "my/msg/All"))
             writer.write("/all", "my/msg/All", data, log_time_ns=k, publish_time_ns=k)
     rows = frame(tmp_path / "all", ["/all"])
+    assert rows.attrs["left_out"] == ["/all:pixels: 5000 elements; name those you need"]
     assert rows["on"].dtype == bool
     assert rows["word"].tolist() == [f"w{k}" for k in range(40)]
     assert [list(codes) for codes in rows["codes"][:3]] == [[], [200], [200, 200]]

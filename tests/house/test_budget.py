@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_472,
-    ("bags",): 12_026,
+    ("bags",): 12_007,
     ("nlsid_ros",): 2_666,
-    ("tests",): 22_897,
+    ("tests",): 22_896,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
