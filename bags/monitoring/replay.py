@@ -25,6 +25,7 @@ from nlsid_core.errors import BagError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status, cause
+from nlsid_core.running.tubes import BEYOND
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -256,6 +257,12 @@ class Replay:
     def first_alarm(self) -> Reading | None:
         """The first reading with a second alarm, which is no verdict."""
         return next((r for r in self.judged if r.alarm), None)
+
+    @property
+    def beyond(self) -> str:
+        """What was commanded that no training trial had, and from when on; empty if nothing."""
+        said = (r.assuming.partition(BEYOND) for r in self.judged)
+        return next((f"{BEYOND}{what}" for _, found, what in said if found), "")
 
     @property
     def assumption(self) -> float:

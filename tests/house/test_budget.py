@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_472,
-    ("bags",): 12_007,
+    ("nlsid_core",): 18_506,
+    ("bags",): 12_023,
     ("nlsid_ros",): 2_666,
-    ("tests",): 22_896,
+    ("tests",): 22_917,
     ("benchmarks", "examples"): 3_809,
 }
 ARGUMENTS, FIELDS = 6, 8
