@@ -3,7 +3,7 @@
 A command imports what it runs when it is called.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -112,7 +112,7 @@ def signals(
     ):
         found = bag_signals(source, progress=progress)
     if as_json:
-        typer.echo(bag_show.signals_json(found))
+        typer.echo(bag_show.as_json([asdict(listed) for listed in found]))
     else:
         out.print(bag_show.signals_table(found))
 
