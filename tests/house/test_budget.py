@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_544,
+    ("nlsid_core",): 18_549,
     ("bags",): 12_023,
     ("nlsid_ros",): 2_664,
     ("tests",): 22_989,
