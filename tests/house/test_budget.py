@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_549,
-    ("bags",): 12_023,
+    ("nlsid_core",): 18_551,
+    ("bags",): 12_027,
     ("nlsid_ros",): 2_664,
-    ("tests",): 22_989,
+    ("tests",): 22_991,
     ("benchmarks", "examples"): 3_807,
 }
 ARGUMENTS, FIELDS = 6, 8
