@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_546,
+    ("nlsid_core",): 18_551,
     ("bags",): 12_027,
     ("nlsid_ros",): 2_664,
     ("tests",): 22_991,
