@@ -13,7 +13,7 @@ from tests.house.sources import sources
 STATEMENTS = {
     ("nlsid_core",): 18_551,
     ("bags",): 12_029,
-    ("nlsid_ros",): 2_664,
+    ("nlsid_ros",): 2_662,
     ("tests",): 23_000,
     ("benchmarks", "examples"): 3_807,
 }
