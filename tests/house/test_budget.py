@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_551,
-    ("bags",): 12_027,
+    ("bags",): 12_025,
     ("nlsid_ros",): 2_664,
     ("tests",): 22_991,
     ("benchmarks", "examples"): 3_807,
