@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_551,
-    ("bags",): 12_029,
+    ("bags",): 12_027,
     ("nlsid_ros",): 2_662,
     ("tests",): 23_000,
     ("benchmarks", "examples"): 3_807,
