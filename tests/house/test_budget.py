@@ -12,13 +12,8 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_551,
-<<<<<<< HEAD
     ("bags",): 12_025,
-    ("nlsid_ros",): 2_664,
-=======
-    ("bags",): 12_027,
     ("nlsid_ros",): 2_662,
->>>>>>> main
     ("tests",): 22_991,
     ("benchmarks", "examples"): 3_807,
 }
