@@ -17,7 +17,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import ShapeError
+from nlsid_core.errors import Infeasible, ShapeError
 from nlsid_core.identification.fit import Step
 from nlsid_core.identification.network.cells import NONE, SMOOTHING, TOLERANCE
 from nlsid_core.identification.network.fit import Minimum, Problem, Scaled, minimise, shortened
@@ -31,6 +31,7 @@ from nlsid_core.models import CellNetwork
 INERTIAS = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9)  # a
 MOST_DELAY = 10  # samples
 INSIDE = 0.98  # of the circle criterion's slope: the proof has room
+HALF = 0.5  # of the largest slope, which the least one is below
 START_SAMPLES, START_STEPS = 3000, 12
 KEPT = 2  # of a and d, refined
 WIDTHS = (8, 4, 2, 1, 1, 1, 1, 2, 4, 8)  # of the intervals of f, on a grid
@@ -112,6 +113,8 @@ def follower(
     late = min(range(MOST_DELAY + 1), key=lambda delay: _start(INERTIAS[0], delay, short)[3])
     tried, steps = [], []
     for a in INERTIAS:
+        if 1.0 - slowest > HALF * (1.0 - a):
+            break  # the slopes' bounds leave nothing
         least = np.inf
         while late >= 0:
             loop, theta, begun, _ = _start(a, late, short)
@@ -122,6 +125,8 @@ def follower(
                 break
             least, late = found.rms, late - 1
         late += 1  # more of the lag is inertia
+    if not tried:
+        raise Infeasible("no follower keeps to so small a max_rate; give a larger one")
     refined = []
     for loop, found in sorted(tried, key=lambda entry: entry[1].rms)[:KEPT]:
         begun = [replace(t, start=loop.errors(found.parameters, t)[:2]) for t in trials]
