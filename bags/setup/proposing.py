@@ -34,6 +34,7 @@ from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
+MOST_OPTIMISM: Final = 5.0
 SAFETY: Final = 1.2  # on the disturbance's amplitude, the funnel's own default
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
@@ -467,5 +468,12 @@ def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]
 
 
 def _say_funnel(proposal: Proposal) -> None:
-    proposal.content["funnel"] = {"safety_factor": SAFETY}
-    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less"
+    """Where the level is set by trials that the model was fitted to, their errors are too small."""
+    times = 1.0
+    if proposal.choice is not None and not proposal.content["split"].get("calibration"):
+        times = min(proposal.choice.optimism, MOST_OPTIMISM)
+    proposal.content["funnel"] = {"safety_factor": float(f"{SAFETY * times:.2g}")}
+    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less" + (
+        f"; {SAFETY:g} times {times:.2g}, as no trial is left for calibration, and errors are so "
+        "many times larger on what was held out than where models were fitted"
+    ) * (times > 1.0)

@@ -234,6 +234,20 @@ class Choice:
         return [first, *others]
 
     @property
+    def optimism(self) -> float:
+        """How many times larger errors are where nothing was fitted than where it was, 1 or more.
+
+        Of the best, on all folds.
+        """
+        held_out, best = self.held_out, self.best
+        own = [
+            held_out.error(fit.model, [trial])
+            for fold, fit in zip(held_out.folds, best.fits, strict=True)
+            for trial in fold.fitted
+        ]
+        return max(1.0, math.sqrt(np.mean(best.errors) / np.mean(own)))
+
+    @property
     def promise(self) -> Promise:
         """The errors on each fold of what the other folds choose.
 
