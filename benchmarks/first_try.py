@@ -3,7 +3,8 @@
     python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N] [--limit S] [--out FILE]
 
 Each function is all that a user writes. A refusal is reported, not hidden. Starts on the boundary
-at t0 and at a later knot follow the true equations; w is at random corners of its box. Each is then
+at t0 and at a later knot follow the true equations; w is at random corners of its box. `room` is
+how many times as far from the motion the nearest start at t0 is that misses the goal. Each is then
 designed for a computer: `hold="largest"`, states measured wrong by up to a hundredth of the goal;
 and simulated so, with samples a half to all of the hold apart.
 
@@ -25,7 +26,12 @@ import numpy as np
 
 from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.machine import parser, tell
-from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
+from benchmarks.thesis.soundness import (
+    OneSet,
+    simulate_boundary,
+    simulate_held,
+    smallest_escape,
+)
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
@@ -448,6 +454,14 @@ def run(name: str, starts: int, limit: float) -> dict[str, Any]:
         "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
     }
     told |= judged(function, found, given, starts)
+    told["room"] = smallest_escape(
+        Truth(function, found, given),
+        found.policy,
+        found.funnel,
+        found.found.goal.P,
+        starts=starts // 8,
+        rng=np.random.default_rng(5),
+    )
     if found.model.m:  # without an input there is nothing to hold
         error = WRONG * np.asarray(problem.goal, dtype=np.float64)
         held, told["held"] = designed(lambda: replace(problem, hold="largest", error=error), limit)
@@ -491,6 +505,7 @@ def summary(results: dict[str, Any]) -> dict[str, Any]:
         "proved_first_try": sum(told["proved"] for told in results.values()),
         "of": len(results),
         "left": sum(told.get("left", 0) for told in results.values()),
+        "median_room": float(np.median([told["room"] for told in results.values() if told["proved"]])),
         "proved_held": sum(told["proved"] for told in held),
         "left_held": sum(told.get("left", 0) for told in held),
         "most_lines": max(told["lines"] for told in results.values()),
