@@ -501,11 +501,12 @@ def judged(
 def summary(results: dict[str, Any]) -> dict[str, Any]:
     """The figures over all problems that were tried, and what became of each."""
     held = [told["held"] for told in results.values() if "held" in told]
+    rooms = [told["room"] for told in results.values() if "room" in told]
     return {
         "proved_first_try": sum(told["proved"] for told in results.values()),
         "of": len(results),
         "left": sum(told.get("left", 0) for told in results.values()),
-        "median_room": float(np.median([told["room"] for told in results.values() if told["proved"]])),
+        "median_room": float(np.median(rooms)) if rooms else None,
         "proved_held": sum(told["proved"] for told in held),
         "left_held": sum(told.get("left", 0) for told in held),
         "most_lines": max(told["lines"] for told in results.values()),

@@ -70,7 +70,8 @@ def swept(
     if setting.expansion is not None:
         return sweep_expanded(setting, wanted, progress, most_back=most_back, again=again)
     instants = sections(steps, policy, setting.P)
-    return Swept(setting, *sweep_rho(steps, instants, wanted, progress, again))
+    found = sweep_rho(steps, instants, wanted, progress, again)
+    return Swept(replace(setting, steps=steps.as_it_is()), *found)
 
 
 def sweep_expanded(
@@ -172,5 +173,5 @@ def with_field(setting: Setting) -> Setting:
     field = field_of([steps.local[k] for k in range(len(policy.t) - 1)], policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)
-    proving.kappa = steps.kappa
+    proving.kappa = None if steps.kappa is None else steps.kappa.copy()
     return replace(setting, steps=proving, policy=policy)

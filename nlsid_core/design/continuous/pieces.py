@@ -80,9 +80,10 @@ def prove_pieces(
     for k, pair in enumerate(ends or []):
         known[k, 0.0], known[k, 1.0] = pair.start, pair.end
     done: list[tuple[Pieces, FloatArray]] = []
-    if kept is not None:
-        done.append((replace(kept.pieces, kappa=steps.kappa), kept.margins))
-    over = [] if kept is None else kept.pieces.interval
+    over: set[int] = set()
+    if kept is not None and len(kept.pieces):
+        done = [(replace(kept.pieces, kappa=steps.kappa), kept.margins)]
+        over = set(kept.pieces.interval.tolist())
     waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1) if k not in over]
     unproved: list[Part] = []
     while waiting:

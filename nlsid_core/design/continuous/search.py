@@ -165,28 +165,29 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
     for most in LEVELS:
         try:
             made = swept(setting, replace(wanted, times=times), progress, again=again)
-            no_more = False
+            last = False
         except NoFunnel:
             if kept is None:
                 raise
-            most, no_more = LEVELS[-1], True  # no larger margin: smaller parts have to do
+            most, last = LEVELS[-1], True  # no larger margin: smaller parts have to do
         if again is not None and kept is not None:
             kept = kept.on([k for k in intervals if made.ends[k] is again.ends[k]])
         steps, policy = made.setting.steps, made.setting.policy
         digest = files.digest(policy.document())
         funnel = ContinuousFunnel(policy.x, setting.P, made.rho, policy.vector_field, digest)
         refuse_unmonitorable(funnel)
-        kept = prove_pieces(steps, policy, funnel, made.ends, kept=kept, most=most)
-        if not kept.unproved:
-            return Found(made.setting, funnel, kept, wanted.margin)
-        left = np.isin(intervals, [part.interval for part in kept.unproved])
-        times = np.where(left, LARGER * times, times)
-        again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
-        if no_more:
+        shown = prove_pieces(steps, policy, funnel, made.ends, kept=kept, most=most)
+        if not shown.unproved:
+            return Found(made.setting, funnel, shown, wanted.margin)
+        left = np.isin(intervals, [part.interval for part in shown.unproved])
+        refusal = Unproved(
+            f"no proof from {unsolved(policy, shown.unproved)} although the L-steps at its "
+            "knots hold: try more knots there",
+            float(policy.t[int(np.flatnonzero(left)[-1])]),
+            left,
+        )
+        if last:
             break
-    raise Unproved(
-        f"no proof from {unsolved(policy, kept.unproved)} although the L-steps at its "
-        "knots hold: try more knots there",
-        float(policy.t[again.last]),
-        left,
-    )
+        kept, times = shown, np.where(left, LARGER * times, times)
+        again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
+    raise refusal
