@@ -17,12 +17,13 @@ import os
 import random
 import resource
 import signal
-import socket
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -46,6 +47,7 @@ from bags.recordings.message_types import decode, standard_types
 from bags.samples import f1tenth
 from benchmarks.cache import cache_folder
 from benchmarks.machine import parser, tell
+from examples.fleet.__main__ import free_port, started
 
 BUCKET = "fleet"
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "f1tenth.yaml"
@@ -102,10 +104,7 @@ def made_bag(trial: Path, seed: int) -> bytes:
         data = message.data
         if message.topic == "/odom":
             odometry: Any = decode(data, *types["/odom"])
-            linear = odometry.twist.twist.linear
-            linear = replace(linear, x=linear.x + NOISE * rng.standard_normal())
-            twist = replace(odometry.twist.twist, linear=linear)
-            odometry = replace(odometry, twist=replace(odometry.twist, twist=twist))
+            odometry.twist.twist.linear.x += NOISE * rng.standard_normal()
             data = bytes(standard_types().serialize_cdr(odometry, message.msgtype))
         add(message.topic, message.msgtype, message.log_time_ns, data)
         if k % every == 0:
@@ -120,31 +119,18 @@ def made_bag(trial: Path, seed: int) -> bytes:
 @contextmanager
 def s3_server(folder: Path) -> Iterator[Any]:
     """moto's server in a process of its own; yields a client of it."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     os.environ |= {
         "AWS_ACCESS_KEY_ID": "benchmark",
         "AWS_SECRET_ACCESS_KEY": "benchmark",
         "AWS_DEFAULT_REGION": "us-east-1",
         "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
     }
-    with (folder / "server.log").open("w") as log:
-        command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-        server = subprocess.Popen(command, stdout=log, stderr=log)
-    try:
-        for _ in range(600):
-            try:
-                socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
-                break
-            except OSError:
-                time.sleep(0.1)
+    command = ["-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    with started(command, port, folder / "server.log"):
         client = boto3.client("s3")
         client.create_bucket(Bucket=BUCKET)
         yield client
-    finally:
-        server.terminate()
-        server.wait()
 
 
 def fill(client: Any, count: int) -> int:
@@ -214,44 +200,37 @@ class Alone:
     sent: int = 0
 
 
-def alone(reader: Callable[[Any, str], None], pattern: str) -> Alone:
+def alone(reader: Callable[[str], Alone], pattern: str) -> Alone:
     """`reader`, `_ours` or `_theirs`, in a process of its own."""
     context = multiprocessing.get_context("spawn")
-    mine, theirs = context.Pipe()
-    process = context.Process(target=reader, args=(theirs, pattern))
-    process.start()
-    found: Alone = mine.recv()
-    process.join()
-    return found
+    with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
+        return pool.submit(reader, pattern).result()
 
 
-def _ours(pipe: Any, pattern: str) -> None:
+def _ours(pattern: str) -> Alone:
     bags = named_bags([Path(pattern)])
     read(dict(islice(bags.items(), 1)), 0)  # so that imports do not count
     started = time.process_time()
     found = read(bags, 0)
     cpu = time.process_time() - started
-    pipe.send(
-        Alone(
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            1e3 * cpu / len(bags),
-            found.digest,
-            sum(answer.requests for answer in found.answers),
-            sum(answer.fetched for answer in found.answers),
-            found.sent,
-        )
+    return Alone(
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        1e3 * cpu / len(bags),
+        found.digest,
+        sum(answer.requests for answer in found.answers),
+        sum(answer.fetched for answer in found.answers),
+        found.sent,
     )
 
 
-def _theirs(pipe: Any, pattern: str) -> None:
+def _theirs(pattern: str) -> Alone:
     urls = [str(path) for path in named_bags([Path(pattern)]).values()][:MANY]
     _by_hand(urls[0])
     started = time.process_time()
     for url in urls:
         _by_hand(url)
     cpu = time.process_time() - started
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    pipe.send(Alone(peak, 1e3 * cpu / len(urls)))
+    return Alone(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1e3 * cpu / len(urls))
 
 
 def by_hand(bags: Mapping[str, Path], workers: int) -> float:
@@ -304,12 +283,11 @@ def killed(pattern: str, wanted: str, rounds: int, folder: Path) -> int:
         victims = [run.pid] if number % 2 else _children(run.pid)
         for victim in victims[-1:]:
             os.kill(victim, signal.SIGKILL)
+        run.wait()
         if number % 2:
-            run.wait()
             done = subprocess.run(command, capture_output=True, text=True, check=True)
             good += done.stdout.strip().endswith(wanted)
         else:
-            run.wait()
             found = read(named_bags([Path(pattern)]), 0, manifest)
             good += found.digest == wanted and all(answer.kept for answer in found.answers)
     return good
@@ -317,25 +295,14 @@ def killed(pattern: str, wanted: str, rounds: int, folder: Path) -> int:
 
 def _children(pid: int) -> list[int]:
     """Processes that it started and that read bags; the resource tracker is not one."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if int(fields[1]) == pid and b"spawn_main" in command:
-            found.append(int(entry.name))
-    return sorted(found)
+    there = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(c) for c in there if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
 
 
 def _rows(manifest: Path) -> int:
-    import sqlite3
-
-    if not manifest.exists():
-        return 0
+    """How many bags it has; none before it is there."""
     try:
-        with sqlite3.connect(manifest) as rows:
+        with sqlite3.connect(f"file:{manifest}?mode=ro", uri=True) as rows:
             return int(rows.execute("select count(*) from bags").fetchone()[0])
     except sqlite3.OperationalError:
         return 0

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         Feedback,
         FilterMapFilter,
         Fit,
+        Follower,
         LeastSquares,
         Network,
         Polynomial,
@@ -58,6 +59,7 @@ __all__ = [
     "Feedback",
     "FilterMapFilter",
     "Fit",
+    "Follower",
     "Goal",
     "Grid",
     "LeastSquares",
@@ -95,6 +97,7 @@ _FAMILIES: Final = (
     "Degrees",
     "Network",
     "FilterMapFilter",
+    "Follower",
     "CellRow",
     "Feedback",
 )

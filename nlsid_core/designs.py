@@ -13,8 +13,8 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import Signal, StableModel, StateModel, TrapezoidalModel
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models import Signal, StableModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
@@ -32,7 +32,7 @@ FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
 COMPOSITION = "composition.proof.json"  # of funnels that follow each other, its stages beside it
 
-D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
+D = TypeVar("D", bound=StableModel | StateModel | VectorField)
 P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)
 F = TypeVar("F", bound=SampledFunnel | ContinuousFunnel | TubeFunnel | None)
 S = TypeVar("S")
@@ -143,7 +143,7 @@ class Design(Generic[D, P, F, S]):
             return tuple(Signal(f"x{i}") for i in range(model.n)), tuple(
                 Signal(f"u{j}") for j in range(model.m)
             )
-        measured = model.x if isinstance(model, StateModel | TrapezoidalModel) else model.y
+        measured = model.x if isinstance(model, StateModel) else model.y
         y, u = ((s,) if isinstance(s, Signal) else s for s in (measured, model.u))
         return y, u
 
@@ -155,7 +155,7 @@ class Design(Generic[D, P, F, S]):
     @property
     def is_single(self) -> bool:
         """One output and one input of an identified model: numbers, not vectors."""
-        measured = isinstance(self.model, StateModel | TrapezoidalModel | VectorField)
+        measured = isinstance(self.model, StateModel | VectorField)
         return not measured and all(len(part) == 1 for part in self.signals)
 
     @property

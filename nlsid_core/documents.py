@@ -20,9 +20,7 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
     StateModel,
-    trapezoidal,
 )
-from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
@@ -42,7 +40,6 @@ Noun: TypeAlias = (
     | MonotoneEquation
     | StateAffineModel
     | StateModel
-    | TrapezoidalModel
 )
 
 # By format, and by kind where the format has kinds.
@@ -62,7 +59,6 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
         ("nlsid/model", "monotone_equation"): MonotoneEquation.from_document,
         ("nlsid/model", "state_affine"): StateAffineModel.from_document,
         ("nlsid/model", "state_map"): StateModel.from_document,
-        ("nlsid/model", trapezoidal.KIND): TrapezoidalModel.from_document,
     }
 )
 

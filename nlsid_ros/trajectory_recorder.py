@@ -137,12 +137,14 @@ class TrajectoryRecorder(ManagedNode):
         return said
 
     def _take(self) -> None:
-        """Write what has arrived; before there is simulated time it waits."""
+        """Write what has arrived; before simulated time goes on it waits."""
         if self._simulated:
             simulated_ns = self.get_clock().now().nanoseconds
             if not simulated_ns:
                 return
             self._clock_of_log.look(time.time_ns(), simulated_ns)
+            if not self._clock_of_log.goes:
+                return
         self._topics.take()
 
     def _begin(self) -> Path:

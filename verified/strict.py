@@ -338,7 +338,7 @@ def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
 
 def funnel(document: dict[str, Any], sizes: Sizes, planned: bool, boxed: bool) -> None:
     """Tubes, and what is assumed beside them. `boxed`: a box may be stated."""
-    optional = "" if planned else "response cusum"
+    optional = "" if planned else "response cusum commands"
     required = "format version kind model settling tubes" + " policy" * planned
     members(document, "funnel", required, optional + " box" * boxed)
     head(document, "funnel", ("tube",))

@@ -42,7 +42,7 @@ RANGES = (
     "input_range",
     "output_range",
 )  # options of which one [low, high] is the range of one signal
-ONE_BY_ONE = ("linear", "block_cascade")  # models of one response and one excitation
+ONE_BY_ONE = ("linear", "block_cascade", "follower")  # models of one response and one excitation
 OWN = {  # of every section
     "transient": Annotated[int, Field(ge=0)],
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],

@@ -15,7 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design.sampled.design import frame
 from nlsid_core.errors import DataError
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.running.observer import StateObserver
 
@@ -87,7 +87,7 @@ def record_repeats(
 
 def run_policy(
     robot: Robot,
-    model: MeasuredState,
+    model: StateModel,
     policy: SampledPolicy,
     *,
     seed: int,

@@ -19,7 +19,7 @@ from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.names import did_you_mean, listed
-from bags.signals.grid import filled_samples, read_dataset, skipped_samples
+from bags.signals.grid import filled_samples, read_dataset, refuse_unjudgeable, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials, check_apart
@@ -354,7 +354,7 @@ def design_funnel_files(
         )
     load = documents.load_stable_model if options.profile is None else documents.load_model
     model: StableModel = load(model_path)
-    trials, _ = _trials_beside(model_path, config, model)
+    trials, test = _trials_beside(model_path, config, model)
     weights = options.policy
     found = design(
         OutputTube(
@@ -372,6 +372,7 @@ def design_funnel_files(
             lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
         )
     )
+    refuse_unjudgeable(trials.calibration if test is None else test, found.funnel.settling)
     if found.policy is None:
         (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
     found.save(out)

@@ -14,6 +14,7 @@ from nlsid_core.identification import (
     Degrees,
     Feedback,
     FilterMapFilter,
+    Follower,
     ModelClass,
     Network,
     Polynomial,
@@ -149,6 +150,11 @@ TEMPLATES: Mapping[str, Template] = MappingProxyType(
             "A filter with feedback through a static map of its output",
             Feedback,
             _same("lags", "intervals", "stages", "imitated", "start_samples", "seed"),
+        ),
+        "follower": Template(
+            "An output that goes after its input, late, with inertia and a limit of its speed",
+            Follower,
+            _same("start_samples"),
         ),
     }
 )

@@ -59,9 +59,6 @@ class StateIdentification(Section):
     biased_without_repeats: Annotated[
         bool, Key("least squares where no excitation was repeated; noise biases it", example=True)
     ] = False
-    implicit: Annotated[
-        bool, Key("a trapezoidal step of a mechanism instead of an explicit map", example=True)
-    ] = False
 
 
 class MotionConfig(Section):

@@ -17,7 +17,7 @@ from nlsid_core.design.sampled.design import TrackingDesign, assume
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.errors import DataError
 from nlsid_core.identification.states import StateFit, identify_states
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress
 from nlsid_core.running.assumption import DisturbanceMeter, disturbance_of
@@ -36,7 +36,6 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
         degrees=options.degrees,
         refuse_above=options.refuse_above,
         biased_without_repeats=options.biased_without_repeats,
-        implicit=options.implicit,
     )
     files.write_document(out / documents.MODEL, fit.model.document())
     if report_available():
@@ -95,7 +94,7 @@ def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
 
 
 def feedback_of(
-    model: MeasuredState, x: np.ndarray, u: np.ndarray, config: TrackingConfig
+    model: StateModel, x: np.ndarray, u: np.ndarray, config: TrackingConfig
 ) -> Feedback:
     """The time-varying LQR of the configured weights around a motion (x, u)."""
     motion = config.motion

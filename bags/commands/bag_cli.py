@@ -3,7 +3,7 @@
 A command imports what it runs when it is called.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,7 +47,7 @@ SignalsOption = Annotated[
     typer.Option(
         "--signal",
         "-s",
-        help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
+        help=r"topic:field.path\[0], [*] or \[name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
 
@@ -112,7 +112,7 @@ def signals(
     ):
         found = bag_signals(source, progress=progress)
     if as_json:
-        typer.echo(bag_show.signals_json(found))
+        typer.echo(bag_show.as_json([asdict(listed) for listed in found]))
     else:
         out.print(bag_show.signals_table(found))
 
@@ -282,7 +282,7 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help="signal=column: /joints:position[name=elbow]=angle; repeat.",
+            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat.",
         ),
     ] = None,
     types: Annotated[

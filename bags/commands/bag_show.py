@@ -98,7 +98,7 @@ def signals_table(found: Sequence[Listed]) -> Table:
 def info_json(info: BagInfo) -> str:
     """What `show_info` shows, as JSON; times in s, sizes in bytes, null where nothing is known."""
     first_ns, last_ns = info.span_ns
-    return _json(
+    return as_json(
         {
             "bag": str(info.path),
             "messages": info.messages,
@@ -127,14 +127,9 @@ def _topic(topic: TopicInfo) -> dict[str, object]:
     }
 
 
-def signals_json(found: Sequence[Listed]) -> str:
-    """The signals as JSON."""
-    return _json([asdict(listed) for listed in found])
-
-
 def fitness_json(results: Sequence[Fitness]) -> str:
     """The verdicts and their reasons as JSON; levels: good, look, bad."""
-    return _json(
+    return as_json(
         [
             {
                 "bag": str(result.bag),
@@ -149,7 +144,8 @@ def fitness_json(results: Sequence[Fitness]) -> str:
     )
 
 
-def _json(content: object) -> str:
+def as_json(content: object) -> str:
+    """Numbers and texts as JSON; null where nothing is known."""
     return json.dumps(_without_nan(content), ensure_ascii=False, indent=2, allow_nan=False)
 
 

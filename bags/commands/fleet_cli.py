@@ -219,6 +219,7 @@ def _say_verdicts(found: FleetVerdict) -> None:
     for what, title in (
         ("unjudged", "not judged whole"),
         ("clock", "clock"),
+        ("beyond", "commanded beyond training"),
         ("alarm", "only the second alarm"),
     ):
         told = {row.bag: row.said[what] for row in found.rows if what in row.said}

@@ -66,7 +66,8 @@ DefinitionsOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--definitions",
-        help="PACKAGE/msg/Type.msg, or folders of packages: types that the bags do not define.",
+        help="PACKAGE/msg/Type.msg, .idl, .srv, .action, or folders of packages: types that the "
+        "bags do not define.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]

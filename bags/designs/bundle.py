@@ -25,7 +25,7 @@ from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.checking import read_regular
 from nlsid_core.models import StableModel
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
@@ -198,7 +198,7 @@ class Check:
 # What goes with a funnel of each kind: a policy of which type (None: or none), and which models.
 KINDS: Final[Mapping[type, tuple[tuple[type, ...], tuple[type, ...]]]] = {
     TubeFunnel: ((TubePolicy, type(None)), get_args(StableModel)),
-    SampledFunnel: ((SampledPolicy,), get_args(MeasuredState)),
+    SampledFunnel: ((SampledPolicy,), (StateModel,)),
     ContinuousFunnel: ((ContinuousPolicy,), (VectorField,)),
 }
 

@@ -46,13 +46,14 @@ class JudgeBag:
 def judged_of(replay: Replay, bag: Path, name: str) -> Row:
     """What `replay` says of `bag`, which is called `name`, in a few words and numbers.
 
-    said: `alarm`, the second one; `unjudged`, the first samples that were not judged, and why, also
-    of a bag that is bad; `clock`, where its stamps go back.
+    said: `alarm`, the second one; `beyond`, what was commanded that no training trial had;
+    `unjudged`, the first samples that were not judged, and why, also of a bag that is bad; `clock`,
+    where its stamps go back.
     numbers: the least `margin`; the largest part of the assumption that was `spent`, at `spent_at`
     s of the run; `bad_at`, the first bad sample; s that were `judged` of the `span`; samples that
     were `filled` in.
     """
-    said = {"clock": replay.clock, "unjudged": _unjudged(replay)}
+    said = {"beyond": replay.beyond, "clock": replay.clock, "unjudged": _unjudged(replay)}
     numbers: dict[str, float] = {
         "judged": replay.judged_span,
         "span": replay.span,

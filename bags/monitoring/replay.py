@@ -25,6 +25,7 @@ from nlsid_core.errors import BagError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status, cause
+from nlsid_core.running.tubes import BEYOND
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -258,6 +259,12 @@ class Replay:
         return next((r for r in self.judged if r.alarm), None)
 
     @property
+    def beyond(self) -> str:
+        """What was commanded that no training trial had, and from when on; empty if nothing."""
+        said = (r.assuming.partition(BEYOND) for r in self.judged)
+        return next((f"{BEYOND}{what}" for _, found, what in said if found), "")
+
+    @property
     def assumption(self) -> float:
         """The most of what is assumed that a judged sample used; 1 is all of it, NaN unmeasured."""
         used = [r.assumption for r in self.judged if not math.isnan(r.assumption)]
@@ -418,7 +425,7 @@ def _fed(
     digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
-        clock.start_ns = source.start_ns
+        clock.start_ns = source.storage.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
         doubt = _doubt(watch.pairing, source)

@@ -15,7 +15,7 @@ from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
 from nlsid_core.models import Signal
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 
 TUBE = "#dbe8f4"
 TIMES = 200  # at which a continuous tube is drawn
@@ -70,7 +70,7 @@ def state_pairs(n: int) -> list[tuple[int, int]]:
     return pairs
 
 
-def draw_free_run(model: MeasuredState, validation: Dataset) -> Figure:
+def draw_free_run(model: StateModel, validation: Dataset) -> Figure:
     """Draw measured and simulated states of the worst trial, and beside them what is missed.
 
     Simulated in each stretch in the box of the model's data, from its measured start, as the class

@@ -155,11 +155,6 @@ class Bag:
             found.append(f"{METADATA} states {total} messages in all, {there} are there")
         return tuple(dict.fromkeys(found))
 
-    @property
-    def start_ns(self) -> int:
-        """The first log time in ns; 0 if there are no messages."""
-        return self.storage.start_ns
-
     def types_on(self, topic: str) -> tuple[str, Typestore]:
         """The message type on `topic`, and the types it is made of.
 

@@ -9,6 +9,7 @@ Source: OMG CORBA 3.0 (formal/02-06-51), chapter 15.3, CDR; alignment counts fro
 four-byte encapsulation header.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -202,10 +203,8 @@ def _taken(layout: Layout, batch: Batch) -> list[Numbers]:
     n = len(batch)
     columns: dict[int, Numbers] = {}
     for (of, is_bool, length), targets, offsets in layout.groups:
-        places = offsets[:, None] + batch.start
-        if length is not None:
-            places = places[:, :, None] + np.dtype(of).itemsize * np.arange(length)
-        found = _view(batch.buffer, of)[places] if places.size else np.empty(places.shape, of)
+        shape = () if length is None else (length,)
+        found = _view(batch.buffer, of, shape)[offsets[:, None] + batch.start]
         found = found != 0 if is_bool else found.astype(found.dtype.newbyteorder("="), copy=False)
         for target, column in zip(targets.tolist(), found, strict=True):
             columns[target] = column if length is None else np.fromiter(column, object, n)
@@ -234,10 +233,13 @@ def _matches(layout: Layout, batch: Batch) -> Any:
     return same
 
 
-def _view(buffer: Buffer, kind: str) -> Any:
-    """The buffer as numbers starting at every byte."""
+def _view(buffer: Buffer, kind: str, shape: tuple[int, ...] = ()) -> Any:
+    """The buffer as numbers, or as arrays of that many, starting at every byte."""
     dtype = np.dtype(kind)
-    return np.ndarray((max(0, len(buffer) - dtype.itemsize + 1),), dtype, buffer, strides=(1,))
+    places = max(0, len(buffer) - dtype.itemsize * math.prod(shape) + 1)
+    return np.ndarray(
+        (places, *shape), dtype, buffer, strides=(1, *(dtype.itemsize for _ in shape))
+    )
 
 
 def is_strings(description: FieldDesc) -> bool:

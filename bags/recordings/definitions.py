@@ -1,12 +1,17 @@
-"""Definitions of message types for a bag: standard ones, and custom ones from their .msg texts."""
+"""Definitions of message types for a bag: standard ones, and custom ones from their texts.
 
+A service's events and an action's feedback are messages, too: their texts are made of the parts of
+.srv and .action files.
+"""
+
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.message_types import (
@@ -14,6 +19,7 @@ from bags.recordings.message_types import (
     defining,
     fields_of,
     is_stamped,
+    parse,
     refuse_what_code_cannot_be,
     standard_types,
     types_in_bag,
@@ -21,6 +27,18 @@ from bags.recordings.message_types import (
 from nlsid_core.errors import BagError
 
 MAX_MSG_BYTES: Final = 2**20
+PLACES: Final = ("msg/*.idl", "msg/*.msg", "srv/*.srv", "action/*.action")  # in a package
+PARTS: Final = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
+RECORDED: Final = {
+    "srv": (
+        "Event",
+        "service_msgs/ServiceEventInfo info\n"
+        "{0}_Request[<=1] request\n{0}_Response[<=1] response\n",
+    ),
+    "action": ("FeedbackMessage", "unique_identifier_msgs/UUID goal_id\n{0}_Feedback feedback\n"),
+}
+_IDL: Final = re.compile(r"^\s*module\s+\w+\s*\{", re.MULTILINE)
+_NEXT_PART: Final = re.compile(r"^---\s*$", re.MULTILINE)
 
 
 class Definition(NamedTuple):
@@ -47,15 +65,16 @@ def standard_definition(msgtype: str) -> Definition:
 
 
 def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
-    """Type name -> definition of each type whose .msg text is given.
+    """Type name -> definition of each type whose .msg or .idl text is given.
 
     What the texts use and do not define is taken from the standard types. Raises BagError if a text
     is not a message definition or uses a type that is not known.
     """
     parsed: Typesdict = {}
     for msgtype, text in texts.items():
+        form = MessageDefinitionFormat.IDL if _IDL.search(text) else MessageDefinitionFormat.MSG
         with defining(f"'{msgtype}'"):
-            parsed.update(get_types_from_msg(text, msgtype))
+            parsed.update(parse(msgtype, MessageDefinition(form, text)))
     found = {}
     for msgtype in texts:
         with defining(f"'{msgtype}'"):
@@ -64,7 +83,8 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
             types = get_typestore(Stores.EMPTY)
             types.register(used)
             text = types.generate_msgdef(msgtype, ros_version=2)[0]
-            found[msgtype] = Definition(msgtype, text, types.hash_rihs01(msgtype))
+            type_hash = types.hash_rihs01(msgtype) if "/msg/" in msgtype else ""
+            found[msgtype] = Definition(msgtype, text, type_hash)
     return found
 
 
@@ -80,24 +100,41 @@ def texts_of(definitions: Mapping[str, Definition]) -> list[tuple[str, str]]:
 
 
 def read_definitions(paths: Iterable[Path]) -> dict[str, Definition]:
-    """Definitions from .msg files, packages' folders (with `msg` in it) and folders of packages.
+    """Definitions from files, packages' folders (with `msg` in it) and folders of packages.
 
-    A file's type is named by its place: PACKAGE/msg/Type.msg. Raises BagError if a path holds none,
-    and as `definitions_from`; OS errors pass through.
+    A file's type is named by its place: PACKAGE/msg/Type.msg, or .idl; PACKAGE/srv/Type.srv defines
+    Type_Event, PACKAGE/action/Type.action Type_FeedbackMessage. Raises BagError if a path holds
+    none, and as `definitions_from`; OS errors pass through.
     """
-    texts = {}
+    texts: dict[str, str] = {}
     for path in paths:
-        files = [path] if path.is_file() else [*path.glob("msg/*.msg"), *path.glob("*/msg/*.msg")]
+        inside = [file for place in PLACES for up in ("", "*/") for file in path.glob(up + place)]
+        files = [path] if path.is_file() else inside
         if not files:
             raise BagError(
                 f"{path} holds no message definitions; give a PACKAGE/msg/Type.msg file, a "
                 "package's share folder, or a folder of those"
             )
         for file in map(Path.resolve, files):
-            package, folder, kind = file.parts[-3:]
-            if folder != "msg" or file.suffix != ".msg":
+            if not any(file.match(f"*/{place}") for place in PLACES):
                 raise BagError(f"{file}: a definition's place is PACKAGE/msg/Type.msg")
             if file.stat().st_size > MAX_MSG_BYTES:
                 raise BagError(f"{file}: more than {MAX_MSG_BYTES} bytes; not a definition")
-            texts[f"{package}/msg/{Path(kind).stem}"] = file.read_text(encoding="utf-8")
+            with defining(f"'{file}'"):
+                texts |= _texts(file)
     return definitions_from(texts)
+
+
+def _texts(file: Path) -> dict[str, str]:
+    """The texts in a file by the names of their types; ValueError if it lacks a part."""
+    package, folder, _ = file.parts[-3:]
+    text = file.read_text(encoding="utf-8")
+    if folder not in PARTS:
+        return {f"{package}/msg/{file.stem}": text}
+    parts = zip(PARTS[folder], _NEXT_PART.split(text), strict=True)
+    texts = {f"{package}/msg/{file.stem}_{part}": inside for part, inside in parts}
+    name, whole = RECORDED[folder]
+    return {
+        **texts,
+        f"{package}/{folder}/{file.stem}_{name}": whole.format(f"{package}/{file.stem}"),
+    }

@@ -115,7 +115,7 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
         if msgtype in noetic and not embedded.data.strip():
             parsed = {msgtype: noetic[msgtype]}
         else:
-            parsed = _parse(msgtype, embedded)
+            parsed = parse(msgtype, embedded)
         parsed = completed(parsed, noetic) | {name: standard[name] for name in ROS1_DIFFERS}
         refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
@@ -136,7 +136,7 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
         fields_of(msgtype, standard)
         return standard
     with defining(f"'{msgtype}' in the bag"):
-        parsed = completed(_parse(msgtype, embedded))
+        parsed = completed(parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
             for name, (_, fields) in parsed.items()
@@ -166,10 +166,12 @@ def defining(what: str) -> Iterator[None]:
         ) from error
 
 
-def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
+def parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
+    """What a definition defines; `msgtype` is called as it is, also in a package's `srv`."""
     lines = embedded.data.lstrip("\ufeff").splitlines(keepends=False)
     if embedded.format == MessageDefinitionFormat.MSG:
-        return get_types_from_msg("\n".join(lines), msgtype)
+        (_, defined), *others = get_types_from_msg("\n".join(lines), msgtype).items()
+        return {msgtype: defined, **dict(others)}
     text = "".join(f"{line}\n" for line in lines if not line.lstrip().startswith("#"))
     if not text.startswith(IDL_SEPARATOR + "IDL: "):
         return get_types_from_idl(text)

@@ -83,13 +83,13 @@ def offered_text(profiles: Iterable[Profile]) -> str:
 
 
 def profile_of(qos: Any) -> Profile:
-    """From rosbags' or rclpy's object: policies with names, times with parts or nanoseconds."""
+    """From rclpy's object."""
     return Profile(
         qos.history.name.lower(),
         int(qos.depth),
         qos.reliability.name.lower(),
         qos.durability.name.lower(),
-        Times(*(_span_of(getattr(qos, name)) for name in Times._fields)),
+        Times(*(QosTime(*divmod(getattr(qos, name).nanoseconds, 10**9)) for name in Times._fields)),
         qos.liveliness.name.lower(),
         bool(qos.avoid_ros_namespace_conventions),
     )
@@ -133,10 +133,3 @@ def _span(found: Any) -> QosTime:
     if not (0 <= span.sec < 2**64 and 0 <= span.nsec < 2**64):
         raise ValueError(f"a time of {span}")
     return span
-
-
-def _span_of(time: Any) -> QosTime:
-    if hasattr(time, "nanoseconds"):
-        whole = int(time.nanoseconds)
-        return QosTime(*divmod(whole, 10**9))
-    return QosTime(int(time.sec), int(time.nsec))

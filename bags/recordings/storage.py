@@ -96,8 +96,11 @@ class Raw(NamedTuple):
 
 
 def defined(channel: Channel, given: Mapping[str, Definition], release: str) -> Channel:
-    """The channel, with a definition where its file has none: the given one, or the release's."""
-    if channel.schema[0] in FORMATS:
+    """The channel, with a definition where its file has none: the given one, or the release's.
+
+    rosbag2 writes those of services' events without the event's own fields: the given one is used.
+    """
+    if channel.schema[0] in FORMATS and "/srv/" not in channel.msgtype:
         return channel
     if channel.msgtype in given:
         text = given[channel.msgtype].text
@@ -292,7 +295,7 @@ class Storage:
 
     @property
     def start_ns(self) -> int:
-        """The first log time; 0 if there are no messages."""
+        """The first log time in ns; 0 if there are no messages."""
         first = min(map(_first_ns, self.files), default=NEVER)
         return 0 if first == NEVER else first
 

@@ -16,7 +16,7 @@ import numpy as np
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.setup.proposal import Unfit
-from bags.signals.columns import Columns, expand_paths, read_columns
+from bags.signals.columns import Columns, expand_path, read_columns
 from bags.signals.expressions import derivative, turn_of
 from bags.signals.signal import ANGLES, SignalPath
 from bags.signals.timing import Delay, delay
@@ -240,7 +240,7 @@ def _elements(bag: Bag, listed: Listed) -> list[SignalPath]:
     if listed.number == "bool" or listed.elements > MOST_ELEMENTS:
         return []
     with suppress(BagError):
-        return expand_paths(bag, [SignalPath.parse(listed.signal)])
+        return expand_path(bag, SignalPath.parse(listed.signal))
     return []
 
 

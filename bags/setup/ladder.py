@@ -16,6 +16,7 @@ from nlsid_core.identification.network.options import (
     CellRow,
     Feedback,
     FilterMapFilter,
+    Follower,
     Limit,
     Network,
 )
@@ -129,6 +130,7 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         for orders in dict.fromkeys(((n, 0), (0, n), (n - n // 2, n // 2))):
             filters = FilterMapFilter(orders, intervals=12, starts=4)
             yield Attempt(Network(filters), certified)
+        yield Attempt(Network(Follower()), certified)
     if best.percent > SWINGS:
         loop = Network(Feedback(2, stages=2, imitated=20))
         yield Attempt(loop, certified)

@@ -1,5 +1,6 @@
 """What arrived on a topic: when, how many are missing, and the last seconds of it."""
 
+from bisect import bisect
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 
+REMEMBERED = 1000  # looks at a clock; a recorder looks 20 times a second
 SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
 
 
@@ -29,23 +31,34 @@ class Arrival(NamedTuple):
 
 @dataclass
 class LogClock:
-    """When messages came, in the time of a simulation; between two looks it goes on evenly."""
+    """When messages came, in the time of a simulation; between two looks it goes on evenly.
 
-    _before: tuple[int, int] = (0, 0)
-    _newest: tuple[int, int] = (0, 0)
+    A message may have waited for many looks, or from before the first: a later one never gets an
+    earlier time than it.
+    """
+
+    _walls_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _simulated_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
     def look(self, wall_ns: int, simulated_ns: int) -> None:
         """At `wall_ns` the simulation's clock is at `simulated_ns`."""
-        self._before, self._newest = self._newest, (wall_ns, simulated_ns)
+        self._walls_ns.append(wall_ns)
+        self._simulated_ns.append(simulated_ns)
+
+    @property
+    def goes(self) -> bool:
+        """Whether it was looked at twice, so that its pace is known."""
+        return len(self._walls_ns) > 1
 
     def at(self, wall_ns: int) -> int:
         """The simulated time at `wall_ns`, in ns; the wall's where no clock was looked at."""
-        (first, begun), (last, now) = self._before, self._newest
-        if not last:
-            return wall_ns
-        if not first or not first <= wall_ns <= last:
-            return now
-        return begun + (now - begun) * (wall_ns - first) // max(last - first, 1)
+        if not self.goes:
+            return self._simulated_ns[0] if self._simulated_ns else wall_ns
+        later = max(bisect(self._walls_ns, wall_ns, hi=len(self._walls_ns) - 1), 1)
+        first, last = self._walls_ns[later - 1], self._walls_ns[later]
+        begun, now = self._simulated_ns[later - 1], self._simulated_ns[later]
+        gone = (now - begun) * (min(wall_ns, last) - first) // max(last - first, 1)
+        return max(begun + gone, 0)
 
 
 @dataclass

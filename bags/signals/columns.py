@@ -89,7 +89,7 @@ def read_columns(
 ) -> dict[str, Columns]:
     """Topic -> its signals over the whole bag, by log time; equal log times as recorded.
 
-    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
+    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_path`).
     All are checked against the types in the bag before a message is read. A topic without messages
     gives columns of length 0. Raises BagError where `signals` or the bag are wrong.
     """
@@ -104,23 +104,18 @@ def read_columns(
     return {topic: growing.pop(topic).columns() for topic in topics}
 
 
-def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
-    """The paths, with `[*]` replaced by the elements that the topic's first message has.
+def expand_path(bag: Bag, path: SignalPath) -> list[SignalPath]:
+    """The path, with `[*]` the elements that the topic's first message has.
 
-    Raises BagError if a path does not fit the topic's type, or if there is no message to count in.
+    Raises BagError if it does not fit the topic's type, or if there is no message to count in.
     """
-    expanded: list[SignalPath] = []
-    for path in paths:
-        msgtype, types = bag.types_on(path.topic)
-        check_path(bag, path)
-        if not path.every:
-            expanded.append(path)
-            continue
-        first = next((batch for _, batch in bag.batches([path.topic])), None)
-        if first is None:
-            raise BagError(f"{bag.path}: {path.topic} has no messages, so [*] stands for nothing")
-        expanded += path.expand(decode(first.data(0), msgtype, types))
-    return expanded
+    check_path(bag, path)
+    if not path.every:
+        return [path]
+    first = next((batch for _, batch in bag.batches([path.topic])), None)
+    if first is None:
+        raise BagError(f"{bag.path}: {path.topic} has no messages, so [*] stands for nothing")
+    return path.expand(decode(first.data(0), *bag.types_on(path.topic)))
 
 
 class TopicReader:

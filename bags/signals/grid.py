@@ -39,9 +39,11 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
 from nlsid_core.files import canonical
 from nlsid_core.progress import Progress, silent
+from nlsid_core.running.grid import OTHER_PACE
 from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
+ON_A_GRID = "give grid.period the mean step of the samples, or set grid.resample to linear"
 FEW: Final = 0.01  # of the samples, left out at the ends: nobody needs to hear of it
 TOGETHER: Final = 64  # numbers that a sampler takes before it is asked for samples
 MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
@@ -381,8 +383,12 @@ def filled_samples(dataset: Dataset) -> int:
 def _restarts(stamp_ns: IntArray, points: IntArray, period_ns: int) -> int:
     """How often a monitor begins a new run with samples that are on these points of the grid.
 
-    It holds every stamp against the start of its run.
+    It holds every stamp against the start of its run, and their mean step against the period: where
+    that is another, it begins again at each.
     """
+    mean = (stamp_ns[-1] - stamp_ns[0]) / max(points[-1] - points[0], 1)
+    if abs(mean - period_ns) > OTHER_PACE * period_ns:
+        return len(points)
     count, start = 0, 0
     for k in range(len(points)):
         due = stamp_ns[start] + (points[k] - points[start]) * period_ns
@@ -391,19 +397,31 @@ def _restarts(stamp_ns: IntArray, points: IntArray, period_ns: int) -> int:
     return count
 
 
+def restarts_in(trial: Trajectory) -> int:
+    """How often a monitor begins a new run in it, as its stamps stray from the grid."""
+    return int(json.loads(trial.provenance or "{}").get("restarts", 0))
+
+
 def said_restarts(dataset: Dataset) -> list[str]:
     """Of each trial that a monitor would not judge as one run: that, and what to do."""
-    counts = {
-        trial.name: (json.loads(trial.provenance or "{}").get("restarts", 0), trial.period)
-        for trial in dataset
-    }
     return [
-        f"{name}: its stamps stray from a grid of {period:g} s, so that a monitor begins {count} "
-        "new runs in it and judges it in pieces or not at all; give grid.period the mean step of "
-        "the samples, or set grid.resample to linear"
-        for name, (count, period) in counts.items()
-        if count
+        f"{trial.name}: its stamps stray from a grid of {trial.period:g} s, so that a monitor "
+        f"begins {count} new runs in it and judges it in pieces or not at all; {ON_A_GRID}"
+        for trial in dataset
+        if (count := restarts_in(trial))
     ]
+
+
+def refuse_unjudgeable(dataset: Dataset, settling: int) -> None:
+    """Raise DataError if most of such trials would be starts of runs, `settling` samples each."""
+    samples = sum(map(len, dataset))
+    lost = settling * sum(map(restarts_in, dataset))
+    if lost > 0.5 * samples:
+        raise DataError(
+            f"a monitor would judge little of such trials: their stamps stray from a grid of "
+            f"{dataset.period:g} s, and new runs take {min(lost, samples)} of {samples} samples to "
+            f"start; {ON_A_GRID}"
+        )
 
 
 def _period_ns(stamp_ns: IntArray, period: float | None, label: str, *, on_grid: bool) -> int:

@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.remote import RemotePath
-from bags.signals.columns import Columns, expand_paths, read_columns
+from bags.signals.columns import Columns, expand_path, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.publishers import two_curves
 from nlsid_core.arrays import FloatArray, IntArray, Json
@@ -119,7 +119,7 @@ def expanded(bag: Bag, texts: Sequence[str]) -> dict[str, Expression]:
     found: dict[str, Expression] = {}
     for text in texts:
         signal = Expression.parse(text)
-        for path in expand_paths(bag, [signal.path]):
+        for path in expand_path(bag, signal.path):
             found[str(signal.of(path)) if signal.path.every else text] = signal.of(path)
     return found
 

@@ -103,13 +103,8 @@ class ClockRelation:
     latency: float
     spread: float
 
-    @property
-    def same_clock(self) -> bool:
-        """Whether stamps and log times can be of one clock."""
-        return abs(self.offset) < SAME_CLOCK and not self.drift
-
     def __str__(self) -> str:
-        if self.same_clock:
+        if abs(self.offset) < SAME_CLOCK and not self.drift:
             return (
                 f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
             )

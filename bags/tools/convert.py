@@ -189,7 +189,8 @@ def _refuse_another_type(topic: str, first: Bag, second: Bag) -> None:
 
 def _spans(bags: Sequence[Bag], what: What) -> Spans:
     """When messages are copied."""
-    origin_ns = min((bag.start_ns for bag in bags if any(c.count for c in bag.channels)), default=0)
+    filled = [bag.storage for bag in bags if any(channel.count for channel in bag.channels)]
+    origin_ns = min((storage.start_ns for storage in filled), default=0)
     start_ns = _moment(what.start, origin_ns) if what.start else 0
     end_ns = _moment(what.end, origin_ns) if what.end else NEVER
     if not what.around:

@@ -18,12 +18,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.remote import StorageError, place
-from bags.signals.columns import expand_paths, read_columns
+from bags.signals.columns import read_columns
 from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
 from bags.signals.sampling import Grid
-from bags.signals.signal import SignalPath
 from bags.signals.timing import RELATED, Delay, clock_relation, delay, held
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
@@ -207,10 +206,10 @@ def _ruled(samples: Samples, rule: str) -> Samples:
 def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
     if bag.ending is not None:
         yield Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}")
-    texts = [text.partition("|")[0] for text in signals]
-    paths = expand_paths(bag, [SignalPath.parse(text) for text in texts])
+    found = expanded(bag, signals).values()
+    paths = [signal.path for signal in found]
+    logged = {signal.path.topic for signal in found if signal.clock == "log"}
     offsets = {}
-    logged = {e.path.topic for e in map(Expression.parse, signals) if e.clock == "log"}
     for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
         if topic in logged:
             yield Finding(
@@ -229,9 +228,7 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
         elif len(columns):
             back = int((np.diff(columns.stamp_ns) < 0).sum())
             if back:
-                yield Finding(
-                    Level.BAD, "clock", f"{topic}: stamps go back in {_counted(back, 'place')}"
-                )
+                yield Finding(Level.BAD, "clock", f"{topic}: stamps go back {back} times")
             relation = clock_relation(columns.stamp_ns, columns.log_ns)
             offsets[topic] = relation.offset
             level = Level.LOOK if relation.drift else Level.GOOD
@@ -266,14 +263,14 @@ def _regularity(samples: Samples) -> Iterator[Finding]:
         yield Finding(
             Level.LOOK,
             "regularity",
-            f"{name}: {_counted(int(gaps.sum()), 'gap')}, the longest {np.max(steps):.3g} s",
+            f"{name}: gaps: {gaps.sum()}, the longest {np.max(steps):.3g} s",
         )
     jitter = float(np.quantile(np.abs(steps[~gaps] - period), 0.95)) / period
     level = Level.LOOK if jitter > JITTER_LOOK else Level.GOOD
     yield Finding(
         level,
         "regularity",
-        f"{name}: {_rate(samples, period)}, 95 % of steps within {_percent(jitter)}",
+        f"{name}: {_rate(samples, period)}, 95 % of steps within {100 * jitter:.3g} %",
     )
 
 
@@ -311,14 +308,6 @@ def _commands(samples: Samples, last_ns: int) -> Iterator[Finding]:
 def _rate(samples: Samples, period: float) -> str:
     rate = f"{1 / period:.4g} Hz" if period > 0 else "several at one time"
     return rate if samples.clock == HEADER_STAMP else f"{rate} by {samples.clock}"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
 def _excitation(samples: Samples) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -137,7 +138,8 @@ def frame(
         period: s between rows.
 
     Returns:
-        The DataFrame; integers, booleans and strings as such, arrays as NumPy arrays.
+        The DataFrame; integers, booleans and strings as such, arrays as NumPy arrays. Its
+        `attrs["left_out"]` says which arrays are too long for a table: pixels, points.
 
     Raises:
         BagError: without pandas, as `read_signals` for damage, and if nothing is there.
@@ -148,7 +150,8 @@ def frame(
 
     parts: dict[str, list[Table]] = {}
     with nullcontext(bag) if isinstance(bag, Bag) else Bag(bag) as source:
-        tables = _wanted(source, wanted, [])
+        left_out: list[str] = []
+        tables = _wanted(source, wanted, left_out)
         for topic, table in _tables(source, tables, None, silent):
             parts.setdefault(topic, []).append(table)
         frames = []
@@ -157,7 +160,7 @@ def frame(
                 raise BagError(f"{source.path}: {topic} has no messages")
             rows = {n: np.concatenate([p[n] for p in parts[topic]]) for n in parts[topic][0]}
             by = "stamp_ns" if clock == "header" and "stamp_ns" in rows else "log_time_ns"
-            index = pandas.to_datetime(rows[by]).rename("time")
+            index = pandas.DatetimeIndex(rows[by].view("M8[ns]"), name="time")
             named = {n: v for n, v in rows.items() if n not in TIMES}
             if len(tables) > 1:
                 named = {f"{topic}:{n}": v for n, v in named.items()}
@@ -170,6 +173,7 @@ def frame(
         )
     for other in frames[0 if period is not None else 1 :]:
         joined = pandas.merge_asof(joined, other, left_index=True, right_index=True)
+    joined.attrs["left_out"] = left_out
     return joined
 
 
@@ -186,34 +190,33 @@ def _wanted(
             for signal in expanded(bag, [text]).values():
                 found.setdefault(signal.path.topic, {})[str(signal).partition(":")[2]] = signal
         else:
-            found[text] = _every_field(bag, text)
+            found[text] = _every_field(bag, text, left_out)
     for topic in () if texts else dict.fromkeys(c.topic for c in bag.channels if c.count):
         try:
-            found[topic] = _every_field(bag, topic)
-            _leave_out_large(bag, topic, found[topic], left_out)
+            found[topic] = _every_field(bag, topic, left_out)
         except BagError as error:
-            found.pop(topic, None)
             left_out.append(str(error))
     return found
 
 
-def _every_field(bag: Bag, topic: str) -> dict[str, Expression]:
-    """Each field of a topic's messages, those of messages in it by their paths."""
-    texts = _fields(*bag.types_on(topic))
-    return {t.removesuffix("[*]"): Expression(SignalPath.parse(f"{topic}:{t}")) for t in texts}
+def _every_field(bag: Bag, topic: str, left_out: list[str]) -> dict[str, Expression]:
+    """Each field of a topic's messages, those of messages in it by their paths.
 
-
-def _leave_out_large(
-    bag: Bag, topic: str, columns: dict[str, Expression], left_out: list[str]
-) -> None:
-    """Leave out arrays with more than MAX_ELEMENTS in the first message."""
-    first = next(batch for _, batch in bag.batches([topic]))
-    message = decode(first.data(0), *bag.types_on(topic))
-    for name, signal in list(columns.items()):
-        value = _value(message, signal.path)
-        if not isinstance(value, str) and np.size(value) > MAX_ELEMENTS:
-            left_out.append(f"{topic}:{name}: {np.size(value)} elements; name those you need")
-            del columns[name]
+    Arrays with more than MAX_ELEMENTS in the first message are left out: pixels and points.
+    """
+    msgtype, types = bag.types_on(topic)
+    columns = {
+        text.removesuffix("[*]"): Expression(SignalPath.parse(f"{topic}:{text}"))
+        for text in _fields(msgtype, types)
+    }
+    for _, first in islice(bag.batches([topic]), 1):
+        message = decode(first.data(0), msgtype, types)
+        for name, signal in list(columns.items()):
+            value = _value(message, signal.path)
+            if not isinstance(value, str) and np.size(value) > MAX_ELEMENTS:
+                left_out.append(f"{topic}:{name}: {np.size(value)} elements; name those you need")
+                del columns[name]
+    return columns
 
 
 def _fields(msgtype: str, types: Typestore) -> Iterator[str]:

@@ -11,7 +11,7 @@ from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.models import StableModel
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.options import require_at_least, require_one_of, require_positive, require_ranges
 from nlsid_core.policies.sampled import SampledPolicy
 
@@ -79,7 +79,7 @@ class SampledTracking:
     largest that the box of the data allows).
     """
 
-    model: MeasuredState
+    model: StateModel
     policy: SampledPolicy
     feedback: Feedback
     assumption: DisturbanceAssumption

@@ -134,7 +134,7 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
     fast = _best(form, _pairs(gains, e, form.fading()), amplitudes, samples, decided, start)
     slower = np.multiply.outer([*SLOWER, 0.0], fast.L)
     own = [innovations(model, slower, trial, settling) for trial in train]
-    found, tubes, alarm = [fast], [tube_of(fast, None)], None
+    found, tubes, alarm, trained = [fast], [tube_of(fast, None)], None, None
     if horizon is not None:
         length = max(1, round(horizon / model.period))
         longest = max(map(len, trials.calibration)) - settling
@@ -162,7 +162,8 @@ def design_output_tube(problem: OutputTube) -> OutputTubeDesign:
             tubes.append(tube_of(headline, None, peak))
         deviation = np.concatenate([part[:, 0] for part in own]).std(axis=0)
         alarm = Cusum(np.maximum(deviation, TINY), DRIFT, DRIFT)
-    funnel = replace(around(*tubes), cusum=alarm)
+        trained = commanded([*train, *trials.calibration])
+    funnel = replace(around(*tubes), cusum=alarm, commands=trained)
     funnel = calibrated(funnel, model, train, trials.calibration)
     refuse_far(model, funnel, trials.calibration)
     return proved(funnel, found)
@@ -203,6 +204,13 @@ def statistics(funnel: TubeFunnel, model: StableModel, trial: Trajectory) -> Flo
         z = funnel.tubes[0].measured.safety_factor * e[:, 0] / alarm.deviation
         found.append((max(DRIFT, float(cusum(z).max())), *SUMS))
     return np.asarray(np.maximum(found, TINY))
+
+
+def commanded(trials: Sequence[Trajectory]) -> FloatArray:
+    """(n_u, 3) the least and the largest of every input, and its largest change in a sample."""
+    u = np.concatenate([trial.u for trial in trials])
+    changes = np.concatenate([np.abs(np.diff(trial.u, axis=0)) for trial in trials])
+    return np.column_stack([u.min(axis=0), u.max(axis=0), changes.max(axis=0)])
 
 
 def calibrated(

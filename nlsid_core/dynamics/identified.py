@@ -8,7 +8,7 @@ import numpy as np
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.dynamics.vector_field import VectorField, variable_names
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models import ImplicitModel, TrapezoidalModel
+from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial
 
 LARGEST_REST = 1e-9  # of the largest coefficient: rounding of a term that is not in e + f
@@ -16,7 +16,7 @@ WORST_CONDITION = 1e10  # of E
 
 
 def identified_field(
-    model: ImplicitModel | TrapezoidalModel,
+    model: ImplicitModel,
     *,
     box: Sequence[tuple[float, float]] | None = None,
     disturbance: ArrayLike | None = None,
@@ -28,16 +28,12 @@ def identified_field(
     (set 2.19) is one, as is every model of a `Polynomial(..., continuous=True)`.
     A step of h differs from the solution by O(h³). What is proved of the model is about its steps.
 
-    box: (low, high) of every state, then every input, where the field is to be used (None: of a
-    `TrapezoidalModel` the range of its data, else everywhere); a funnel stays there. disturbance:
-    (n,) half-widths of what may be added to ẋ at any time, per second (None: nothing).
+    box: (low, high) of every state, then every input, where the field is to be used (None:
+    everywhere); a funnel stays there. disturbance: (n,) half-widths of what may be added to ẋ at
+    any time, per second (None: nothing).
     Raises DataError if the model steps no such equation, ShapeError on rows that do not fit.
     """
-    if isinstance(model, TrapezoidalModel):
-        equation = _of_mechanism(model)
-        ranges = np.concatenate([model.x_range, model.u_range])
-    else:
-        equation, ranges = _of_implicit(model), np.zeros((0, 2))
+    equation, ranges = _of_implicit(model), np.zeros((0, 2))
     n, m = len(model), len(model.u)
     if box is not None:
         ranges = np.asarray(box, dtype=np.float64)
@@ -73,15 +69,6 @@ class _Equation:
 
     exponents: IntArray
     coefficients: FloatArray
-
-
-def _of_mechanism(model: TrapezoidalModel) -> _Equation:
-    d, size = model.joints, len(model) + len(model.u)
-    rates = np.eye(size, dtype=np.int64)[d : 2 * d]
-    coefficients = np.zeros((d + len(model.exponents), 2 * d))
-    coefficients[:d, :d] = np.eye(d)
-    coefficients[d:, d:] = model.coefficients
-    return _merged(np.vstack([rates, model.exponents]), coefficients)
 
 
 def _of_implicit(model: ImplicitModel) -> _Equation:

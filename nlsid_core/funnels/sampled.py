@@ -12,7 +12,7 @@ from nlsid_core.funnels.factor import rounding_of
 from nlsid_core.funnels.tube import FORMAT
 
 KIND = "sampled"
-_AXES = {"S": 3, "A": 3, "tube": 1, "inlet": 1, "half_widths": 2, "roots": 1}
+_AXES = {"S": 3, "A": 3, "tube": 1, "inlet": 1, "half_widths": 2}
 FORM = "response"  # how the disturbance is bounded; the format has others, nothing makes them
 
 
@@ -39,9 +39,7 @@ class SampledFunnel:
     tube: (N + 1,) radii of what starts with |S_0 x̄_0| ≤ tube_0 do; inlet: (N + 1,) radii from
     which the goal inlet_N is reached. The radius is tube + the assumption's bound. Radii are in the
     norm of S, without unit. half_widths: (N + 1, n) the largest |x̄_i| in the tube, in the signals'
-    units, rounded up; they are part of what is proved. roots, of an implicit model only: (N + 1,),
-    at sample k + 1 the next rates v are claimed to be within |S_vv (v - v_{k+1})| ≤ roots_{k+1},
-    S_vv the block of the rates; farther ones are spurious. `model` and `policy` are digests.
+    units, rounded up; they are part of what is proved. `model` and `policy` are digests.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -54,7 +52,6 @@ class SampledFunnel:
     assumption: DisturbanceAssumption
     model: str
     policy: str
-    roots: FloatArray | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "funnel", {"S": (None, None, None)})
@@ -74,10 +71,6 @@ class SampledFunnel:
         )
         if (np.tril(self.S, -1) != 0).any() or (np.diagonal(self.S, axis1=1, axis2=2) == 0).any():
             raise DataError("funnel: S should be upper triangular with a nonzero diagonal")
-        if self.roots is not None:
-            freeze(self, "funnel", {"roots": (length,)})
-            if not (self.roots > 0).all():
-                raise DataError(f"funnel: roots should be {length} positive radii")
         if not ((self.tube > 0).all() and (self.inlet > 0).all() and self.tube[0] <= self.inlet[0]):
             raise DataError("funnel: radii should be positive, and the tube start in the inlet")
         if self.assumption.bound < 0:
@@ -132,7 +125,6 @@ class SampledFunnel:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         a = self.assumption
-        roots = {} if self.roots is None else {"roots": self.roots.tolist()}
         return {
             "format": FORMAT,
             "version": files.VERSION,
@@ -154,7 +146,6 @@ class SampledFunnel:
             "half_widths": self.half_widths.tolist(),
             "S": self.S.tolist(),
             "A": self.A.tolist(),
-            **roots,
         }
 
     @classmethod
@@ -169,7 +160,6 @@ class SampledFunnel:
         arrays = {
             key: files.array(document, key, (None,) * axes, source=source)
             for key, axes in _AXES.items()
-            if key != "roots" or key in document
         }
         return cls(
             assumption=DisturbanceAssumption(

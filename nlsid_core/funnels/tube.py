@@ -211,7 +211,8 @@ class TubeFunnel:
     (n_u, 2): where outputs, states and inputs have to stay, for implicit models whose increments
     are known on a box only; else None. model: its digest. cusum: a second alarm, which is no
     assumption. policy: the digest of the policy whose plan the tubes are around too, None without
-    one.
+    one. commands: (n_u, 3) the least and the largest that each input was in the trials of design
+    and calibration, and its largest change in a sample; no part of the claim.
     """
 
     tubes: tuple[Tube, ...]
@@ -221,10 +222,13 @@ class TubeFunnel:
     u_box: FloatArray | None = None
     cusum: Cusum | None = None
     policy: str | None = None
+    commands: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if not self.tubes:
             raise DataError("a funnel of kind tube holds one tube or more")
+        if self.commands is not None:
+            freeze(self, "funnel", {"commands": (None, 3)})
         if len({tube.L.shape for tube in self.tubes}) > 1:
             raise ShapeError("the tubes are of models of different sizes")
 
@@ -266,6 +270,7 @@ class TubeFunnel:
             "settling": self.settling,
             **box,
             **({} if self.cusum is None else {"cusum": self.cusum.document()}),
+            **({} if self.commands is None else {"commands": self.commands.tolist()}),
             "tubes": [tube.document() for tube in self.tubes],
         }
 
@@ -281,6 +286,8 @@ class TubeFunnel:
             given = files.member(document, "box", dict, source=source)
             for key in ("y", "u"):
                 beside[f"{key}_box"] = files.array(given, key, (None, 2), source=source)
+        if "commands" in document:
+            beside["commands"] = files.array(document, "commands", (None, 3), source=source)
         if "cusum" in document:
             beside["cusum"] = _cusum(document["cusum"], f"{source} cusum")
         return cls(

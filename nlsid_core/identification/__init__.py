@@ -12,7 +12,13 @@ from nlsid_core.identification.methods.options import (
     Rse,
     Sem,
 )
-from nlsid_core.identification.network.options import CellRow, Feedback, FilterMapFilter, Network
+from nlsid_core.identification.network.options import (
+    CellRow,
+    Feedback,
+    FilterMapFilter,
+    Follower,
+    Network,
+)
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
 from nlsid_core.identification.prediction import Model, predict, simulate_trial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
@@ -35,6 +41,7 @@ __all__ = [
     "Feedback",
     "FilterMapFilter",
     "Fit",
+    "Follower",
     "History",
     "ImplicitProof",
     "LeastSquares",

@@ -1,9 +1,7 @@
 """`identify_states`: a polynomial model of a measured state from repeats of the same excitations.
 
 Noise in the regressors biases least squares. Repeats have independent noise, so the monomials of
-one repeat are instrumented by those of the mean of the others: Σ Z'(x⁺ - x - Φθ) = 0. Of a map all
-states are fitted on the monomials at a sample; of a trapezoidal step the rates are, on the mean of
-the monomials at both its ends, so that the discretisation's error does not end up in θ.
+one repeat are instrumented by those of the mean of the others: Σ Z'(x⁺ - x - Φθ) = 0.
 Source: the instrumental-variable method; repeats as in thesis Chapter 3.
 """
 
@@ -17,10 +15,8 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.signal import signals_of
 from nlsid_core.models.state_map import StateModel
-from nlsid_core.models.trapezoidal import TrapezoidalModel
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds
 USEFUL = 0.97  # a larger model has to bring the error below this part of the smaller one's
@@ -41,7 +37,7 @@ class StateFit:
     diverged or was not determined). error: the chosen model's.
     """
 
-    model: MeasuredState
+    model: StateModel
     error: float
     errors: tuple[tuple[tuple[int, ...], float], ...]
 
@@ -53,15 +49,13 @@ def identify_states(
     degrees: Sequence[tuple[int, ...]] | None = None,
     refuse_above: float = REFUSED_ERROR,
     biased_without_repeats: bool = False,
-    implicit: bool = False,
 ) -> StateFit:
     """Fit x⁺ = f(x, u) to repeats; trajectories hold the measured state in y.
 
-    implicit: a `TrapezoidalModel`, of states [q; v], instead of an explicit map. degrees: classes
-    to try, the highest power of each of [x; u]; default `classes_to_try`. The least free-run error
-    on `validation` wins. biased_without_repeats: least squares on single runs, for recordings that
-    have no repeats. Raises DataError if there are none and that was not asked for, or if no class
-    describes the data to `refuse_above` %, saying where they fail.
+    degrees: classes to try, the highest power of each of [x; u]; default `classes_to_try`. The
+    least free-run error on `validation` wins. biased_without_repeats: least squares on single runs,
+    for recordings that have no repeats. Raises DataError if there are none and that was not asked
+    for, or if no class describes the data to `refuse_above` %, saying where they fail.
     """
     groups = list(train.repeats().values())
     if not groups and biased_without_repeats:
@@ -78,13 +72,13 @@ def identify_states(
         raise DataError(f"{(first.y_names + first.u_names)[int(np.argmin(scale))]} is always zero")
     best: StateFit | None = None
     tried: list[tuple[tuple[int, ...], float]] = []
-    for choice in degrees if degrees is not None else classes_to_try(n, p, implicit=implicit):
+    for choice in degrees if degrees is not None else classes_to_try(n, p):
         exponents = monomials_of(choice)
-        theta = _instrumented(groups, exponents, scale, implicit=implicit)
+        theta = _instrumented(groups, exponents, scale)
         if theta is None:
             tried.append((tuple(choice), np.inf))
             continue
-        model = _model(train, groups, exponents, theta, data, implicit=implicit)
+        model = _model(train, groups, exponents, theta, data)
         error = free_run_error(model, validation, in_box=True)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
@@ -98,19 +92,17 @@ def identify_states(
     return StateFit(best.model, best.error, tuple(tried))
 
 
-def classes_to_try(n: int, p: int, *, implicit: bool = False) -> list[tuple[int, ...]]:
+def classes_to_try(n: int, p: int) -> list[tuple[int, ...]]:
     """Degrees per variable, [positions; rates; inputs], small first, that a funnel can prove."""
     half = n // 2
     choices = []
     for position, rate in product((1, 3, 5), (1, 2, 3)):
-        # a step's square has twice the degree; implicitly it has more variables, not more degree
-        variables, degree = (n + half, (position + 1) // 2) if implicit else (n, position)
-        if rate <= position and comb(variables + degree, variables) <= LARGEST_GRAM:
+        if rate <= position and comb(n + position, n) <= LARGEST_GRAM:
             choices.append((position,) * half + (rate,) * (n - half) + (1,) * p)
     return choices
 
 
-def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = False) -> float:
+def free_run_error(model: StateModel, dataset: Dataset, *, in_box: bool = False) -> float:
     """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread.
 
     in_box: only of the stretches in the box of the model's data, each from its measured start;
@@ -130,14 +122,14 @@ def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = Fal
     return float(max(errors, default=np.inf))
 
 
-def stretches_in_box(model: MeasuredState, trial: Trajectory) -> list[slice]:
+def stretches_in_box(model: StateModel, trial: Trajectory) -> list[slice]:
     """Where the trajectory stays in the box of the model's data for SHORTEST samples or more."""
     outside = (trial.y < model.x_range[:, 0]) | (trial.y > model.x_range[:, 1])
     ends = [-1, *np.flatnonzero(outside.any(axis=1)).tolist(), len(trial)]
     return [slice(a + 1, b) for a, b in pairwise(ends) if b - a > SHORTEST]
 
 
-def where_it_fails(model: MeasuredState, dataset: Dataset) -> str:
+def where_it_fails(model: StateModel, dataset: Dataset) -> str:
     """The slice of a variable in which one step ahead is worst, in words."""
     points = np.concatenate([np.hstack([t.y[:-1], t.u[:-1]]) for t in dataset])
     try:
@@ -181,22 +173,14 @@ def features(exponents: IntArray, points: FloatArray) -> FloatArray:
 
 
 def _instrumented(
-    groups: Sequence[Sequence[Trajectory]],
-    exponents: IntArray,
-    scale: FloatArray,
-    *,
-    implicit: bool,
+    groups: Sequence[Sequence[Trajectory]], exponents: IntArray, scale: FloatArray
 ) -> FloatArray | None:
-    """θ of x⁺ - x (m, n), or of v⁺ - v (m, n/2), in scaled monomials; None if undetermined."""
+    """θ of x⁺ - x (m, n) in scaled monomials; None if undetermined."""
     m, n = len(exponents), groups[0][0].y.shape[1]
-    fitted = slice(n // 2, n) if implicit else slice(n)
-    moments, target = np.zeros((m, m)), np.zeros((m, len(range(n)[fitted])))
+    moments, target = np.zeros((m, m)), np.zeros((m, n))
 
     def monomials_at(y: FloatArray, u: FloatArray) -> FloatArray:
-        now = features(exponents, np.hstack([y[:-1], u]) / scale)
-        if not implicit:
-            return now
-        return np.asarray((now + features(exponents, np.hstack([y[1:], u]) / scale)) / 2)
+        return features(exponents, np.hstack([y[:-1], u]) / scale)
 
     for members in groups:
         total = np.sum([member.y for member in members], axis=0)
@@ -204,7 +188,7 @@ def _instrumented(
             others = (total - member.y) / (len(members) - 1) if len(members) > 1 else total
             instruments = monomials_at(others, member.u[:-1])
             moments += instruments.T @ monomials_at(member.y, member.u[:-1])
-            target += instruments.T @ np.diff(member.y[:, fitted], axis=0)
+            target += instruments.T @ np.diff(member.y, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(moments, target, rcond=None)
     return np.asarray(solution) if rank == m else None
 
@@ -215,22 +199,17 @@ def _model(
     exponents: IntArray,
     theta: FloatArray,
     data: FloatArray,
-    *,
-    implicit: bool,
-) -> MeasuredState:
+) -> StateModel:
     first = groups[0][0]
     n = first.y.shape[1]
     scale = np.abs(data).max(axis=0)
     coefficients = theta / np.prod(scale**exponents, axis=1)[:, None]
-    if implicit:
-        coefficients = coefficients / train.period
-    for i in range(0 if implicit else n):
+    for i in range(n):
         unit = (exponents == np.eye(exponents.shape[1], dtype=np.int64)[i]).all(axis=1)
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
     noise = noise_between(groups)
-    make = TrapezoidalModel if implicit else StateModel
-    model: MeasuredState = make(
+    model = StateModel(
         exponents=exponents,
         coefficients=coefficients,
         period=train.period,
@@ -257,9 +236,7 @@ def noise_between(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
     return spread
 
 
-def _with_disturbance(
-    model: MeasuredState, groups: Sequence[Sequence[Trajectory]]
-) -> MeasuredState:
+def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]]) -> StateModel:
     """What one step misses on the mean of the repeats, less what the noise left in it explains."""
     squares, noise = [], []
     for members in groups:

@@ -97,15 +97,20 @@ class Node:
         return self.array(*how) if isinstance(how, tuple) else how(self)
 
     def document(
-        self, form: str, table: Table, kinds: str = "", made_for: Mapping[str, str] = NOTHING
+        self,
+        form: str,
+        table: Table,
+        kinds: str = "",
+        made_for: Mapping[str, str] = NOTHING,
+        former: Sequence[str] = (),
     ) -> Members:
         """The members of a document nlsid/`form`, of one of `kinds` if there are any.
 
-        made_for: the digests, by role, that it has to name.
+        made_for: the digests, by role, that it has to name. former: kinds that are refused by name.
         """
         heads: Table = {"format": one_of(f"nlsid/{form}"), "version": whole(VERSION, VERSION)}
         if kinds:
-            heads["kind"] = one_of(*kinds.split())
+            heads["kind"] = one_of(*kinds.split(), former=former)
         made = {role: one_of(digest, reason="mismatch") for role, digest in made_for.items()}
         return self.read({**heads, **made, **table})
 

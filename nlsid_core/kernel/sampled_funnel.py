@@ -4,8 +4,7 @@ With x̄ = xhat - x_k and d_k the observer's correction, x̄⁺ = f̄_k(x̄) + d
 The disturbance keeps |S_k r_k| <= bound, where r_{k+1} = A_k r_k + d_k from r_0 = 0.
 For both chains of radii, the tube and the inlet, and at each step: `positive` proves that
 |ξ| <= radius implies |f̄_k(ξ)| <= reach; and the reach, with what |r| <= bound adds to it, is within
-the next radius. A trapezoidal model's f̄ is any root of its equation
-h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄⁺ = T⁺w.
+the next radius. Coordinates are stated: x̄ = T z.
 Why that is enough: docs/certificate_sampled_funnel.md.
 """
 
@@ -27,7 +26,7 @@ from .files import (
     refuse_if,
 )
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import expanded, positive, powers_of_two, read_squares
+from .positivity import expanded, positive, read_squares
 from .sampled_step import Sample, nonnegative, read_step, stretch, triangular
 from .signals import apart, ranges, signals
 
@@ -36,6 +35,7 @@ MAX_SAMPLES = 10**6  # times the cube of the states
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
 LEFT = ("peak", "energy", "fading")  # forms of the assumption that are not decided any more
+LEFT_MODELS = ("trapezoidal",)
 
 SENTENCE = (
     "funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= {tube:down}, such as xhat = "
@@ -49,10 +49,6 @@ DISTURBANCE = (
     "d = xhat+ - f(xhat, u)"
 )
 APPLIED = "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
-ROOTS = (
-    "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1], {low:down} to "
-    "{high:down}; that there is one is not stated"
-)
 
 
 def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
@@ -66,8 +62,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     S, A = funnel["S"], funnel["A"]
     for k, (point, inputs, gain) in enumerate(zip(x, [*u, []], [*K, []], strict=True)):
         _prove_box(model, funnel, k, [*point, *inputs], gain)
-    names = "basis ball_basis steps" + " roots_basis equation_basis" * model["trapezoidal"]
-    bases = proof.members(names)
+    bases = proof.members("basis ball_basis steps")
     steps, rooms = bases["steps"].items(len(u), len(u)), []
 
     def prove(ring: Ring, k: int) -> None:
@@ -75,34 +70,26 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
         step = read_step(steps[k], model, at, ring)
         rooms.extend([_prove_chain(step, bases, funnel, chain, k) for chain in CHAINS])
 
-    at_width(model["variables"], range(len(u)), prove)
-    said, assumptions = _sentence(model, funnel, len(u)), _assumptions(model, funnel)
-    return text.Verdict(said, min(rooms), assumptions, digests)
+    at_width(len(model["x"]), range(len(u)), prove)
+    assumptions = text.say(DISTURBANCE, bound=funnel["bound"]), APPLIED
+    return text.Verdict(_sentence(model, funnel, len(u)), min(rooms), assumptions, digests)
 
 
 def _prove_chain(
     step: Members, bases: dict[str, Node], funnel: Members, chain: str, k: int
 ) -> Fraction:
     """Prove one step of one chain; the part of the next radius that it leaves free."""
-    ring, d, what = step["size"].ring, len(step["h"]), f"{chain}, step {k}"
-    names = "reach columns squares ball" + " roots equations spread extents" * bool(d)
-    stated = step[chain].members(names)
+    ring, what = step["size"].ring, f"{chain}, step {k}"
+    stated = step[chain].members("reach columns squares ball")
     reach, (radius, following) = nonnegative(stated["reach"]), funnel[chain][k : k + 2]
-    parts = [reach**2 - ring.dot(step["rows"], step["rows"])]
-    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, step["size"]))
-    if d:
-        far = step["kappa_next"] * funnel["roots"][k + 1]
-        far, added = _implicit_addition(step, stated, funnel["bound"], radius, far)
-        w = ring.variables[-d:]
-        parts.append(_ball(stated["roots"], bases["roots_basis"], far, ring.dot(w, w)))
-        parts += _equations(stated["equations"], bases["equation_basis"], step["h"])
-    else:
-        z, r = step["kappa"] * radius, step["kappa"] * funnel["bound"]
-        added = stretch(step["curvature"], z, r, least=1) * r
+    z, r = step["kappa"] * radius, step["kappa"] * funnel["bound"]
+    added = stretch(step["curvature"], z, r) * r
     shown = text.above(reach), text.above(added)
     exceeds = f"{what}: reach {shown[0]} and disturbance {shown[1]} exceed the next radius"
     at_most(reach + added, following, exceeds)
     squares = read_squares(stated | {"basis": bases["basis"]}, ring)
+    parts = [reach**2 - ring.dot(step["rows"], step["rows"])]
+    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, step["size"]))
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
     return Fraction((following - reach - added) / following)
 
@@ -111,37 +98,6 @@ def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polyno
     """-σ (radius² - size), σ a sum of squares: not positive where size <= radius²."""
     stated = node.members("columns squares") | {"basis": basis}
     return expanded(stated, size.ring) * (size - radius**2)
-
-
-def _equations(node: Node, basis: Node, h: list[Polynomial]) -> list[Polynomial]:
-    """-ν_i h_i, zero at a root: ν_i = Σ_m rows[i][m] 2^columns[m] monomial_m."""
-    stated, ring = node.members("columns rows"), h[0].ring
-    monomials = [ring.monomial(row) for row in basis.monomials(ring.count)]
-    columns = powers_of_two(stated["columns"], len(monomials))
-    rows = stated["rows"].wholes(len(h), len(monomials))
-    nu = ([-e * Fraction(2) ** c for e, c in zip(row, columns, strict=True)] for row in rows)
-    return [ring.dot(row, monomials) * equation for row, equation in zip(nu, h, strict=True)]
-
-
-def _implicit_addition(
-    step: Members, stated: dict[str, Node], bound: Fraction, radius: Fraction, far: Fraction
-) -> tuple[Fraction, Fraction]:
-    """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
-    z, rho, D = step["kappa"] * radius, step["kappa"] * bound, nonnegative(stated["spread"])
-    wide, near = (nonnegative(entry) for entry in stated["extents"].items(2, 2))
-    # The root of ξ: Δ, with |Δ| <= D|r|, is mapped to at most (state + ...) |r|.
-    far += D * rho
-    at_most(z**2 + far**2, wide**2, f"{stated['extents'].where}: the first is too small")
-    mu = stretch(step["curvature"], wide, (1 + D) * rho, least=2)
-    within = step["rates"] < 1 and step["state"] + step["rates"] * D + mu * (1 + D) <= D
-    stated["spread"].require({"two roots may differ by more": within}, "not_below")
-    # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
-    own = step["kappa_next"] * stated["reach"].number()
-    at_most(z**2 + own**2, near**2, f"{stated['extents'].where}: the second is too small")
-    m = stretch(step["curvature"], near, (1 + D) * rho, least=2)
-    if 1 - step["rates"] - m > 0:
-        D = min(D, (step["state"] + m) / (1 - step["rates"] - m))
-    return far, (step["direct"] + step["through"] * (step["rates"] * D + m * (1 + D))) * rho
 
 
 def _prove_box(
@@ -172,24 +128,21 @@ def _read_model(node: Node) -> Members:
         "u": signals("inputs", 1, MAX_SIGNALS),
         **dict.fromkeys(("exponents", "coefficients", "x_range", "u_range"), itself),
     }
-    given = node.document("model", table, "state_map trapezoidal")
-    trapezoidal, x, u = given["kind"] == "trapezoidal", given["x"], given["u"]
+    given = node.document("model", table, "state_map", former=LEFT_MODELS)
+    x, u = given["x"], given["u"]
     box = given["x_range"].array(len(x), 2) + given["u_range"].array(len(u), 2)
     exponents = given["exponents"].monomials(len(box))
     node.require(
         {
             "the period should be positive": given["period"] > 0,
-            "a trapezoidal model has a rate for each position": not (trapezoidal and len(x) % 2),
             "there should be monomials": exponents,
         }
     )
-    columns = given["coefficients"].array(len(exponents), len(x) // (1 + trapezoidal))
+    columns = given["coefficients"].array(len(exponents), len(x))
     polynomials = [list(zip(exponents, column, strict=True)) for column in transposed(columns)]
-    variables = len(x) + len(x) // 2 * trapezoidal  # z, and of an implicit model w
     degree = max(map(sum, exponents))
-    limit(comb(variables + degree, degree), MAX_MONOMIALS, f"monomials of degree {degree}")
-    found = {"trapezoidal": trapezoidal, "map": polynomials, "box": box, "variables": variables}
-    return {**given, **found, "named": [*x, *apart(u, x)]}
+    limit(comb(len(x) + degree, degree), MAX_MONOMIALS, f"monomials of degree {degree}")
+    return {**given, "map": polynomials, "box": box, "named": [*x, *apart(u, x)]}
 
 
 def _read_policy(node: Node, model: Members, made_for: str) -> Members:
@@ -227,7 +180,7 @@ def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]
     table: Table = {
         "set": itself,
         "assumption": lambda entry: entry.read(assumed),
-        **dict.fromkeys(("tube", "inlet") + ("roots",) * model["trapezoidal"], samples),
+        **dict.fromkeys(CHAINS, samples),
         "half_widths": (*samples, n),
         "S": (*samples, n, n),
         "A": (steps, n, n),
@@ -237,10 +190,10 @@ def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]
     assumption = given["assumption"]
     fits = assumption["rate"] == assumption["gain"] == 1
     node.require({"rate and gain should be 1": fits}, "not_below")
-    funnel = {"roots": [], **given, "bound": assumption["bound"]}
+    funnel = {**given, "bound": assumption["bound"]}
     starts = funnel["tube"][0] <= funnel["inlet"][0]
-    positive_radii = min(funnel["tube"] + funnel["inlet"] + funnel["roots"]) > 0
-    wanted = "radii and roots should be positive, and the tube start in the inlet"
+    positive_radii = min(funnel["tube"] + funnel["inlet"]) > 0
+    wanted = "radii should be positive, and the tube start in the inlet"
     node.require({wanted: positive_radii and starts}, "not_below")
     for S in funnel["S"]:
         triangular(S, node)
@@ -268,10 +221,3 @@ def _sentence(model: Members, funnel: Members, steps: int) -> str:
         goal=goal,
         box=ranges(model["named"], list(map(text.PRINTED["outer_range"], model["box"]))),
     )
-
-
-def _assumptions(model: Members, funnel: Members) -> tuple[str, ...]:
-    said = (text.say(DISTURBANCE, bound=funnel["bound"]), APPLIED)
-    if not model["trapezoidal"]:
-        return said
-    return (*said, text.say(ROOTS, low=min(funnel["roots"][1:]), high=max(funnel["roots"][1:])))

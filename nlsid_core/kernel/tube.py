@@ -95,7 +95,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     made_for = {role: digests[role] for role in roles.split()[:-1]}
     table: Table = {"settling": whole(0, MAX_SAMPLES), "tubes": itself, "box?": itself}
     if not planned:
-        table |= {"response?": itself, "cusum?": itself}
+        table |= {"response?": itself, "cusum?": itself, "commands?": itself}
     funnel = documents["funnel"].document("funnel", table, "tube", made_for)
     model = read_model(documents["model"], funnel["box"])
     policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None

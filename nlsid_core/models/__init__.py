@@ -11,7 +11,6 @@ from nlsid_core.models.signal import Signal
 from nlsid_core.models.spline import Spline
 from nlsid_core.models.state_affine import StateAffineModel
 from nlsid_core.models.state_map import StateModel
-from nlsid_core.models.trapezoidal import TrapezoidalModel
 
 # Models of recorded inputs and outputs that may be proved to forget their start.
 StableModel: TypeAlias = (
@@ -35,5 +34,4 @@ __all__ = [
     "StableModel",
     "StateAffineModel",
     "StateModel",
-    "TrapezoidalModel",
 ]

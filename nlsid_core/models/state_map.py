@@ -1,7 +1,6 @@
 """`StateModel`: an identified polynomial map of a measured state, and the box of its data."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from nlsid_core.models.signal import FORMAT, Signal, signals
 from nlsid_core.polynomial import Polynomial
 
 KIND = "state_map"
+MAX_DEGREE = 15  # of one variable in a file; a larger one would only be there to waste our time
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,26 @@ class StateModel:
     bags: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        settle(self, len(self.x))
+        exponents = np.array(self.exponents, dtype=np.int64)
+        keep(self, {"exponents": exponents})
+        n, p = len(self.x), len(self.u)
+        shapes = {
+            "coefficients": (len(exponents), n),
+            "x_range": (n, 2),
+            "u_range": (p, 2),
+            "noise": (n,),
+            "disturbance": (n,),
+        }
+        freeze(self, "model", shapes)
+        if exponents.shape != (len(exponents), n + p) or (exponents < 0).any():
+            raise ShapeError(f"model: exponents should be (m, {n + p}) and not negative")
+        empty = (self.x_range[:, 0] >= self.x_range[:, 1]).any()
+        if empty or (self.u_range[:, 0] >= self.u_range[:, 1]).any():
+            raise DataError("model: the box of its data is empty")
+        if not (np.isfinite(self.period) and self.period > 0):
+            raise DataError(f"model: period is {self.period} s")
+        if (self.noise < 0).any() or (self.disturbance < 0).any():
+            raise DataError("model: noise and disturbance should not be negative")
 
     def __len__(self) -> int:
         """The number of states n."""
@@ -91,84 +110,45 @@ class StateModel:
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
-        return write_fields(
-            self, KIND, "x+ = sum_i coefficients[i] * prod_j [x; u][j] ^ exponents[i][j]"
-        )
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "kind": KIND,
+            "equation": "x+ = sum_i coefficients[i] * prod_j [x; u][j] ^ exponents[i][j]",
+            "period": self.period,
+            "x": [signal.document() for signal in self.x],
+            "u": [signal.document() for signal in self.u],
+            "exponents": self.exponents.tolist(),
+            "coefficients": self.coefficients.tolist(),
+            "x_range": self.x_range.tolist(),
+            "u_range": self.u_range.tolist(),
+            "noise": self.noise.tolist(),
+            "disturbance": self.disturbance.tolist(),
+            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+        }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "StateModel":
         """Raises DocumentError if the document is not a state map."""
-        return cls(**read_fields(document, KIND, source=source))
-
-
-MAX_DEGREE = 15  # of one variable in a file; a larger one would only be there to waste our time
-
-
-def settle(model: Any, outputs: int) -> None:
-    """Check the fields that models of a measured state share, coefficients (m, outputs)."""
-    exponents = np.array(model.exponents, dtype=np.int64)
-    keep(model, {"exponents": exponents})
-    n, p = len(model.x), len(model.u)
-    shapes = {
-        "coefficients": (len(exponents), outputs),
-        "x_range": (n, 2),
-        "u_range": (p, 2),
-        "noise": (n,),
-        "disturbance": (n,),
-    }
-    freeze(model, "model", shapes)
-    if exponents.shape != (len(exponents), n + p) or (exponents < 0).any():
-        raise ShapeError(f"model: exponents should be (m, {n + p}) and not negative")
-    empty = (model.x_range[:, 0] >= model.x_range[:, 1]).any()
-    if empty or (model.u_range[:, 0] >= model.u_range[:, 1]).any():
-        raise DataError("model: the box of its data is empty")
-    if not (np.isfinite(model.period) and model.period > 0):
-        raise DataError(f"model: period is {model.period} s")
-    if (model.noise < 0).any() or (model.disturbance < 0).any():
-        raise DataError("model: noise and disturbance should not be negative")
-
-
-def write_fields(model: Any, kind: str, equation: str) -> Json:
-    """The JSON form of a model with these fields."""
-    return {
-        "format": FORMAT,
-        "version": files.VERSION,
-        "kind": kind,
-        "equation": equation,
-        "period": model.period,
-        "x": [signal.document() for signal in model.x],
-        "u": [signal.document() for signal in model.u],
-        "exponents": model.exponents.tolist(),
-        "coefficients": model.coefficients.tolist(),
-        "x_range": model.x_range.tolist(),
-        "u_range": model.u_range.tolist(),
-        "noise": model.noise.tolist(),
-        "disturbance": model.disturbance.tolist(),
-        "bags": [{"name": name, "digest": digest} for name, digest in model.bags],
-    }
-
-
-def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]:
-    """The fields of a model of kind `expected`; DocumentError says what is wrong."""
-    files.header(document, FORMAT, source=source, kind=expected)
-    x, u = (signals(document, key, source=source) for key in ("x", "u"))
-    exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
-    if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():
-        raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
-    bags = files.member(document, "bags", list, source=source)
-    sizes: dict[str, tuple[int | None, ...]] = {
-        "coefficients": (len(exponents), None),
-        "x_range": (len(x), 2),
-        "u_range": (len(u), 2),
-        "noise": (len(x),),
-        "disturbance": (len(x),),
-    }
-    arrays = {key: files.array(document, key, s, source=source) for key, s in sizes.items()}
-    return {
-        "exponents": exponents.astype(np.int64),
-        "period": files.number(document, "period", source=source),
-        "x": x,
-        "u": u,
-        "bags": tuple(files.named_digests(bags, source=source)),
-        **arrays,
-    }
+        files.header(document, FORMAT, source=source, kind=KIND)
+        x, u = (signals(document, key, source=source) for key in ("x", "u"))
+        exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
+        if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():
+            raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
+        bags = files.member(document, "bags", list, source=source)
+        sizes: dict[str, tuple[int | None, ...]] = {
+            "coefficients": (len(exponents), None),
+            "x_range": (len(x), 2),
+            "u_range": (len(u), 2),
+            "noise": (len(x),),
+            "disturbance": (len(x),),
+        }
+        arrays = {key: files.array(document, key, s, source=source) for key, s in sizes.items()}
+        return cls(
+            exponents=exponents.astype(np.int64),
+            period=files.number(document, "period", source=source),
+            x=x,
+            u=u,
+            bags=tuple(files.named_digests(bags, source=source)),
+            **arrays,
+        )

@@ -5,7 +5,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.running.observer import StateObserver
 
@@ -31,7 +31,7 @@ class DisturbanceMeter:
 
 
 def disturbance_of(
-    model: MeasuredState,
+    model: StateModel,
     policy: SampledPolicy,
     run: Trajectory,
     meter: DisturbanceMeter,

@@ -23,7 +23,7 @@ from nlsid_core.funnels.factor import UNIT, refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.assumption import DisturbanceMeter
@@ -170,7 +170,7 @@ class SampledComparison:
 
     lags = 0
 
-    def __init__(self, model: MeasuredState, policy: SampledPolicy, funnel: SampledFunnel) -> None:
+    def __init__(self, model: StateModel, policy: SampledPolicy, funnel: SampledFunnel) -> None:
         self.model, self._policy, self._funnel = model, policy, funnel
         refuse_unmonitorable(funnel)
         refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
@@ -222,8 +222,6 @@ class SampledComparison:
         a, start = self._funnel.assumption, self._funnel.start_size(x - self._policy.x[k])
         if k == 0 and not start <= 1.0:
             return f"started outside: {start:.4g} times as far out as the boundary of the start"
-        if self._farther_than_roots(k):
-            return f"the model's step ended at a root beyond the proved ones at t = {t:g} s"
         if not disturbance <= a.bound:
             return (
                 f"disturbance response {disturbance:.4g} above the assumed {a.bound:.4g} "
@@ -232,16 +230,6 @@ class SampledComparison:
         if u is None or k > self._policy.last:
             return ""
         return not_the_policys(t, u, self._policy(k, x), [signal.name for signal in self.model.u])
-
-    def _farther_than_roots(self, k: int) -> bool:
-        """Whether an implicit step's next rates are farther from the nominal than was proved."""
-        predicted, roots = self._observer.predicted, self._funnel.roots
-        if roots is None or predicted is None:
-            return False
-        d = len(predicted) // 2
-        away = (predicted - self._policy.x[k])[d:]
-        size = float(np.linalg.norm(self._funnel.S[k][d:, d:] @ away)) * self._up
-        return not size <= float(roots[k])
 
     def _level(self, k: int, size: float, x_bar: FloatArray) -> Level:
         norm, inlet = self._funnel.norm(k, x_bar), float(self._funnel.inlet[k])

@@ -3,6 +3,7 @@
 import math
 
 TOLERANCE = 0.25  # of a period: a stamp this far off the grid is still that sample
+OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
 
 
 def early(t: float, last: float, period: float) -> str:

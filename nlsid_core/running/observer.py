@@ -9,7 +9,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 
 
 class PredictingObserver:
@@ -39,10 +39,9 @@ class StateObserver:
 
     lags, ahead = 0, 0
 
-    def __init__(self, model: MeasuredState, L: FloatArray) -> None:
+    def __init__(self, model: StateModel, L: FloatArray) -> None:
         self._model, self._L = model, L
         self.x: FloatArray | None = None
-        self.predicted: FloatArray | None = None  # f(x̂, u), before the correction
         self.d: FloatArray = np.zeros(len(model))
 
     def begin(self, y: list[FloatArray], _u: list[FloatArray]) -> FloatArray:
@@ -51,15 +50,12 @@ class StateObserver:
         return self.x
 
     def update(self, y: FloatArray, u: FloatArray | None) -> FloatArray:
-        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one.
-
-        Raises SolverError if an implicit model's step finds no root.
-        """
+        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one."""
         if self.x is None or u is None:
             return self.begin([y], [])
-        self.predicted = self._model(self.x, u)
-        self.d = self._L @ (y - self.predicted)
-        self.x = self.predicted + self.d
+        predicted = self._model(self.x, u)
+        self.d = self._L @ (y - predicted)
+        self.x = predicted + self.d
         return self.x
 
 

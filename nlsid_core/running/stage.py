@@ -7,11 +7,11 @@ from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.funnels.protocol import AnyFunnel
 from nlsid_core.models import StableModel
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.protocol import AnyPolicy
 from nlsid_core.running.held import Held
 
-Dynamics: TypeAlias = StableModel | MeasuredState | VectorField
+Dynamics: TypeAlias = StableModel | StateModel | VectorField
 
 
 class Stage(NamedTuple):

@@ -24,7 +24,7 @@ from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
-from nlsid_core.running.grid import TOLERANCE, early
+from nlsid_core.running.grid import OTHER_PACE, TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status, Trend, unsaid
 from nlsid_core.running.stepping import Stepper
 
@@ -33,8 +33,9 @@ ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
 PACE = 0.01  # of what a gap is too long, by which the mean follows: over some 100 samples
-OTHER_PACE = 0.01  # of the period: two clocks differ by a tenth of it
 COARSE = "float64 cannot tell where the simulation is"
+BEYOND = "commanded beyond training"
+CLEARLY = 0.01  # of the range in training, by which a command is beyond it
 WATCHED = "watched as well, not needed for the tube's sentence"
 
 
@@ -81,6 +82,9 @@ class TubeRun:
         }
         if any(level.inputs > len(self._stepper.u) for level in self._follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
+        self._trained = funnel.commands
+        if self._trained is not None and len(self._trained) != len(self._stepper.u):
+            raise DataError("the funnel's commands are not those of this model")
         self._cusum = funnel.cusum
         self._signals = (*self._stepper.y, *self._stepper.u)
         self._names = [signal.name for signal in self._stepper.y]
@@ -109,6 +113,8 @@ class TubeRun:
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
         self._g: dict[int, float] = {}
+        self._u_before: FloatArray | None = None
+        self._beyond = ""
         alarm = self._cusum
         self._sums = None if alarm is None else CusumMeter(len(self._names), alarm.drift)
         self._trend = Trend()
@@ -128,6 +134,8 @@ class TubeRun:
         fault = self._fault(t, measured, applied)
         if fault:
             return self._unknown(t, measured, self._without(applied, fault) or fault)
+        self._beyond = self._beyond or self._beyond_training(t, applied)
+        self._u_before = applied
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
@@ -190,6 +198,23 @@ class TubeRun:
             if not math.isfinite(value):
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
+
+    def _beyond_training(self, t: float, u: FloatArray) -> str:
+        """Which input leaves the range or the pace that it had in training; empty if none does."""
+        if self._trained is None:
+            return ""
+        change = np.abs(u - (u if self._u_before is None else self._u_before))
+        least, most, fastest = self._trained.T
+        room = CLEARLY * (most - least)
+        out = (u < least - room) | (u > most + room) | (change > fastest + room)
+        if not out.any():
+            return ""
+        i = int(np.argmax(out))
+        signal, now = self._stepper.u[i], f"{u[i]:.4g}"
+        if least[i] - room[i] <= u[i] <= most[i] + room[i]:
+            now = f"changed by {change[i]:.4g} in a sample"
+        trained = f"{least[i]:.4g} to {most[i]:.4g}, changes to {fastest[i]:.4g}"
+        return f"; {BEYOND} from t = {t:g} s on: {signal.name} {now}, in training {trained}"
 
     def _without(self, u: FloatArray, fault: str) -> str:
         """A step with e = 0 under the input u, or a new run if that is not known.
@@ -318,7 +343,7 @@ class TubeRun:
             tuple(y.tolist()),
             Level.TUBE if size <= 1.0 else Level.NONE,
             reason,
-            self._assuming,
+            self._assuming + self._beyond,
             [*deviation.tolist(), *e[0].tolist()],
             alarm,
             tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),

@@ -230,31 +230,56 @@ def test_operations_are_exported(bag: Path, tmp_path: Path) -> None:
     assert np.isnan(column[: -len(expected)]).all()
 
 
-def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path: Path) -> None:
-    (tmp_path / "my_robot" / "msg").mkdir(parents=True)
-    text = "std_msgs/Header header\nfloat64 throttle\n"
-    (tmp_path / "my_robot" / "msg" / "Drive.msg").write_text(text)
+STAMPED = "std_msgs/Header header\nfloat64 throttle\n"
+DEFINED = {  # place -> its text, the type, the bytes before the number and the signal
+    "msg/Drive.msg": (STAMPED, "my/msg/Drive", (b"\1" + bytes(7)) * 2, "/drive:throttle"),
+    "msg/Drive.idl": (
+        "module my { module msg { struct Drive { long count; double throttle; }; }; };",
+        "my/msg/Drive",
+        bytes(8),
+        "/drive:throttle",
+    ),
+    "srv/Drive.srv": (
+        "float64 throttle\n---\nbool done\n",
+        "my/srv/Drive_Event",
+        bytes(40) + b"\1" + bytes(7),
+        "/drive:request[0].throttle",
+    ),
+    "action/Drive.action": (
+        "float64 far\n---\nbool done\n---\nfloat64 throttle\n",
+        "my/action/Drive_FeedbackMessage",
+        bytes(16),
+        "/drive:feedback.throttle",
+    ),
+}
+
+
+@pytest.mark.parametrize("place", DEFINED)
+def test_a_type_that_the_bag_does_not_define_is_read_from_its_file(
+    tmp_path: Path, place: str
+) -> None:
+    text, msgtype, before, signal = DEFINED[place]
+    file = tmp_path / "my" / place
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
     bare = tmp_path / "bare.mcap"
     with bare.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start(profile="ros2")
-        schema = writer.register_schema("my_robot/msg/Drive", "", b"")
-        channel = writer.register_channel("/drive", "cdr", schema)
+        channel = writer.register_channel("/drive", "cdr", writer.register_schema(msgtype, "", b""))
         for k in range(50):
-            stamp = START_NS + k * PERIOD_NS
-            data = struct.pack("<4s2II4sd", b"\0\1\0\0", *divmod(stamp, 10**9), 1, b"", k)
-            writer.add_message(channel, stamp, data, stamp)
+            data = b"\0\1\0\0" + before + struct.pack("<d", k) + b"\0" * 4 * ("srv" in place)
+            writer.add_message(channel, START_NS + k, data, START_NS + k)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates half of its writer
-    signal = "/drive:throttle"
-    with pytest.raises(BagError, match=r"'my_robot/msg/Drive' is not known: .*--definitions"):
+    with pytest.raises(BagError, match=rf"'{msgtype}' is not known: .*--definitions"):
         read_signals(bare, [signal])
-    given = ["--definitions", tmp_path / "my_robot"]
+    given = ["--definitions", tmp_path / "my"]
     assert "throttle" in run("signals", bare, *given)
     run("export", bare, "--out", tmp_path / "tables", *given)
     run("info", bare, *given)
     run("convert", bare, "--out", tmp_path / "defined", *given)
-    values = read_signals(tmp_path / "defined", [signal])[signal].values
-    assert values.tolist() == np.arange(50.0).tolist()
+    read = read_signals(tmp_path / "defined", [signal])
+    assert read[signal].values.tolist() == np.arange(50.0).tolist()
 
 
 @pytest.mark.pictures
@@ -425,7 +450,10 @@ def table_in(path: Path) -> Any:
 
 
 def test_what_changes_its_length_and_what_is_nested_are_lists_of_true_types(tmp_path: Path) -> None:
-    text = "byte[] codes\nbool on\nstring word\nstring[] words\ngeometry_msgs/Point[] points\n"
+    text = (
+        "byte[] codes\nbool on\nstring word\nstring[] words\n"
+        "geometry_msgs/Point[] points\nuint8[] pixels\n"
+    )
     defined = definitions_from({"my/msg/All": text})["my/msg/All"]
     embedded = MessageDefinition(MessageDefinitionFormat.MSG, defined.text)
     types = types_in_bag("my/msg/All", embedded)
@@ -435,10 +463,13 @@ def test_what_changes_its_length_and_what_is_nested_are_lists_of_true_types(tmp_
         for k in range(40):
             codes = np.full(k % 3, 200, np.uint8)
             words, points = ["a"] * (k % 2), [point(float(k), 0.0, 0.0)] * (k % 2 + 1)
-            message: Any = types.types["my/msg/All"](codes, k > 5, f"w{k}", words, points)
+            message: Any = types.types["my/msg/All"](
+                codes, k > 5, f"w{k}", words, points, np.zeros(5000, np.uint8)
+            )
             data = bytes(types.serialize_cdr(message, "my/msg/All"))
             writer.write("/all", "my/msg/All", data, log_time_ns=k, publish_time_ns=k)
     rows = frame(tmp_path / "all", ["/all"])
+    assert rows.attrs["left_out"] == ["/all:pixels: 5000 elements; name those you need"]
     assert rows["on"].dtype == bool
     assert rows["word"].tolist() == [f"w{k}" for k in range(40)]
     assert [list(codes) for codes in rows["codes"][:3]] == [[], [200], [200, 200]]

@@ -434,9 +434,11 @@ def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) 
     median = config.read_text().replace(f"period: {grid.period}", "period: 0.022")
     config.write_text(median)
     out = tmp_path / "median"
-    told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 33 new runs"
+    told = "run_2: its stamps stray from a grid of 0.022 s, so that a monitor begins 300 new runs"
     assert told in nlsid("identify", out, tmp_path / "bags", "--config", config)
-    assert told in nlsid("funnel", out, "--config", config)
+    refused = nlsid("funnel", out, "--config", config, status=None)
+    assert "a monitor would judge little" in refused
+    assert not (out / "funnel.json").exists()
 
 
 def two_axes(folder: Path) -> None:

@@ -200,10 +200,10 @@ def test_profiles_are_read_as_rosbags_reads_them_and_written_as_it_does() -> Non
     assert (old.history, old.durability, old.depth) == ("unknown", "transient_local", 0)
     assert dump_qos_v9(parse_qos(OLD)) == [old.document()]
     assert parse_qos(offered_text([old, LATCHED])) == [*parse_qos(OLD), _rosbags(LATCHED)]
-    assert profile_of(_rosbags(LATCHED)) == LATCHED
     assert _rosbags(LATCHED).durability is QosDurability.TRANSIENT_LOCAL
     live = SimpleNamespace(**_rosbags(LATCHED)._asdict())
-    live.deadline = SimpleNamespace(nanoseconds=9223372036854775807)
+    live.deadline = live.lifespan = SimpleNamespace(nanoseconds=9223372036854775807)
+    live.liveliness_lease_duration = live.deadline
     assert profile_of(live) == LATCHED
     for bad in ("", "- 3", "[", "- depth: -1", "a" * 10**6, None, 7, [{"depth": 1}]):
         assert offered(bad) == ()

@@ -15,9 +15,8 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.dynamics import VectorField, identified_field
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import Degrees, Fit, Polynomial, Sem, identify
-from nlsid_core.models import ImplicitModel, TrapezoidalModel
+from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import Signal
 from nlsid_core.proofs import check
 
 PERIOD = 0.02
@@ -132,26 +131,6 @@ def test_the_page_goes_from_a_recording_to_a_proved_funnel(tmp_path: Path) -> No
     assert made["funnel"].funnel.widths(0.0)[0] > 0.1
     made["funnel"].save(tmp_path)
     assert check(tmp_path / "funnel.proof.json")
-
-
-def test_a_mechanism_becomes_the_field_of_its_accelerations() -> None:
-    model = TrapezoidalModel(
-        exponents=np.array([[1, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 1]]),
-        coefficients=np.array([[-9.0], [1.5], [-0.2], [2.0]]),
-        period=0.01,
-        x=(Signal("q"), Signal("v")),
-        u=(Signal("u"),),
-        x_range=np.array([[-1, 1], [-2, 2]]),
-        u_range=np.array([[-3, 3]]),
-        noise=np.zeros(2),
-        disturbance=np.zeros(2),
-    )
-    field = identified_field(model)
-    x, u = np.array([[0.3, -0.8]]), np.array([[1.1]])
-    np.testing.assert_allclose(
-        field(0.0, x, u), [[-0.8, -9 * 0.3 + 1.5 * 0.027 + 0.16 + 2.2]], rtol=1e-14
-    )
-    assert field.valid.tolist() == [[0, -1, 1], [1, -2, 2], [2, -3, 3]]
 
 
 def test_models_that_step_no_such_equation_are_refused(slowed: Fit[ImplicitModel]) -> None:

@@ -9,7 +9,6 @@ from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, DocumentError
 from nlsid_core.identification.states import identify_states
-from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.state_map import StateModel
 from tests.tracked import PERIOD, pendulum
 
@@ -40,7 +39,7 @@ def record(groups: int, repeats: int, *, seed: int = 0, samples: int = 1200) -> 
     return Dataset(tuple(runs))
 
 
-def coefficient(model: MeasuredState, exponent: list[int], state: int) -> float:
+def coefficient(model: StateModel, exponent: list[int], state: int) -> float:
     row = np.flatnonzero((model.exponents == exponent).all(axis=1))
     return float(model.coefficients[row[0], state])
 

@@ -18,6 +18,8 @@ from nlsid_core.identification import (
     Feedback,
     FilterMapFilter,
     Fit,
+    Follower,
+    LeastSquares,
     Network,
     Polynomial,
     Sem,
@@ -28,6 +30,7 @@ from nlsid_core.identification.network.cells import Row
 from nlsid_core.identification.network.feedback import Layout
 from nlsid_core.identification.network.filters import Cascade
 from nlsid_core.identification.network.fit import Minimum, Scaled
+from nlsid_core.identification.network.follower import UNIT, Loop
 from nlsid_core.identification.network.lowering import network_of
 from nlsid_core.identification.network.maps import Smooth
 from nlsid_core.identification.network.options import Limit
@@ -42,7 +45,7 @@ from tests.two_tanks import NOISE, tanks
 AMPLITUDES = [0.1, 0.2, 0.25, 0.15]
 OSCILLATOR = Network(Feedback(stages=2, imitated=20))
 CASCADE = Network(FilterMapFilter((2, 1), intervals=16, starts=4), seed=3)
-STRUCTURES = ("top", "friction", "none", "loop", "stages", "measured", "rest")
+STRUCTURES = ("follower", "top", "friction", "none", "loop", "stages", "measured", "rest")
 
 Example = tuple[Signals, FloatArray, Trial]
 
@@ -85,6 +88,10 @@ def example(name: str) -> Example:
         theta = np.concatenate([part.ravel() for part in parts])
         signals = Cascade((2, 1), 2, held, f, theta).signals
         return signals, theta, trial(signals, held=held)
+    if name == "follower":
+        signals = Loop(0.5, 3, UNIT).signals
+        theta = np.concatenate([[0.8, 0.1, -0.1], rng.uniform(0.05, 0.2, signals.parameters - 3)])
+        return signals, theta, trial(signals, held=True)
     row = Row(np.tile(np.linspace(-1.0, 1.0, 4), (3, 1)), 2, name)
     theta = np.zeros(1 + max(int(at.max(initial=0)) for at in row.places[-1].values()))
     for cell, top in zip(row.places, (0.6, 0.4, 0.9), strict=True):
@@ -116,7 +123,7 @@ def test_the_sensitivities_are_those_of_finite_differences(name: str) -> None:
         assert row == pytest.approx(slope, abs=2e-5 * (1.0 + np.abs(slope).max()))
 
 
-@pytest.mark.parametrize("name", STRUCTURES[:5])
+@pytest.mark.parametrize("name", STRUCTURES[:6])
 def test_the_network_simulates_what_was_fitted(name: str) -> None:
     """From the state that it begins with, recorded signals having other units."""
     signals, theta, one = example(name)
@@ -126,7 +133,7 @@ def test_the_network_simulates_what_was_fitted(name: str) -> None:
     u, recorded = 1.0 + 0.5 * one.u, (3.0 + 2.0 * y)[:, None]
     train = Dataset((Trajectory(t=np.arange(60.0), y=recorded, u=u),))
     model = network_of(signals, Minimum(1e-3, theta, (one,)), scaled, train, 20)
-    first = 2 if name in ("loop", "stages") else 0
+    first = 2 if name in ("follower", "loop", "stages") else 0
     x = model.start_from(recorded[first:50], u[first:50])
     later = model.states(u[first:], x)[0][20:]  # where what sticks has moved
     assert later == pytest.approx(recorded[first + 20 :], abs=0.02)
@@ -230,6 +237,29 @@ def test_a_slide_that_comes_to_rest_in_dry_friction_is_found_and_proved() -> Non
         assert made.proof.rate < 0.97
     assert errors["friction"] < 1.3 * 0.002
     assert errors["none"] > 3.0 * errors["friction"]
+
+
+def servo(seed: int, samples: int = 1500) -> Dataset:
+    """What goes after a command that is 4 samples old, by at most 0.02 a sample."""
+    rng, v, x, y = np.random.default_rng(seed), 0.0, 0.0, []
+    u = np.repeat(rng.uniform(-1.0, 1.0, samples // 30), 30)
+    for k in range(samples):
+        y.append(x)
+        v = 0.6 * v + 0.4 * np.clip(0.15 * (u[max(k - 3, 0)] - x), -0.02, 0.02)
+        x += v
+    measured = np.array(y) + 0.003 * rng.standard_normal(samples)
+    t = 0.02 * np.arange(samples)
+    return Dataset((Trajectory(t=t, y=measured, u=u, name=f"servo {seed}"),))
+
+
+def test_a_servo_with_a_limit_of_speed_is_found_and_proved() -> None:
+    """Where a linear model has 30 % of the spread; stiffer than proved it would not be stable."""
+    made = identify(servo(1), Network(Follower(), start_samples=10))
+    spread = float(servo(2).trajectories[0].y.std())
+    assert rms(made.model, servo(2), 20) < 0.04 * spread
+    assert made.proof.rate < made.max_rate < 1.0
+    linear = identify(servo(1), Polynomial(4), method=LeastSquares(), comparators=())
+    assert rms(linear.model, servo(2), 20) > 0.25 * spread
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +388,7 @@ def test_a_damaged_network_or_cascade_is_refused() -> None:
         replace(model, a1=np.ones(1)).simulate(np.ones(5), np.zeros(1))
 
 
-@pytest.mark.parametrize("structure", [CellRow(1), Feedback(2), FilterMapFilter()])
+@pytest.mark.parametrize("structure", [CellRow(1), Feedback(2), FilterMapFilter(), Follower()])
 def test_networks_have_one_output(structure: Any) -> None:
     t, u = np.arange(300.0), np.random.default_rng(0).normal(size=300)
     two = Dataset((Trajectory(t=t, y=np.column_stack([u, u**2]), u=u),))

@@ -25,7 +25,7 @@ from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
-from nlsid_core.running.tubes import WATCHED
+from nlsid_core.running.tubes import BEYOND, WATCHED
 from tests import implicit_models
 from tests.core.kernel.tube_claims import LONG, MODELS, dataset, design, recorded
 from tests.marks import slow_among
@@ -113,6 +113,29 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
         needed = tube.peak.direct.any()
         assert (f"assumed ({WATCHED})," in reading.reason) == (part > 1.0 and not needed)
         assert reading.assumption >= part**2 * (1.0 - 1e-6)
+
+
+@pytest.mark.parametrize("name", ["linear", "two_outputs"])
+def test_a_command_beyond_those_of_training_is_said_from_then_on(name: str) -> None:
+    """Beside the verdict, which it does not change; larger, or changing faster."""
+    made, trial = design(name), trial_of(name)
+    assert made.funnel.commands is not None
+    least, most, fastest = made.funnel.commands.T
+    within = np.clip(trial.u, least, most)
+    for k in range(1, len(within)):
+        within[k] = np.clip(within[k], within[k - 1] - fastest, within[k - 1] + fastest)
+    said = [BEYOND in r.assuming for r in run(made.monitor(), replace(trial, u=within))]
+    assert not any(said)
+    larger = within.copy()
+    larger[100:, -1] = most[-1] + 0.02 * (most[-1] - least[-1])
+    readings = run(made.monitor(), replace(trial, u=larger))
+    assert [BEYOND in r.assuming for r in readings] == [False] * 100 + [True] * 200
+    known = replace(made.funnel, commands=None)
+    plain = run(Monitor([Stage(made.model, None, known)]), replace(trial, u=larger))
+    assert [r.status for r in plain] == [r.status for r in readings]
+    faster = replace(made.funnel, commands=np.column_stack([least, most, 0.0 * fastest]))
+    readings = run(Monitor([Stage(made.model, None, faster)]), replace(trial, u=within))
+    assert "changed by" in readings[-1].assuming
 
 
 def test_a_reason_has_units() -> None:

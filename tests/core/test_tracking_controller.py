@@ -16,7 +16,7 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.reading import Status
 from tests.tracked import PERIOD, STEPS, designed
@@ -40,9 +40,7 @@ def design() -> AnyDesign:
     return Bundle({name: files.encode(document) for name, document in documents.items()}).design()
 
 
-def run(
-    model: MeasuredState, controller: Controller, seed: int = 0
-) -> tuple[FloatArray, FloatArray]:
+def run(model: StateModel, controller: Controller, seed: int = 0) -> tuple[FloatArray, FloatArray]:
     """States and inputs of the model under the controller, until it ends."""
     rng = np.random.default_rng(seed)
     x: FloatArray = np.zeros(2)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import BENCHMARKS, Benchmark, measured
-from benchmarks.bag_reading import generated_bag
 from benchmarks.machine import peers
 from benchmarks.nonlinear import PublicSet
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -30,15 +29,7 @@ def test_a_result_has_its_date_machine_load_and_commit() -> None:
     assert found["result"]
 
 
-def test_generated_data_stays_out_of_the_folder_that_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given, cache = tmp_path / "given", tmp_path / "cache"
-    given.mkdir()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    bag = generated_bag(given, 30)
-    assert bag.parent == cache / "nlsid"
-    assert not list(given.iterdir())
+def test_peers_are_told_with_their_versions() -> None:
     assert peers("rosbags", "no-such-thing") == {
         "peers": {"rosbags": version("rosbags"), "no-such-thing": "not installed"}
     }

@@ -18,7 +18,7 @@ from nlsid_core.kernel import text
 from nlsid_core.kernel.files import Terms
 from nlsid_core.kernel.polynomials import Polynomial, Ring
 from nlsid_core.kernel.sampled_step import Sample
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.sos.witness import expanded, multiplier, witness
 
@@ -58,7 +58,7 @@ def floats(M: Sequence[Sequence[Fraction]]) -> FloatArray:
     return np.array([[float(entry) for entry in row] for row in M])
 
 
-def map_of(model: MeasuredState) -> list[Terms]:
+def map_of(model: StateModel) -> list[Terms]:
     """The model's map, exactly."""
     exponents = [bytes(row) for row in model.exponents.tolist()]
     return [list(zip(exponents, column, strict=True)) for column in exact(model.coefficients.T)]
@@ -97,8 +97,8 @@ def norm_bound(M: Sequence[Sequence[Fraction]]) -> float:
     return float(ABOVE * np.linalg.norm(floats(M), 2))
 
 
-def curvature_bounds(p: Sequence[Polynomial], ring: Ring, least: int) -> list[float]:
-    """γ_m of the parts of degree m = least, least + 1, … of p; as in the kernel."""
+def curvature_bounds(p: Sequence[Polynomial], ring: Ring) -> list[float]:
+    """γ_m of the parts of degree m = 1, 2, … of p; as in the kernel."""
     columns: dict[int, list[list[float]]] = {}
     rows = [terms(q, ring) for q in p]
     for e in set().union(*rows):
@@ -107,7 +107,7 @@ def curvature_bounds(p: Sequence[Polynomial], ring: Ring, least: int) -> list[fl
     highest = max(columns, default=0)
     return [
         float(ABOVE * np.linalg.norm(np.array(columns[m]), 2)) if m in columns else 0.0
-        for m in range(least, highest + 1)
+        for m in range(1, highest + 1)
     ]
 
 

@@ -15,14 +15,12 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.problems import SampledTracking
 from nlsid_core.design.sampled.closed_loop import Frame, half_widths
 from nlsid_core.design.sampled.explicit import ExplicitStep
-from nlsid_core.design.sampled.implicit import ImplicitFunnelStep
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, Infeasible
 from nlsid_core.funnels.factor import refuse_coarse, refuse_unmonitorable
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
-from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.models.trapezoidal import TrapezoidalModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress, silent
 from nlsid_core.running.assumption import DisturbanceMeter, disturbance_of
@@ -32,14 +30,10 @@ CLOSE = 1.0 - 4e-4  # ... and from where it is content
 ATTEMPTS = 8  # semidefinite programs a step; two or three are usual
 INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
 
-ROOTS = 3.0  # radii of the tube within which the roots of an implicit step are claimed
+TrackingDesign: TypeAlias = Design[StateModel, SampledPolicy, SampledFunnel, None]
 
 
-FunnelStep: TypeAlias = ExplicitStep | ImplicitFunnelStep
-TrackingDesign: TypeAlias = Design[MeasuredState, SampledPolicy, SampledFunnel, None]
-
-
-def frame(model: MeasuredState, policy: SampledPolicy, feedback: Feedback) -> Frame:
+def frame(model: StateModel, policy: SampledPolicy, feedback: Feedback) -> Frame:
     """The norms |S x̄|, S'S the LQR cost, and how far the box of the data lets them grow."""
     S = np.array([np.linalg.cholesky(P).T for P in feedback.P])
     T = np.array([np.triu(np.linalg.inv(s)) for s in S])
@@ -75,13 +69,10 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
             f"at sample {k} the disturbance alone ({assumption.bound:.3g}) fills the box of the "
             f"data ({norms.cap[k]:.3g}); record more widely, or disturb less"
         )
-    implicit = isinstance(model, TrapezoidalModel)
-    kind: Any = ImplicitFunnelStep if implicit else ExplicitStep
     samples = range(len(policy))
-    steps: list[FunnelStep] = [kind.at(model, policy, norms, k, assumption) for k in samples]
+    steps = [ExplicitStep.at(model, policy, norms, k, assumption) for k in samples]
     inlet, to_goal = _inlet(steps, cap, problem.goal, progress)
-    roots = ROOTS * (inlet + assumption.bound)
-    tube, along = _tube(steps, float(inlet[0]), roots, progress)
+    tube, along = _tube(steps, float(inlet[0]), progress)
     funnel = SampledFunnel(
         S=norms.S,
         A=norms.A,
@@ -91,7 +82,6 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
         assumption=assumption,
         model=policy.model,
         policy=files.digest(policy.document()),
-        roots=roots if implicit else None,
     )
     refuse_unmonitorable(funnel)
     refuse_coarse(np.spacing(np.abs(policy.x)), funnel.half_widths, "the motion")
@@ -105,7 +95,7 @@ def design_state_funnel(problem: SampledTracking, *, progress: Progress = silent
 
 
 def assume(
-    model: MeasuredState,
+    model: StateModel,
     policy: SampledPolicy,
     feedback: Feedback,
     runs: Dataset,
@@ -131,7 +121,7 @@ def assume(
 
 
 def _inlet(
-    steps: Sequence[FunnelStep], cap: FloatArray, goal: float | None, progress: Progress
+    steps: Sequence[ExplicitStep], cap: FloatArray, goal: float | None, progress: Progress
 ) -> tuple[FloatArray, list[Any]]:
     """Backward: at each sample the largest radius whose step fits in the next one."""
     N = len(steps)
@@ -141,10 +131,9 @@ def _inlet(
     for k in range(N - 1, -1, -1):
         target = float(radii[k + 1])
         radius = min(target * growth, float(cap[k]))
-        roots = ROOTS * (target + steps[k].assumption.bound)
         best: tuple[float, Any] | None = None
         for _ in range(ATTEMPTS):
-            proof, needed = steps[k].from_radius(radius, roots)
+            proof, needed = steps[k].from_radius(radius)
             if needed <= target:
                 if best is None or radius > best[0]:
                     best = (radius, proof)
@@ -163,19 +152,19 @@ def _inlet(
 
 
 def _tube(
-    steps: Sequence[FunnelStep], start: float, roots: FloatArray, progress: Progress
+    steps: Sequence[ExplicitStep], start: float, progress: Progress
 ) -> tuple[FloatArray, list[Any]]:
     """Forward: what each step needs is the next radius."""
     radii, proofs = [start], []
     for k, step in enumerate(steps):
-        proof, needed = step.from_radius(radii[-1], float(roots[k + 1]))
+        proof, needed = step.from_radius(radii[-1])
         radii.append(needed)
         proofs.append(proof)
         progress("tube", (k + 1) / len(steps))
     return np.array(radii), proofs
 
 
-def refuse_assumption(model: MeasuredState, a: DisturbanceAssumption) -> None:
+def refuse_assumption(model: StateModel, a: DisturbanceAssumption) -> None:
     """Refuse an assumption that the kernel would refuse, before any work."""
     fitted = {digest for _, digest in model.bags}
     if not a.measured_on:

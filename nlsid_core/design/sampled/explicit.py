@@ -56,11 +56,11 @@ class ExplicitStep:
             size=ring.dot(scaled, scaled),
             degree=max(1, int(np.max(model.exponents.sum(axis=1)))),
             kappa=closed_loop.inverse_bound(ST),
-            curvature=closed_loop.curvature_bounds(moved, ring, 1),
+            curvature=closed_loop.curvature_bounds(moved, ring),
             assumption=assumption,
         )
 
-    def from_radius(self, radius: float, _roots: float) -> tuple[Reach, float]:
+    def from_radius(self, radius: float) -> tuple[Reach, float]:
         """The reach from `radius`, and the radius it needs next."""
         found = reach(self.rows, self.ring, radius, self.degree)
         return found, (found.bound + self.assumption.bound * self.stretch(radius)) * UP

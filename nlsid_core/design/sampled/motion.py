@@ -10,7 +10,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.riccati import Feedback, discrete_tvlqr, solve_riccati
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
-from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 
 __all__ = ["Feedback", "observer_gain", "plan_motion", "track", "tvlqr"]
@@ -23,7 +23,7 @@ NEARNESS = 1e-3  # weight of the state against the input
 
 
 def plan_motion(
-    model: MeasuredState,
+    model: StateModel,
     start: ArrayLike,
     goal: ArrayLike,
     *,
@@ -61,7 +61,7 @@ def plan_motion(
 
 
 def tvlqr(
-    model: MeasuredState,
+    model: StateModel,
     x: FloatArray,
     u: FloatArray,
     *,
@@ -77,7 +77,7 @@ def tvlqr(
     return discrete_tvlqr(A, B, Q=Q, R=R, P_final=(P_final + P_final.T) / 2)
 
 
-def observer_gain(model: MeasuredState) -> FloatArray:
+def observer_gain(model: StateModel) -> FloatArray:
     """L (n, n) of x̂⁺ = f + L(y⁺ - f), Kalman's for the model's noise and disturbance.
 
     Linearised at the middle of the data box.
@@ -88,7 +88,7 @@ def observer_gain(model: MeasuredState) -> FloatArray:
     return np.asarray(np.linalg.solve(prior + R, prior).T)
 
 
-def track(model: MeasuredState, x: FloatArray, u: FloatArray, feedback: Feedback) -> SampledPolicy:
+def track(model: StateModel, x: FloatArray, u: FloatArray, feedback: Feedback) -> SampledPolicy:
     """The policy that follows a motion with this feedback and the model's observer."""
     return SampledPolicy(
         x=x,
@@ -100,14 +100,14 @@ def track(model: MeasuredState, x: FloatArray, u: FloatArray, feedback: Feedback
     )
 
 
-def _rolled_out(model: MeasuredState, x: FloatArray, u: FloatArray) -> FloatArray:
+def _rolled_out(model: StateModel, x: FloatArray, u: FloatArray) -> FloatArray:
     """The model's own motion under u, so that no defect is left but rounding."""
     states = model.simulate(x[0], u)
     return states if np.isfinite(states).all() else x
 
 
 def _subproblem(
-    model: MeasuredState,
+    model: StateModel,
     x: FloatArray,
     u: FloatArray,
     ends: Sequence[FloatArray],

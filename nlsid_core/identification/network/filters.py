@@ -85,10 +85,11 @@ class Cascade:
         a1, b1, a2, b2, c = self.places
         nodes: list[Signal | Mapped] = []
         for j, b in enumerate(b1):
-            nodes += [Signal((Taps(0, b), Taps(2 + 2 * j, a1, 1))), Mapped(2 + 2 * j, self.f, c)]
+            past = _past(2 + 2 * j, a1)
+            nodes += [Signal((Taps(0, b), *past)), Mapped(2 + 2 * j, self.f, c)]
         y = 2 + len(nodes)
         taps = [Taps(3 + 2 * j, b) for j, b in enumerate(b2)]
-        nodes.append(Signal((*taps, Taps(y, a2, 1)), len(a2) if self.held else 0))
+        nodes.append(Signal((*taps, *_past(y, a2)), len(a2) if self.held else 0))
         return Signals(1, tuple(nodes), y)
 
     def problem(self, trials: tuple[Trial, ...], radius: float) -> Problem:
@@ -244,6 +245,11 @@ def _with_phases(cascade: Cascade, trials: tuple[Trial, ...], phases: int) -> Ca
     wide = cascade.moved({"b1": b1, "b2": np.zeros((phases, b2_at.shape[1]))})
     at = wide.places[3].ravel()
     return replace(wide, theta=best_for(wide.problem(trials, np.inf), wide.theta, at))
+
+
+def _past(signal: int, at: IntArray) -> tuple[Taps, ...]:
+    """Of a signal itself; a filter without poles has none."""
+    return (Taps(signal, at, 1),) if len(at) else ()
 
 
 def _knots(x: FloatArray, intervals: int) -> Smooth:

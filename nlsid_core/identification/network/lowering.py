@@ -91,8 +91,10 @@ def _rows(signals: Signals, theta: FloatArray) -> tuple[FloatArray, FloatArray, 
             sources.append(unit[len(into)])
             into.append(sources[node.source])
         else:
-            sources.append(unit[first] + _at_delay(0, node, theta, sources))
-            first += _depth(node, theta)
+            depth = _depth(node, theta)
+            own = unit[first : first + min(depth, 1)].sum(axis=0)  # none of a signal without past
+            sources.append(own + _at_delay(0, node, theta, sources))
+            first += depth
     first = m
     for node in signals.nodes:
         if isinstance(node, Signal):

@@ -82,16 +82,21 @@ class Feedback:
         require_whole(self, "imitated", 0, MOST_IMITATED)
 
 
-S = TypeVar("S", bound=FilterMapFilter | CellRow | Feedback, covariant=True)
+@dataclass(frozen=True)
+class Follower:
+    """One output that goes after one input, late, with inertia and a limit of its speed."""
+
+
+S = TypeVar("S", bound=FilterMapFilter | CellRow | Feedback | Follower, covariant=True)
 
 
 @dataclass(frozen=True)
 class Network(Generic[S]):
     """Filters and static maps in a structure that makes every such model stable.
 
-    structure: `FilterMapFilter`, `CellRow` or `Feedback`, with its options. start_samples: at the
-    start of a trial, that show the first state of a row of cells or a loop and are not scored, 1 to
-    10000. seed: of what is drawn at random, starts or inputs.
+    structure: `FilterMapFilter`, `CellRow`, `Feedback` or `Follower`, with its options.
+    start_samples: at the start of a trial, that show the first state of cells or of a loop and are
+    not scored, 1 to 10000. seed: of what is drawn at random, starts or inputs.
     """
 
     structure: S

@@ -10,7 +10,14 @@ from nlsid_core.identification.methods.options import Sem
 from nlsid_core.identification.network.cells import cells_in_a_row
 from nlsid_core.identification.network.feedback import feedback_unrolled
 from nlsid_core.identification.network.filters import filter_map_filter
-from nlsid_core.identification.network.options import CellRow, Feedback, FilterMapFilter, Network
+from nlsid_core.identification.network.follower import follower
+from nlsid_core.identification.network.options import (
+    CellRow,
+    Feedback,
+    FilterMapFilter,
+    Follower,
+    Network,
+)
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.trail import Task, Trail
 
@@ -20,6 +27,7 @@ FITS: dict[type, Fitted] = {
     FilterMapFilter: filter_map_filter,
     CellRow: cells_in_a_row,
     Feedback: feedback_unrolled,
+    Follower: follower,
 }
 
 

@@ -120,11 +120,11 @@ class Signals:
 
     def own_filter(self, number: int, theta: FloatArray) -> FloatArray:
         """A = [1, -a₁, …] of a signal's own past, its maps left out."""
-        a: FloatArray = np.ones(1)
+        A = [1.0]
         for part in self.nodes[number - self.inputs - 1].taps:  # type: ignore[union-attr]
             if part.source == number:
-                a = np.concatenate([a, -theta[part.at]])
-        return a
+                A += [-weight for _, weight in part.weights(theta)]
+        return np.array(A)
 
     def radius(self, theta: FloatArray) -> float:
         """Of the slowest pole of the signals whose past passes no map."""

@@ -67,21 +67,6 @@ def explicit_next(model: Json, policy: Json, k: int, deviation: Vector) -> Vecto
     return plus(after, fractions(policy["x"][k + 1]), -1)
 
 
-def implicit_next(
-    model: Json, policy: Json, k: int, deviation: Vector, rate: Vector
-) -> tuple[Vector, Vector]:
-    """x̄⁺ and the equation's value, where the next rate departs from the nominal's by `rate`."""
-    d, half = len(rate), Fraction(model["period"]) / 2
-    following = fractions(policy["x"][k + 1])
-    x = plus(fractions(policy["x"][k]), deviation)
-    q, v, u = x[:d], x[d:], policy_input(policy, k, deviation)
-    v_next = plus(following[d:], rate)
-    q_next = [a + half * (b + c) for a, b, c in zip(q, v, v_next, strict=True)]
-    pull = plus(map_at(model, q + v + u), map_at(model, q_next + v_next + u))
-    h = [c - b - half * p for b, c, p in zip(v, v_next, pull, strict=True)]
-    return plus(q_next + v_next, following, -1), h
-
-
 def monomial(point: Vector, exponents: list[int]) -> Fraction:
     """Π point^exponents."""
     result = Fraction(1)
@@ -113,39 +98,17 @@ def dot(a: Vector, b: Vector) -> Fraction:
 
 
 def claimed_at(documents: dict[str, Json], proof: Json, chain: str, k: int, y: Vector) -> Fraction:
-    """The polynomial that has to be nonnegative, at y = z or (z, w)."""
+    """The polynomial that has to be nonnegative, at y = z."""
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
     step = proof["steps"][k]
-    entry, n = step[chain], len(model["x"])
-    z, w = y[:n], y[n:]
-    deviation = times(fractions(step["T"]), z)
+    entry = step[chain]
+    deviation = times(fractions(step["T"]), y)
     S_next = fractions(funnel["S"][k + 1])
     radius = Fraction(funnel[chain][k])
     size = size2(times(fractions(funnel["S"][k]), deviation))
     value = Fraction(entry["reach"]) ** 2
     value -= squares_at(entry["ball"], proof["ball_basis"], y) * (radius**2 - size)
-    if not w:
-        return value - size2(times(S_next, explicit_next(model, policy, k, deviation)))
-    rate = times(fractions(step["T_next"]), w)
-    after, h = implicit_next(model, policy, k, deviation, rate)
-    far = Fraction(step["kappa_next"]) * Fraction(funnel["roots"][k + 1])
-    bound = Fraction(funnel["assumption"]["bound"])
-    far += Fraction(entry["spread"]) * Fraction(step["kappa"]) * bound
-    value -= squares_at(entry["roots"], proof["roots_basis"], y) * (far**2 - size2(w))
-    for row, equation in zip(entry["equations"]["rows"], h, strict=True):
-        nu = sum(
-            (
-                a
-                * Fraction(2) ** shift
-                * prod((p**e for p, e in zip(y, m, strict=True)), start=Fraction(1))
-                for a, shift, m in zip(
-                    row, entry["equations"]["columns"], proof["equation_basis"], strict=True
-                )
-            ),
-            Fraction(0),
-        )
-        value -= nu * equation
-    return value - size2(times(S_next, after))
+    return value - size2(times(S_next, explicit_next(model, policy, k, deviation)))
 
 
 def refuted(documents: dict[str, Json]) -> str:
@@ -220,18 +183,12 @@ def agrees(document: Json, about: Mapping[str, Json]) -> bool:
         return False
 
 
-def is_implicit(model: Json) -> bool:
-    """Whether its next rate is stated by an equation."""
-    return bool(model["kind"] == "trapezoidal")
-
-
 def makes_sense(model: Json, policy: Json, funnel: Json) -> bool:
     """Obligations 1 and 2: kinds, shapes, radii and sizes."""
-    implicit, n, p, N = is_implicit(model), len(model["x"]), len(model["u"]), len(policy["u"])
-    outputs = n // 2 if implicit else n
+    n, p, N = len(model["x"]), len(model["u"]), len(policy["u"])
     rows = model["exponents"]
     arrays = [
-        (model["coefficients"], (len(rows), outputs)),
+        (model["coefficients"], (len(rows), n)),
         (model["x_range"], (n, 2)),
         (model["u_range"], (p, 2)),
         (policy["L"], (n, n)),
@@ -243,16 +200,12 @@ def makes_sense(model: Json, policy: Json, funnel: Json) -> bool:
         (funnel["half_widths"], (N + 1, n)),
         *((funnel[chain], (N + 1,)) for chain in CHAINS),
     ]
-    if implicit:
-        arrays.append((funnel["roots"], (N + 1,)))
-    radii = [*funnel["tube"], *funnel["inlet"], *(funnel["roots"] if implicit else [])]
+    radii = [*funnel["tube"], *funnel["inlet"]]
     return (
-        (model["kind"], policy["kind"], funnel["kind"])
-        == ("trapezoidal" if implicit else "state_map", "sampled", "sampled")
+        (model["kind"], policy["kind"], funnel["kind"]) == ("state_map", "sampled", "sampled")
         and all(has_shape(value, shape) for value, shape in arrays)
         and 1 <= n <= 16
         and 1 <= p <= 16
-        and not (implicit and n % 2)
         and N >= 1
         and N * n**3 <= 10**6
         and len({tuple(row) for row in rows}) == len(rows) >= 1
@@ -313,7 +266,7 @@ def follows(documents: dict[str, Json], proof: Json, k: int) -> bool:
     names = {
         "model": "kind period x exponents coefficients",
         "policy": "u x K",
-        "funnel": "assumption tube inlet S A roots",
+        "funnel": "assumption tube inlet S A",
     }
     used = {
         role: {key: documents[role].get(key) for key in keys.split()}
@@ -327,9 +280,8 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
     documents, step = json.loads(files_of), json.loads(step_of)
     proof = json.loads(bases) | {"steps": {k: step}}
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    n, implicit = len(model["x"]), is_implicit(model)
-    d = n // 2 if implicit else 0
-    y: Any = [P.variable(n + d, i) for i in range(n + d)]
+    n = len(model["x"])
+    y: Any = [P.variable(n, i) for i in range(n)]
     S, S_next = (fractions(funnel["S"][i]) for i in (k, k + 1))
     T, A = fractions(step["T"]), fractions(funnel["A"][k])
     bound = Fraction(funnel["assumption"]["bound"])
@@ -338,37 +290,17 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
         return False
     if not stretches_less(multiplied(S, T), kappa):
         return False
-    deviation = times(T, y[:n])
+    deviation = times(T, y)
     free = times(S_next, times(A, deviation))
-    if implicit:
-        T_next = fractions(step["T_next"])
-        rates = [row[d:] for row in S_next[d:]]
-        if not stretches_less(multiplied(rates, T_next), Fraction(step["kappa_next"])):
-            return False
-        after, h = implicit_next(model, policy, k, deviation, times(T_next, y[n:]))
-        g, moved = times(S_next, after), times(fractions(step["inverse"]), h)
-        if not norms_hold(step, linear(moved), linear(g), linear(free), n):
-            return False
-        if not is_curved(moved, gammas, least=2):
-            return False
-    else:
-        g = times(S_next, explicit_next(model, policy, k, deviation))
-        if not is_curved(plus(g, free, -1), gammas, least=1):
-            return False
+    g = times(S_next, explicit_next(model, policy, k, deviation))
+    if not is_curved(plus(g, free, -1), gammas):
+        return False
     for chain in CHAINS:
         entry, radius = step[chain], Fraction(funnel[chain][k])
         reach, following = Fraction(entry["reach"]), Fraction(funnel[chain][k + 1])
         if reach < 0:
             return False
-        if implicit:
-            far = Fraction(step["kappa_next"]) * Fraction(funnel["roots"][k + 1])
-            found = added_at_roots(step, entry, radius, bound, far)
-            if found is None:
-                return False
-            added = found
-        else:
-            mu = kappa * stretch(gammas, kappa * radius, kappa * bound, least=1)
-            added = mu * bound
+        added = kappa * stretch(gammas, kappa * radius, kappa * bound) * bound
         claimed: Any = claimed_at(documents, proof, chain, k, y)
         witness = {"basis": proof["basis"], "columns": entry["columns"]}
         if left_over([claimed], witness | {"squares": entry["squares"]}) is None:
@@ -399,45 +331,14 @@ def stretches_less(M: Matrix, kappa: Fraction) -> bool:
     )
 
 
-def is_bounded(M: Matrix, c: Fraction) -> bool:
-    """c²I - MM' ⪰ 0."""
-    size = range(len(M))
-    return c >= 0 and is_semidefinite(
-        [[c**2 * int(i == j) - dot(M[i], M[j]) for j in size] for i in size]
-    )
-
-
-def linear(p: list[Any]) -> Matrix:
-    """The coefficients of degree 1."""
-    n = p[0].n
-    units = [tuple(int(i == j) for j in range(n)) for i in range(n)]
-    return [[q.terms.get(unit, Fraction(0)) for unit in units] for q in p]
-
-
-def norms_hold(step: Json, h: Matrix, after: Matrix, free: Matrix, n: int) -> bool:
-    """The four bounds of obligation 9, and that M is invertible."""
-    B, C = [row[:n] for row in h], [row[n:] for row in h]
-    C = [[e - int(i == j) for j, e in enumerate(row)] for i, row in enumerate(C)]
-    L_z, L_w = [row[:n] for row in after], [row[n:] for row in after]
-    turned = multiplied(L_w, B)
-    direct = [
-        [a - b - c for a, b, c in zip(*rows, strict=True)]
-        for rows in zip(L_z, turned, [row[:n] for row in free], strict=True)
-    ]
-    return all(
-        is_bounded(M, Fraction(step[name]))
-        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w))
-    )
-
-
-def is_curved(p: list[Any], gammas: Vector, least: int) -> bool:
-    """Obligation 7: γ_m bounds the part of degree m, from `least` on."""
-    for m in range(least, max([sum(e) for q in p for e in q.terms], default=0) + 1):
+def is_curved(p: list[Any], gammas: Vector) -> bool:
+    """Obligation 6: γ_m bounds the part of degree m."""
+    for m in range(1, max([sum(e) for q in p for e in q.terms], default=0) + 1):
         keys = {e for q in p for e in q.terms if sum(e) == m}
-        if m - least >= len(gammas):
+        if m > len(gammas):
             return not keys
         size = range(len(p))
-        M = [[gammas[m - least] ** 2 * int(i == j) for j in size] for i in size]
+        M = [[gammas[m - 1] ** 2 * int(i == j) for j in size] for i in size]
         for e in keys:
             share = Fraction(prod(factorial(k) for k in e), factorial(m))
             c = [q.terms.get(e, Fraction(0)) for q in p]
@@ -448,36 +349,13 @@ def is_curved(p: list[Any], gammas: Vector, least: int) -> bool:
     return True
 
 
-def stretch(gammas: Vector, s: Fraction, t: Fraction, least: int) -> Fraction:
+def stretch(gammas: Vector, s: Fraction, t: Fraction) -> Fraction:
     """μ(s, t)."""
     return sum(
         (
             gamma * (s + t) ** i * s ** (m - 1 - i)
-            for m, gamma in enumerate(gammas, start=least)
+            for m, gamma in enumerate(gammas, start=1)
             for i in range(m)
         ),
         Fraction(0),
     )
-
-
-def added_at_roots(
-    step: Json, entry: Json, radius: Fraction, bound: Fraction, far: Fraction
-) -> Fraction | None:
-    """What a response adds to the reach of an implicit step; None where an inequality fails."""
-    names = ("state", "rates", "direct", "through", "kappa", "kappa_next")
-    state, rates, direct, through, kappa, kappa_next = (Fraction(step[name]) for name in names)
-    rho, D = kappa * bound, Fraction(entry["spread"])
-    wide, near = fractions(entry["extents"])
-    mu = stretch(step_gammas := fractions(step["curvature"]), wide, (1 + D) * rho, least=2)
-    if rates >= 1 or D < 0 or min(wide, near) < 0:
-        return None
-    if (kappa * radius) ** 2 + (far + D * rho) ** 2 > wide**2:
-        return None
-    if state + rates * D + mu * (1 + D) > D:
-        return None
-    if (kappa * radius) ** 2 + (kappa_next * Fraction(entry["reach"])) ** 2 > near**2:
-        return None
-    m = stretch(step_gammas, near, (1 + D) * rho, least=2)
-    if 1 - rates - m > 0:
-        D = min(D, (state + m) / (1 - rates - m))
-    return (direct + through * (rates * D + m * (1 + D))) * rho
