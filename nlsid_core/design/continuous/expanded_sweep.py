@@ -147,7 +147,7 @@ def _expanded(
     while True:
         try:
             steps.local[k] = expansion.around(policy, P, k, (box, after), held)
-            instants = [section_at(steps, policy, P, k, s) for s in (0.0, 0.5, 1.0)]
+            instants = [section_at(steps, policy, P, k, s) for s in (0.0, 1.0)]
             if looks and duals is not None:
                 most = min(LARGER * box, cap)
                 rho = estimated_before(steps, instants, after, most, wanted, duals)

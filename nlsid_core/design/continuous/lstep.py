@@ -311,22 +311,12 @@ class LSteps:
         solved = self.program.solve(g, tolerance=TOLERANCE, start=start, enough=enough)
         return replace(solved, tau=tau)
 
-    def predicted(
-        self,
-        section: Section,
-        rho: float,
-        duals: list[SphereSolution],
-        *,
-        saturated: bool = True,
-    ) -> float:
+    def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
         """An upper bound of φ at another ρ or section, from dual solutions: no program solved.
 
-        With limits it is an estimate: the multipliers of the mode stay what they are. saturated:
-        False leaves out the modes at a limit, for which that estimate may be far too low.
+        With limits it is an estimate: the multipliers of the mode stay what they are.
         """
-        free = not saturated and len(self.limits) > 0
-        cases = [c for c in range(len(duals)) if not (free and self.split(c)[-1].any())]
-        return min(self.bounds(section, rho, duals, cases))
+        return min(self.bounds(section, rho, duals, range(len(duals))))
 
     def bounds(
         self, section: Section, rho: float, duals: list[SphereSolution], cases: Sequence[int]
