@@ -40,7 +40,7 @@ from nlsid_ros.documents import DESIGN, DesignSubscription, expected_of, wiring_
 from nlsid_ros.helping import Help
 from nlsid_ros.message_classes import installed_types
 from nlsid_ros.messages import numbers_at, off_clock, patience
-from nlsid_ros.running import REPORT, ManagedNode, Parameter, arm
+from nlsid_ros.running import REPORT, ManagedNode, Parameter, arm, now_ns
 from nlsid_ros.starting import entry_point
 from nlsid_ros.subscribing import Topic
 
@@ -164,10 +164,12 @@ class FunnelMonitor(ManagedNode):
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """A proved design came, or another one: watch its signals from scratch."""
-        announced = bool(self.values.controller)
-        centre = Centre(self.values.nominal)
-        margin = self.values.warning_margin
-        watch = Watch(design, centre=centre, warning_margin=margin, announced=announced)
+        watch = Watch(
+            design,
+            centre=Centre(self.values.nominal),
+            warning_margin=self.values.warning_margin,
+            announced=bool(self.values.controller),
+        )
         for topic in self._topics.values():
             topic.drop()
         self._topics = {
@@ -232,7 +234,7 @@ class FunnelMonitor(ManagedNode):
         """Look whether simulated time went back, which would hold up all that waits for a later
         one; and for the signals' topics.
         """
-        clock_ns = self._patience.now().nanoseconds
+        clock_ns = now_ns(self._patience)
         back_ns, self._clock_ns = self._clock_ns - clock_ns, clock_ns
         if back_ns > 0 and self._watch is not None:
             self._deadlines.clear()
@@ -293,20 +295,20 @@ class FunnelMonitor(ManagedNode):
         watch, heard = self._watch, self._topics[topic]
         assert watch is not None
         logged = watch.pairing.clock == "log"
-        stamp_ns = self.get_clock().now().nanoseconds
+        clock_ns = stamp_ns = now_ns(self.get_clock())
         heard.silence.end(1)
         try:
-            stamp_ns = watch.pairing.stamp(data, stamp_ns)
+            stamp_ns = watch.pairing.stamp(data, clock_ns)
             if watch.pairing.measures(topic, data):
                 heard.numbers.update(info["publication_sequence_number"])
             responds = topic in watch.pairing.response_topics
             if not responds:
-                unfit = "" if logged else self._off_clock(topic, stamp_ns)
+                unfit = "" if logged else self._off_clock(topic, stamp_ns, clock_ns)
                 self._unfit_commands[topic] = unfit
                 if unfit:  # nor does a stamp far ahead say that no other command is still to come
                     self._publish(watch.missing(unfit, doubted=True))
                     return
-            elif reason := self._distrust(topic, data, logged=logged):
+            elif reason := self._distrust(topic, data, None if logged else clock_ns):
                 self._publish(watch.refuse(stamp_ns, reason))
                 return
             judged = watch.message(topic, stamp_ns, data)
@@ -323,7 +325,7 @@ class FunnelMonitor(ManagedNode):
         waiting_ns: the stamp of a response that is not judged yet.
         """
         assert self._watch is not None
-        heard_ns = self._heard_ns[topic] = self._patience.now().nanoseconds
+        heard_ns = self._heard_ns[topic] = now_ns(self._patience)
         if self._stale.is_canceled():
             arm(self._stale, round(self._patient_for * 1e9))
         if waiting_ns is None:
@@ -335,27 +337,30 @@ class FunnelMonitor(ManagedNode):
         if self._release.is_canceled():
             arm(self._release, wait_ns)
 
-    def _distrust(self, topic: str, data: bytes, *, logged: bool) -> str:
-        """Why a response is not to be judged though its number could be; empty if it is."""
+    def _distrust(self, topic: str, data: bytes, clock_ns: int | None) -> str:
+        """Why a response is not to be judged though its number could be; empty if it is.
+
+        clock_ns: None where it has no stamp but the time at which it came.
+        """
         said = self._doubt(topic)
         for each in self._topics.values():
             said = said or each.alternating
-        if said or logged:
+        if said or clock_ns is None:
             return said
         most = math.inf if self.values.allow_old_stamps else self._patient_for
-        said = self._topics[topic].distrust(data, most)
+        said = self._topics[topic].distrust(data, clock_ns, most)
         return said or next(filter(None, self._unfit_commands.values()), "")
 
-    def _off_clock(self, topic: str, stamp_ns: int) -> str:
+    def _off_clock(self, topic: str, stamp_ns: int, clock_ns: int) -> str:
         """Why the stamp of a command is none; empty if it is one, or a recording is played."""
         if self.values.allow_old_stamps:
             return ""
         most = max(self._patient_for, LATEST_COMMAND)
-        return off_clock(stamp_ns, self.get_clock(), most, f"a command on {topic}")
+        return off_clock(stamp_ns, clock_ns, most, f"a command on {topic}")
 
     def _on_release(self) -> None:
         """Let go of samples whose command did not come in time."""
-        now, until = self._patience.now().nanoseconds, None
+        now, until = now_ns(self._patience), None
         while self._deadlines and self._deadlines[0][0] <= now:
             until = self._deadlines.popleft()[1]
         if until is not None and self._watch is not None:
@@ -368,7 +373,7 @@ class FunnelMonitor(ManagedNode):
         """A response stopped coming, or did so a while ago: look again when it would have."""
         patience_ns = round(self._patient_for * 1e9)
         heard_ns = min(self._heard_ns.values(), default=0)
-        ahead_ns = heard_ns + patience_ns - self._patience.now().nanoseconds
+        ahead_ns = heard_ns + patience_ns - now_ns(self._patience)
         if ahead_ns > 0:  # a reset wakes the executor, so it is not done with every message
             arm(self._stale, ahead_ns)
             return
@@ -383,7 +388,7 @@ class FunnelMonitor(ManagedNode):
         """Diagnostics first: an alarm should not wait behind a number."""
         for stamp_ns, reading, state in judged:
             self._say(reading, state)
-            latency_ns = self.get_clock().now().nanoseconds - stamp_ns
+            latency_ns = now_ns(self.get_clock()) - stamp_ns
             self._slowest_ns = max(self._slowest_ns, latency_ns)
             self._judged += 1
             numbers = reading.numbers | self._widths.of(reading) | {"latency": latency_ns * 1e-9}
@@ -462,7 +467,7 @@ class FunnelMonitor(ManagedNode):
             self.get_logger().warning(said.message, throttle_duration_sec=REPORT)
 
     def _on_heartbeat(self) -> None:
-        clock_ns = self.get_clock().now().nanoseconds
+        clock_ns = now_ns(self.get_clock())
         if self._simulated and clock_ns == self._beat_ns and self._watch is not None:
             reason = "simulated time stands still"
             if not self.count_publishers("/clock"):

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from rclpy.clock import Clock
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.validate_topic_name import validate_topic_name
 
@@ -212,9 +211,9 @@ def base_stopped(silent: float, period: float) -> bool:
     return silent > max(BASE_PATIENCE, PATIENT_PERIODS * period)
 
 
-def off_clock(stamp_ns: int, clock: Clock, most: float, what: str = "a response") -> str:
-    """Why the stamp of `what` is not of now, give or take `most` s; empty if it is."""
-    age = (clock.now().nanoseconds - stamp_ns) * 1e-9
+def off_clock(stamp_ns: int, clock_ns: int, most: float, what: str = "a response") -> str:
+    """Why the stamp of `what` is not of now, `clock_ns`, give or take `most` s; empty if it is."""
+    age = (clock_ns - stamp_ns) * 1e-9
     if abs(age) <= most:
         return ""
     if stamp_ns == 0:

@@ -162,17 +162,18 @@ class Topic:
         turns = self.numbers.alternates
         return f"messages of several publishers come in turn on {self.name}" if turns else ""
 
-    def distrust(self, data: bytes, most: float) -> str:
+    def distrust(self, data: bytes, clock_ns: int, most: float) -> str:
         """Why a response is not to be trusted though its number could be; empty if it is.
 
-        most: s that its stamp may be off this node's clock. Raises BagError if it has no header.
+        most: s that its stamp may be off the node's clock, which is at `clock_ns`. Raises BagError
+        if it has no header.
         """
         frame = header_frames(data, self.kind, installed_types(self.kind))
         if self.frame is None:
             self.frame = frame
         if frame != self.frame:
             return f"the response is in frame '{frame}', not in '{self.frame}'"
-        return off_clock(header_stamp_ns(data), self._node.get_clock(), most)
+        return off_clock(header_stamp_ns(data), clock_ns, most)
 
     def _say_anew(self) -> None:
         self.anew = "; ".join(

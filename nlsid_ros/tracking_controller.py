@@ -56,7 +56,7 @@ from nlsid_ros.messages import (
     patience,
     stamp_ns_of,
 )
-from nlsid_ros.running import ManagedNode, Parameter, arm
+from nlsid_ros.running import ManagedNode, Parameter, arm, now_ns
 from nlsid_ros.starting import entry_point
 from nlsid_ros.subscribing import Silence, Topic
 
@@ -189,7 +189,7 @@ class TrackingController(ManagedNode):
     @property
     def _now(self) -> float:
         """S on the clock of the data, on which silence counts."""
-        return self._patience.now().nanoseconds * 1e-9
+        return now_ns(self._patience) * 1e-9
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
@@ -311,7 +311,7 @@ class TrackingController(ManagedNode):
         self._responses.numbers.update(info["publication_sequence_number"])
         try:
             stamp_ns, numbers = header_stamp_ns(data), self._reader.numbers(data)
-            distrust = self._responses.distrust(data, self._patient_for)
+            distrust = self._responses.distrust(data, now_ns(self.get_clock()), self._patient_for)
         except BagError as error:
             self._halt(str(error))
             return
@@ -357,7 +357,7 @@ class TrackingController(ManagedNode):
         most_ns = round(self._patient_for * 1e9)
         while self._due:
             stamp_ns, u = self._due[0]
-            ahead = stamp_ns - max(self._stamped_ns, self.get_clock().now().nanoseconds)
+            ahead = stamp_ns - max(self._stamped_ns, now_ns(self.get_clock()))
             if ahead > 0:
                 arm(self._next, ahead)
                 return
@@ -379,7 +379,7 @@ class TrackingController(ManagedNode):
         self._expiry.cancel()
         if not self._hold_ns or self._run is None or self._answered_ns < self._run.start_ns:
             return
-        age_ns = self.get_clock().now().nanoseconds - self._answered_ns
+        age_ns = now_ns(self.get_clock()) - self._answered_ns
         self._oldest_ns = max(self._oldest_ns, age_ns)
         if age_ns > self._hold_ns:
             proved = f"proved for {self._hold_ns * 1e-9:g} s"
@@ -397,7 +397,7 @@ class TrackingController(ManagedNode):
             return
         start_ns = 0 if self._run is None else self._run.start_ns
         if stamp_ns < start_ns or off_clock(
-            stamp_ns, self.get_clock(), self.values.monitor_patience
+            stamp_ns, now_ns(self.get_clock()), self.values.monitor_patience
         ):
             return
         funnel, _, of_run = message.header.frame_id.partition(" ")
@@ -459,7 +459,7 @@ class TrackingController(ManagedNode):
             else self._ramp.towards_stop(self._input, self._design.period)
         )
         # Later than the last response, which is not to be judged under it, in simulated time too.
-        self._send(max(self.get_clock().now().nanoseconds, self._stamped_ns + 1))
+        self._send(max(now_ns(self.get_clock()), self._stamped_ns + 1))
         if self._limits.at_rest(self._input):
             self._step.cancel()
             self._tell(f"idle; stopped: {self._stopping}")

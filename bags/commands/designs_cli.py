@@ -289,6 +289,10 @@ def export(
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; default the design's.")
     ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option("--c", help="In their place a linear tube's table for a monitor in C."),
+    ] = None,
 ) -> None:
     """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
 
@@ -296,15 +300,25 @@ def export(
     of Autoware's validators for speeds and distances, and a table of all signals. The tube has to
     be as wide always: `funnel: {level: constant}` in the configuration.
     """
-    from bags.designs import tolerances as proved
+    from bags.designs import documents, tolerances
+    from nlsid_core.running.c_table import write_table
 
-    found = proved.tolerances(folder)
+    if table is not None:
+        verdict = write_table(documents.load(folder), table)
+        out.print(f"{verdict}\nwrote {table}", soft_wrap=True, markup=False, highlight=False)
+        return
+
+    found = tolerances.tolerances(folder)
     target = folder if out_dir is None else out_dir
     target.mkdir(parents=True, exist_ok=True)
     out.print(str(found), soft_wrap=True, markup=False, highlight=False)
     written = found.write(target)
     for path in written:
         out.print(f"wrote {path}", soft_wrap=True)
-    for name, units in ((proved.CONTROLLER, proved.POSITIONS), (proved.VALIDATOR, ("m/s", "m"))):
+    kinds = (
+        (tolerances.CONTROLLER, tolerances.POSITIONS),
+        (tolerances.VALIDATOR, ("m/s", "m")),
+    )
+    for name, units in kinds:
         if target / name not in written:
             out.print(f"no {name}: no signal is in {' or '.join(units)}", soft_wrap=True)

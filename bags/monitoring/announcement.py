@@ -34,25 +34,22 @@ class Run:
 
     def document(self) -> Json:
         """The JSON form."""
-        over = {"ended": self.ended, "last_ns": self.last_ns} if self.ended else {}
         return {
             "format": FORMAT,
             "version": files.VERSION,
             "start_ns": self.start_ns,
             "funnel": self.funnel,
-            **over,
+            "ended": self.ended,
+            "last_ns": self.last_ns,
         }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "run") -> "Run":
         """Raises DocumentError if the document is not a run."""
         files.header(document, FORMAT, source=source)
-        run = cls(
+        return cls(
             start_ns=files.member(document, "start_ns", int, source=source),
             funnel=files.member(document, "funnel", str, source=source),
+            ended=files.member(document, "ended", str, source=source),
+            last_ns=files.member(document, "last_ns", int, source=source),
         )
-        if "ended" not in document:
-            return run
-        ended = files.member(document, "ended", str, source=source)
-        last_ns = files.member(document, "last_ns", int, source=source)
-        return cls(run.start_ns, run.funnel, ended, last_ns)

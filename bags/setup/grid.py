@@ -213,9 +213,9 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
     steady = steps.on_grid >= ON_GRID and steps.off_grid <= TOLERANCE
     regular = steady and read.topics == 1 and not steps.repeated
     if steps.period >= SLOW:
-        proposal.doubts.append(
-            f"samples are {steps.period:.4g} s apart, {1.0 / steps.period:.2g} Hz; is it so, or "
-            "were times in milliseconds taken for seconds?"
+        walls.append(
+            f"samples are {steps.period:.4g} s apart, {1.0 / steps.period:.2g} Hz; if times in "
+            "milliseconds were taken for seconds, read them again with their unit"
         )
     factor = 1
     if read.band > 0:

@@ -31,6 +31,7 @@ STEPS = 6  # of a search while it is one of many
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
 EVERY = 100  # least squares is quick
 DROPPED = 1.1  # times the best: what is worse on the first fold is not judged on the others
+LEAP = 0.25  # of the error before: where an attempt leaves less, its stage ends
 MOST_FILTERED = 6  # states of filters: as many as lags of the best by least squares, or fewer
 SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
 ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
@@ -51,8 +52,11 @@ def choose(
     for number, (stage, kept) in enumerate(stages):
         before = {row.attempt for row in rows}
         attempts = [one for one in dict.fromkeys(stage(held_out.data, rows)) if one not in before]
-        glances = []
+        glances: list[Row] = []
+        known_best = least(rows)
         for attempt in attempts:
+            if known_best and glances and glances[-1].percent < LEAP * known_best.percent:
+                break
             progress(str(attempt), number / len(stages))
             glances.append(held_out.glance(attempt))
         for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
@@ -115,15 +119,12 @@ def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
 
 
 def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
-    """Filters around a map, with as many states as linear models need, and rows of cells."""
+    """Filters around a map, with as many states as linear models need, followers, rows of cells."""
     outputs, inputs = signals_of(data)
     best = least(rows)
     if outputs > 1 or best is None or best.percent < ENOUGH:
         return
     certified = Sem(STEPS, certified=True)
-    limits: tuple[tuple[int, Limit], ...] = ((1, "none"), (1, "friction"), (2, "top"))
-    for cells, limit in limits:
-        yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
     if inputs == 1:
         straight = least(row for row in rows if row.attempt.method == LeastSquares())
         n = 4 if straight is None else max(2, min(_lags(straight), MOST_FILTERED))
@@ -131,6 +132,9 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
             filters = FilterMapFilter(orders, intervals=12, starts=4)
             yield Attempt(Network(filters), certified)
         yield Attempt(Network(Follower()), certified)
+    limits: tuple[tuple[int, Limit], ...] = ((1, "none"), (1, "friction"), (2, "top"))
+    for cells, limit in limits:
+        yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
     if best.percent > SWINGS:
         loop = Network(Feedback(2, stages=2, imitated=20))
         yield Attempt(loop, certified)

@@ -46,6 +46,7 @@ CLOSE = 1.25  # times the narrowest forecast: of these the tube that is narrowes
 MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
+SHORTEST_WINDOW = 2  # of a recording that is too short for two of these
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
 LONGEST_SETTLING = 0.25  # of the shortest trial
 SLOWER = (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)  # parts of L that are tried
@@ -325,7 +326,8 @@ def least_window(model: StableModel, train: Dataset, horizon: float | None = Non
     settling = _settling(model, Stepper(model), train)
     if horizon is not None:
         return settling + max(1, round(horizon / model.period))
-    return LEAST_WINDOW * (settling + REACTION)
+    start, half = settling + REACTION, max(map(len, train)) // 2
+    return max(SHORTEST_WINDOW * start, min(LEAST_WINDOW * start, half))
 
 
 def energy(e: FloatArray, tube: Tube | Found) -> FloatArray:

@@ -139,10 +139,6 @@ class Polynomial:
         exponents[:, j] -= 1
         return Polynomial(exponents, coefficients, self.names)
 
-    def gradient(self) -> NDArray[Any]:
-        """(n,) object array of the partial derivatives in the order of `names`."""
-        return np.array([self.derivative(name) for name in self.names] or [], dtype=object)
-
     def substitute(self, values: Mapping[str, "Polynomial | Number"]) -> "Polynomial":
         """Put a number or a polynomial in the place of variables; the others stay."""
         missing = [name for name in values if name not in self.names]

@@ -14,6 +14,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, SolverError
+from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
@@ -102,6 +103,8 @@ class Controller:
         model, policy, funnel = parts
         if isinstance(policy, TubePolicy):
             policy = policy.plan(model)
+        if funnel is not None:
+            refuse_unmonitorable(funnel)  # here, as its exact factors take longer than a sample
         self._model, self._policy, self._funnel = model, policy, funnel
         self.limits, self._settling = limits, settling
         self._continuous = isinstance(model, VectorField)

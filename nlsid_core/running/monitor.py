@@ -11,8 +11,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -29,7 +27,7 @@ from nlsid_core.running.forecast import Forecast
 from nlsid_core.running.grid import TOLERANCE, Grid
 from nlsid_core.running.reading import Level, Reading, Status, Trend
 from nlsid_core.running.stage import Stage
-from nlsid_core.running.tubes import Ahead, TubeRun
+from nlsid_core.running.tubes import TubeRun
 
 OVER = "the proof covers"  # how the reason of every reading after the end begins
 
@@ -109,30 +107,17 @@ class Monitor:
         """
         return self._tubes.unmeasured(t, u, reason) if self.goes_on else self.missing(t, reason)
 
-    def ahead(self) -> Ahead:
-        """What the outputs can be at the next samples, from here; of tubes around a simulation.
+    def forecast(self, u: FloatArray) -> Forecast:
+        """What the outputs can be at the next samples, under the inputs u (h, n_u) there.
 
-        DataError of other funnels.
+        DataError of funnels that are not around a model's simulation.
         """
         if not self.goes_on:
             raise DataError(
                 "a forecast is made from a tube around the model's simulation; around a plan, the "
                 "plan and its funnel say what comes"
             )
-        return Ahead(self._tubes)
-
-    def forecast(self, u: FloatArray) -> Forecast:
-        """`ahead` under the inputs u (h, n_u) of the next h samples."""
-        ahead, found = self.ahead(), []
-        for now in u:
-            bounds = ahead.step(now)
-            if bounds is None:
-                break
-            found.append(bounds)
-        period = self._tubes.period
-        bounds_of = np.reshape(found, (len(found), 2, -1)) if found else np.zeros((0, 2, 0))
-        t = period * np.arange(1, len(found) + 1)
-        return Forecast(t, bounds_of[:, 0], bounds_of[:, 1], ahead.ended)
+        return self._tubes.forecast(u)
 
     def update(self, t: float, y: Any, u: Any) -> Reading:
         """The reading at stamp t (s) for the output or state y and the input u."""

@@ -68,6 +68,8 @@ class FieldPlant:
         self._start, self._t0 = x, t0
         self._x, self._t, self._rests = x, t0, True
         self.inputs = field.m
+        still, w = np.zeros((1, field.m)), field.uncertain.mean(axis=1)
+        field(t0, x[None], still, w, span=field.span(t0))  # the first takes longer than a sample
 
     def refuse(self, states: int, inputs: int) -> None:
         """DataError unless so many signals are its states and its inputs."""

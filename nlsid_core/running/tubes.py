@@ -11,7 +11,9 @@ rests on. Source: docs/certificate_tube.md.
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any
+from itertools import chain, repeat
+from operator import add, gt, mul, sub, truediv
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,14 +25,14 @@ from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
-from nlsid_core.running.forecast import OUTWARD, linear_form, reach
+from nlsid_core.running.forecast import OUTWARD, Forecast, linear_form, reach
 from nlsid_core.running.grid import OTHER_PACE, TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status, Trend, unsaid
-from nlsid_core.running.stepping import Stepper
+from nlsid_core.running.stepping import Rows, Stepper
 
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
-TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
+TINY, LEAST = 1e-100, 1e-300  # g, and what it makes, where no command opens a level: not 0
 STARTING = "waiting for the first"
 PACE = 0.01  # of what a gap is too long, by which the mean follows: over some 100 samples
 COARSE = "float64 cannot tell where the simulation is"
@@ -54,44 +56,23 @@ class TubeRun:
         p, n = len(self._stepper.y), self._stepper.order
         if any(tube.L.shape != (n, p) for tube in tubes):
             raise DataError("the funnel is not one of this model")
-        # Products and sums are rounded up, so that E is never below its exact value.
-        self._rho = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
-        self._R = np.array([tube.R for tube in tubes])
-        spread = max(
-            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
-        )
-        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
-        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
-        self._L = np.array([tube.L for tube in tubes])
-        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
-        unwatched = np.full(p, math.inf)
-        peaks = [unwatched if tube.peak is None else tube.peak.at_most for tube in tubes]
-        self._peak = np.array(peaks) * (1.0 - ROUNDING)
-        self._single = np.array(
-            [
-                math.inf
-                if tube.peak is None
-                else tube.peak.at_most @ np.abs(tube.R) @ tube.peak.at_most
-                for tube in tubes
-            ]
-        )
-        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
-        self._unmoved = np.ones(len(tubes))
+        self._limits = list(map(Limits.of, tubes))
         self._follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
         if any(level.inputs > len(self._stepper.u) for level in self._follow.values()):
             raise DataError("the funnel's level follows inputs that the model does not have")
-        self._trained = funnel.commands
-        if self._trained is not None and len(self._trained) != len(self._stepper.u):
+        self._trained: Rows = [] if funnel.commands is None else funnel.commands.tolist()
+        if self._trained and len(self._trained) != len(self._stepper.u):
             raise DataError("the funnel's commands are not those of this model")
         self._cusum = funnel.cusum
+        self._deviation = [] if self._cusum is None else self._cusum.deviation.tolist()
         self._signals = (*self._stepper.y, *self._stepper.u)
         self._names = [signal.name for signal in self._stepper.y]
         y_box, u_box = funnel.y_box, funnel.u_box
-        self._box: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._box: tuple[Rows, Rows, Rows] | None = None  # of outputs, inputs and states
         if y_box is not None and u_box is not None:
-            self._box = y_box.T, u_box.T, np.tile(y_box, (n // p, 1)).T
+            self._box = y_box.tolist(), u_box.tolist(), y_box.tolist() * (n // p)
         self._assuming = assuming(tubes)
         self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
         self._carried = self._linear.carried if self._linear is not None else None
@@ -106,14 +87,15 @@ class TubeRun:
     def _begin(self, why: str = "") -> None:
         """Collect a start again; the grid of time goes on. why: what ended the run before it."""
         self._ended = why
-        self._start: list[tuple[FloatArray, FloatArray]] = []
-        self._x: FloatArray | None = None
-        self._spent = np.zeros(len(self._tubes))
-        self._largest, self._hidden = np.zeros(self._stepper.order), np.zeros_like(self._widths)
+        self._start: list[tuple[list[float], list[float]]] = []
+        self._x: Rows | None = None  # of each observer, and of the simulation
+        self._spent = [0.0] * len(self._tubes)
+        self._largest = [0.0] * self._stepper.order
+        self._hidden = [[0.0] * len(self._names) for _ in self._tubes]
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
-        self._g: dict[int, float] = {}
-        self._u_before: FloatArray | None = None
+        self._g = [1.0] * len(self._tubes)
+        self._u_before: list[float] | None = None
         self._beyond = ""
         alarm = self._cusum
         self._sums = None if alarm is None else CusumMeter(len(self._names), alarm.drift)
@@ -124,10 +106,8 @@ class TubeRun:
 
         NaN, or None for u, is a sample without a measurement.
         """
-        if u is None:
-            u = np.full(len(self._stepper.u), np.nan)
-        measured = np.array(y, dtype=np.float64, ndmin=1)  # copies: the caller may go on with its
-        applied = np.array(u, dtype=np.float64, ndmin=1)  # own
+        measured = _floats(y)
+        applied = [math.nan] * len(self._stepper.u) if u is None else _floats(u)
         fault = self._take(t)
         if fault:
             return self._unknown(t, measured, fault)
@@ -151,9 +131,53 @@ class TubeRun:
 
     def unmeasured(self, t: float, u: Any, reason: str) -> Reading:
         """The reading at t (s) where nobody measured the outputs: a step with e = 0 under u."""
-        nothing = np.full(len(self._names), np.nan)
-        fault = self._take(t) or self._without(np.array(u, dtype=np.float64, ndmin=1), reason)
+        nothing = [math.nan] * len(self._names)
+        fault = self._take(t) or self._without(_floats(u), reason)
         return self._unknown(t, nothing, fault or reason)
+
+    def forecast(self, u: FloatArray) -> Forecast:
+        """What the outputs can be under the inputs u (h, n_u) of the next samples.
+
+        By a second simulation from the present estimate, and by the tubes; the run goes on as if it
+        were not there.
+        """
+        if len(u) > len(self._reach):
+            self._reach = np.stack(
+                [reach(t, self._linear, 2 * len(u)) for t in self._tubes], axis=1
+            )
+        x, stepper = self._x or [], self._stepper.ahead()
+        g, meters = self._g, copy.deepcopy(self._meters)
+        ended = "" if x else "no run has begun"
+        found: list[tuple[FloatArray, FloatArray]] = []
+        rho, spent = np.array([limits.rho for limits in self._limits]), np.array(self._spent)
+        total = np.zeros(len(rho))
+        for now, reached in zip(u.tolist() if x else [], self._reach, strict=False):
+            outputs, x, ended = self._advance(stepper, x, now)
+            g = _followed(meters, g, now)
+            limits = list(map(Limits.at, self._limits, g))
+            spent = rho * spent
+            total = rho * total + np.maximum(g, 1.0)
+            level, most = (
+                np.array([getattr(each, name) for each in limits]) for name in ("level", "single")
+            )
+            left = np.minimum(
+                level * (1.0 + OUTWARD) - spent * (1.0 - OUTWARD), most * total * (1.0 + OUTWARD)
+            )
+            lasting = self._lasting(self._k + len(found) + 1)
+            if not (lasting and (left[lasting] >= 0.0).all()):
+                ended = ended or "what the tube assumes is broken, or over"
+            if ended:
+                break
+            widths = np.array([each.widths for each in limits])
+            centres = np.vstack([np.array(outputs)[lasting], [outputs[-1]] * len(lasting)])
+            room = np.vstack([np.sqrt(left[lasting, None] * reached[lasting]), widths[lasting]])
+            room = room * (1.0 + OUTWARD) + np.tile(
+                np.array(self._hides(outputs[-1]))[lasting], (2, 1)
+            )
+            found.append(((centres - room).max(axis=0), (centres + room).min(axis=0)))
+        bounds = np.reshape(found, (len(found), 2, len(self._names)))
+        t = self.period * np.arange(1, len(found) + 1)
+        return Forecast(t, bounds[:, 0], bounds[:, 1], ended)
 
     def _take(self, t: float) -> str:
         """Count the sample stamped t; a new run starts where some before it did not come."""
@@ -190,38 +214,35 @@ class TubeRun:
             self._begin(f"{missing} missing before t = {t:g} s")
         return ""
 
-    def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
-        if y.shape != (len(self._names),) or u.shape != (len(self._stepper.u),):
-            return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
-        values = (*y.tolist(), *u.tolist())
-        for value, signal in zip(values, self._signals, strict=True):
+    def _fault(self, t: float, y: list[float], u: list[float]) -> str:
+        if len(y) != len(self._names) or len(u) != len(self._stepper.u):
+            return f"{len(y)} outputs and {len(u)} inputs at t = {t:g} s"
+        for value, signal in zip((*y, *u), self._signals, strict=True):
             if not math.isfinite(value):
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
-    def _beyond_training(self, t: float, u: FloatArray) -> str:
+    def _beyond_training(self, t: float, u: list[float]) -> str:
         """Which input leaves the range or the pace that it had in training; empty if none does."""
-        if self._trained is None:
-            return ""
-        change = np.abs(u - (u if self._u_before is None else self._u_before))
-        least, most, fastest = self._trained.T
-        room = CLEARLY * (most - least)
-        out = (u < least - room) | (u > most + room) | (change > fastest + room)
-        if not out.any():
-            return ""
-        i = int(np.argmax(out))
-        signal, now = self._stepper.u[i], f"{u[i]:.4g}"
-        if least[i] - room[i] <= u[i] <= most[i] + room[i]:
-            now = f"changed by {change[i]:.4g} in a sample"
-        trained = f"{least[i]:.4g} to {most[i]:.4g}, changes to {fastest[i]:.4g}"
-        return f"; {BEYOND} from t = {t:g} s on: {signal.name} {now}, in training {trained}"
+        signals, before = self._stepper.u, self._u_before or u
+        for signal, now, last, (least, most, fastest) in zip(
+            signals, u, before, self._trained, strict=False
+        ):
+            room, change = CLEARLY * (most - least), abs(now - last)
+            inside = least - room <= now <= most + room
+            if inside and change <= fastest + room:
+                continue
+            said = f"changed by {change:.4g} in a sample" if inside else f"{now:.4g}"
+            trained = f"{least:.4g} to {most:.4g}, changes to {fastest:.4g}"
+            return f"; {BEYOND} from t = {t:g} s on: {signal.name} {said}, in training {trained}"
+        return ""
 
-    def _without(self, u: FloatArray, fault: str) -> str:
+    def _without(self, u: list[float], fault: str) -> str:
         """A step with e = 0 under the input u, or a new run if that is not known.
 
         fault: why nothing was measured. Why the model ends the run, empty if it does not.
         """
-        known = u.shape == (len(self._stepper.u),) and np.isfinite(u).all()
+        known = len(u) == len(self._stepper.u) and all(map(math.isfinite, u))
         if self._x is None or not known:
             self._begin(fault)
             return ""
@@ -229,175 +250,151 @@ class TubeRun:
         if refused:
             self._begin(refused)
             return refused
-        self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
-        self._follow_command(u)
+        self._x, self._k = after, self._k + 1
+        self._spent = [of.rho * spent for of, spent in zip(self._limits, self._spent, strict=True)]
+        self._g = _followed(self._meters, self._g, u)
         return ""
 
-    def _collect(self, t: float, y: FloatArray, u: FloatArray) -> Reading:
-        if self._box is not None and not _within(u, self._box[1]):
+    def _collect(self, t: float, y: list[float], u: list[float]) -> Reading:
+        if self._box is not None and not _within([u], self._box[1]):
             away = f"outside the box in which the tube is proved, at t = {t:g} s"
             self._begin(away)
             return self._unknown(t, y, away)
-        self._follow_command(u)
+        self._g = _followed(self._meters, self._g, u)
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
-            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))
+            self._x = [self._stepper.begin(ys, us).tolist()] * (len(self._tubes) + 1)
             self._start = []
         why = f" of a new run: {self._ended}" if self._ended else ""
         return self._unknown(t, y, f"{STARTING} {self.lags} samples{why}")
 
-    def _advance(
-        self, stepper: Stepper, x: FloatArray, u: FloatArray
-    ) -> tuple[FloatArray, FloatArray, str]:
+    def _advance(self, stepper: Stepper, x: Rows, u: list[float]) -> tuple[Rows, Rows, str]:
         """Outputs and next states, and why there are none or nothing is known of them."""
         try:
-            outputs, after = stepper.advance(x, u)
+            outputs, after = stepper.advance_few(x, u)
         except (DataError, SolverError) as error:
             return x, x, str(error)
-        if self._box is not None and not all(map(_within, (outputs, u, x), self._box)):
+        if self._box is not None and not all(map(_within, (outputs, [u], x), self._box)):
             return outputs, after, "outside the box in which the tube is proved"
         return outputs, after, ""
 
-    def _follow_command(self, u: FloatArray) -> None:
-        """The levels at the sample whose inputs are u (n_u,)."""
-        if self._meters:
-            now = u.tolist()
-            self._g = {j: meter.update(now) for j, meter in self._meters.items()}
-
-    def _judge(self, t: float, y: FloatArray, u: FloatArray) -> Reading:
+    def _judge(self, t: float, y: list[float], u: list[float]) -> Reading:
         assert self._x is not None
         outputs, after, refused = self._advance(self._stepper, self._x, u)
         if refused:
             refused = f"{refused}, at t = {t:g} s"
             self._begin(refused)
             return self._unknown(t, y, f"{refused}; a new run starts")
-        self._follow_command(u)
-        e = y - outputs[:-1]
-        simulated = outputs[-1]
-        deviation = y - simulated
-        g, widths = self._followed(self._g)
-        level = self._level * g
-        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
-            if self._single_R is not None:
-                used = self._single_R * (e[:, 0] * e[:, 0])
-                after[:-1] += self._L[:, :, 0] * e
-            else:
-                used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
-                after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
-            self._spent = self._rho * self._spent + used
-            hidden = self._hides(simulated)
-            sizes = (np.abs(deviation) + hidden) / widths
-            spent = (self._spent / level).tolist()
-            parts = (e / self._peak) ** 2
-            if g is not self._unmoved:
-                parts /= np.maximum(g, 1.0)[:, None]
-            peaks = parts.max(axis=1).tolist()
-        self._x, self._k = after, self._k + 1
-        followed = all(map(math.isfinite, self._g.values()))
-        nominal = tuple(simulated.tolist())
-        finite = all(map(math.isfinite, (*self._spent.tolist(), *nominal)))
-        if not (followed and finite and np.isfinite(after).all()):
+        g = self._g = _followed(self._meters, self._g, u)
+        limits = list(map(Limits.at, self._limits, g)) if self._follow else self._limits
+        *predicted, simulated = outputs
+        deviation = list(map(sub, y, simulated))
+        innovations = [list(map(sub, y, each)) for each in predicted]
+        self._spent = list(map(Limits.spend, limits, self._spent, innovations))
+        hidden = self._hides(simulated)
+        away = list(map(Limits.sizes, limits, repeat(deviation), hidden))
+        self._x = [*map(Limits.corrected, limits, after, innovations), after[-1]]
+        self._k += 1
+        followed = all(map(math.isfinite, g))
+        if not (followed and all(map(math.isfinite, chain(self._spent, simulated, *self._x)))):
             what = "the model's state" if followed else "the level that follows the commands"
             reason = f"{what} is not finite at t = {t:g} s"
             self._begin(reason)
-            if np.isfinite(simulated).all() and (sizes > 1.0).any():
+            if all(map(math.isfinite, simulated)) and max(map(max, away)) > 1.0:
                 return Reading(
                     t,
                     Status.OUTSIDE,
                     -math.inf,
                     math.inf,
                     0.0,
-                    measured=tuple(y.tolist()),
+                    measured=tuple(y),
                     level=Level.NONE,
                     reason=f"outside the tube; {reason}",
                 )
             return self._unknown(t, y, reason)
-        if not (hidden <= MOST_ROUNDING * widths).all():
-            most = f"rounding can hide {float(hidden.max()):.2g}"
-            least = f"{float(widths.min()):.2g}"
-            return self._unknown(
-                t, y, f"{COARSE}: {most} beside a half-width of {least}, at t = {t:g} s"
-            )
-        alarm = self._alarm(e[0].tolist())
+        for hides, each in zip(hidden, limits, strict=True):
+            if not max(map(truediv, hides, each.widths)) <= MOST_ROUNDING:
+                most, least = f"{max(hides):.2g}", f"{min(each.widths):.2g}"
+                return self._unknown(
+                    t,
+                    y,
+                    f"{COARSE}: rounding can hide {most} beside a half-width of {least}, at t = "
+                    f"{t:g} s",
+                )
+        alarm = self._alarm(innovations[0])
         lasting = self._lasting(self._k)
         if not lasting:
             over = f"the proof covers {self._tubes[0].samples} samples; they are over"
             return self._unknown(t, y, over)._replace(alarm=alarm)
-        row = sizes[lasting].max(axis=0) if len(lasting) > 1 else sizes[lasting[0]]
-        size = float(row.max())
-        share, reason = self._used(t, lasting, spent, peaks)
+        nearest = max(lasting, key=lambda j: max(away[j]))
+        size = max(away[nearest])
+        share, reason = self._used(t, lasting, limits, innovations)
         status = Status.ASSUMPTION_VIOLATED if reason else Status.INSIDE
         if not size <= 1.0:
             status = Status.OUTSIDE
             kept = "although the assumption was kept: what runs is not what was proved"
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+        moved = [limits[j].widths for j in lasting] if self._follow else []
         return Reading(
             t,
             status,
             1.0 - size,
             share,
             self._trend.exit_after(t, 1.0 - size),
-            self._names[int(row.argmax())],
-            nominal,
-            tuple(y.tolist()),
+            self._names[away[nearest].index(size)],
+            tuple(simulated),
+            tuple(y),
             Level.TUBE if size <= 1.0 else Level.NONE,
             reason,
             self._assuming + self._beyond,
-            [*deviation.tolist(), *e[0].tolist()],
+            [*deviation, *innovations[0]],
             alarm,
-            tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
+            tuple(map(min, zip(*moved, strict=True))),
         )
 
     def _used(
-        self, t: float, lasting: list[int], spent: list[float], peaks: list[float]
+        self, t: float, lasting: list[int], limits: "list[Limits]", innovations: Rows
     ) -> tuple[float, str]:
         """The most of what the tubes that last assume that is used, and what is exceeded."""
-        most = max(lasting, key=spent.__getitem__)
-        sharpest = max(lasting, key=peaks.__getitem__)
-        used = max(spent[most], peaks[sharpest])
-        if not spent[most] <= 1.0:
+        spent, most = max((self._spent[j] / limits[j].level, j) for j in lasting)
+        peak, sharpest = max((limits[j].sharpest(innovations[j]), j) for j in lasting)
+        used = max(spent, peak)
+        if not spent <= 1.0:
             unit = self._tubes[most].energy_unit(self._stepper.y)
             return used, (
                 f"innovation energy {self._spent[most]:.4g}{unit} above the level "
-                f"{self._spent[most] / spent[most]:.4g}{unit} at t = {t:g} s"
+                f"{limits[most].level:.4g}{unit} at t = {t:g} s"
             )
-        if not peaks[sharpest] <= 1.0:
-            peak = self._tubes[sharpest].peak
-            beside = "" if peak is not None and peak.direct.any() else f" ({WATCHED})"
+        if not peak <= 1.0:
+            assumed = self._tubes[sharpest].peak
+            beside = "" if assumed is not None and assumed.direct.any() else f" ({WATCHED})"
             return used, (
-                f"one sample's innovation is {math.sqrt(peaks[sharpest]):.4g} times what is "
+                f"one sample's innovation is {math.sqrt(peak):.4g} times what is "
                 f"assumed{beside}, at t = {t:g} s"
             )
         return used, ""
 
-    def _hides(self, simulated: FloatArray) -> FloatArray:
+    def _hides(self, simulated: list[float]) -> list[list[float]]:
         """(tubes, p) what rounding can hide of the outputs' distance from these simulated (p,)."""
         assert self._x is not None
-        reached = np.abs(self._x[-1])
-        if (reached > self._largest).any():
-            self._largest = np.maximum(self._largest, 1.1 * reached)  # so that this is seldom
-            none = np.zeros_like(simulated)
-            self._hidden = np.array([tube.hidden(self._largest, none) for tube in self._tubes])
+        reached = list(map(abs, self._x[-1]))
+        if any(map(gt, reached, self._largest)):
+            largest = np.maximum(self._largest, 1.1 * np.array(reached))  # so that this is seldom
+            none = np.zeros(len(simulated))
+            hidden = np.array([tube.hidden(largest, none) for tube in self._tubes])
             if self._linear is not None and self._carried is not None:
-                directly = self._carried @ self._linear.rounded(self._largest)
-                self._hidden = np.minimum(self._hidden, directly)
-        return self._hidden + STEPS * UNIT * np.abs(simulated)
-
-    def _followed(self, g: dict[int, float]) -> tuple[FloatArray, FloatArray]:
-        """By what levels are multiplied (tubes,), and half-widths (tubes, p), where g is this."""
-        if not g:
-            return self._unmoved, self._widths
-        room = np.array([max(g[j], TINY) if j in g else 1.0 for j in range(len(self._tubes))])
-        return room, self._widths * np.sqrt(room)[:, None]
+                hidden = np.minimum(hidden, self._carried @ self._linear.rounded(largest))
+            self._largest, self._hidden = largest.tolist(), hidden.tolist()
+        own = [STEPS * UNIT * abs(each) for each in simulated]
+        return [list(map(add, each, own)) for each in self._hidden]
 
     def _alarm(self, innovation: list[float]) -> str:
         """What CUSUM says of the first observer; empty if it does not alarm."""
         cusum, sums = self._cusum, self._sums
         if cusum is None or sums is None:
             return ""
-        z = [e / size for e, size in zip(innovation, cusum.deviation.tolist(), strict=True)]
-        reached = sums.update(z)
+        reached = sums.update(list(map(truediv, innovation, self._deviation)))
         if reached <= cusum.threshold:
             return ""
         return (
@@ -405,62 +402,12 @@ class TubeRun:
             f"side, above {cusum.threshold:.4g}; nothing is proved of this"
         )
 
-    def _reached(self, steps: int) -> FloatArray:
-        """(tubes, p) of `reach` after so many steps; found for twice as many where they are new."""
-        if steps > len(self._reach):
-            parts = [reach(tube, self._linear, 2 * steps) for tube in self._tubes]
-            self._reach = np.stack(parts, axis=1)
-        return np.asarray(self._reach[steps - 1])
-
     def _lasting(self, k: int) -> list[int]:
         """The tubes whose proof covers k samples."""
         return [j for j, tube in enumerate(self._tubes) if k <= (tube.samples or k)]
 
-    def _unknown(self, t: float, y: FloatArray, reason: str) -> Reading:
-        return Reading(t, Status.UNKNOWN, measured=tuple(y.tolist()), reason=reason)
-
-
-class Ahead:
-    """A second simulation from a run's present estimate, and how far the robot can be from it.
-
-    `step` once for each next sample, with its inputs. Where it says nothing, `ended` says why, and
-    it never says anything again. The run goes on as if this were not there.
-    """
-
-    def __init__(self, run: TubeRun) -> None:
-        self._run = run
-        self._x, self._k, self._spent, self._g = run._x, run._k, run._spent, run._g
-        self._stepper, self._meters = run._stepper.ahead(), copy.deepcopy(run._meters)
-        self.steps, self._total = 0, np.zeros(len(run._rho))
-        self.ended = "no run has begun" if self._x is None else ""
-
-    def step(self, u: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Between which values (p,) the outputs are at the next sample, under its inputs u (n_u,).
-
-        Within the funnel's tubes too.
-        """
-        run = self._run
-        if self.ended or self._x is None:
-            return None
-        outputs, self._x, self.ended = run._advance(self._stepper, self._x, u)
-        self.steps += 1
-        self._g = {j: meter.update(u.tolist()) for j, meter in self._meters.items()}
-        g, widths = run._followed(self._g)
-        left = run._level * g * (1.0 + OUTWARD) - run._rho**self.steps * self._spent * (
-            1.0 - OUTWARD
-        )
-        self._total = run._rho * self._total + np.maximum(g, 1.0)
-        left = np.minimum(left, run._single * self._total * (1.0 + OUTWARD))
-        lasting = run._lasting(self._k + self.steps)
-        if not lasting or not (left[lasting] >= 0.0).all():
-            self.ended = self.ended or "what the tube assumes is broken, or over"
-        if self.ended:
-            return None
-        beside = np.sqrt(left[lasting, None] * run._reached(self.steps)[lasting])
-        centres = np.vstack([outputs[lasting], np.tile(outputs[-1], (len(lasting), 1))])
-        room = np.vstack([beside, widths[lasting]]) * (1.0 + OUTWARD)
-        room += np.tile(run._hides(outputs[-1])[lasting], (2, 1))
-        return (centres - room).max(axis=0), (centres + room).min(axis=0)
+    def _unknown(self, t: float, y: list[float], reason: str) -> Reading:
+        return Reading(t, Status.UNKNOWN, measured=tuple(y), reason=reason)
 
 
 def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
@@ -474,9 +421,82 @@ def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
             raise DataError(f"{trial.name}: {reading.reason}; measure from a place nearby")
 
 
-def _within(values: FloatArray, box: FloatArray) -> bool:
-    """Whether all values (..., n) are in the box (2, n)."""
-    return bool(((box[0] <= values) & (values <= box[1])).all())
+class Limits(NamedTuple):
+    """What one tube's samples are held against, as floats; all is rounded towards an alarm.
+
+    up: by what e'Re is multiplied, so that it is never below its exact value. peak: (p,), and
+    single: the most that one sample spends under it; inf where nothing is assumed of one sample.
+    """
+
+    rho: float
+    L: Rows
+    R: Rows
+    up: float
+    level: float
+    peak: list[float]
+    single: float
+    widths: list[float]
+
+    @classmethod
+    def of(cls, tube: Tube) -> "Limits":
+        """Those of a tube."""
+        R, p = tube.R, len(tube.R)
+        spread = float(np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2))
+        peak = np.full(p, math.inf) if tube.peak is None else tube.peak.at_most
+        return cls(
+            tube.rho * (1.0 + 8.0 * UNIT),
+            tube.L.tolist(),
+            R.tolist(),
+            1.0 + 8.0 * (p * p + 4) * UNIT * spread,
+            tube.level * (1.0 - ROUNDING),
+            (peak * (1.0 - ROUNDING)).tolist(),
+            math.inf if tube.peak is None else float(peak @ np.abs(R) @ peak),
+            (tube.half_widths * (1.0 - ROUNDING)).tolist(),
+        )
+
+    def spend(self, spent: float, e: list[float]) -> float:
+        """E after an innovation e."""
+        weighted = [sum(map(mul, row, e)) for row in self.R]
+        return self.rho * spent + self.up * float(sum(map(mul, weighted, e)))
+
+    def corrected(self, after: list[float], e: list[float]) -> list[float]:
+        """The observer's next state: the model's, and L e."""
+        return [each + sum(map(mul, row, e)) for each, row in zip(after, self.L, strict=True)]
+
+    def sharpest(self, e: list[float]) -> float:
+        """The largest of an innovation's squares beside what is assumed of one sample."""
+        parts = list(map(truediv, e, self.peak))
+        return float(max(map(mul, parts, parts)))
+
+    def sizes(self, deviation: list[float], hidden: list[float]) -> list[float]:
+        """(p,) how far out of the tube the outputs can be: 1 on its boundary."""
+        return list(map(truediv, map(add, map(abs, deviation), hidden), self.widths))
+
+    def at(self, g: float) -> "Limits":
+        """Those where the commands give the level this much room."""
+        room, sample = max(g, TINY), math.sqrt(max(g, 1.0))
+        return self._replace(
+            level=max(self.level * room, LEAST),
+            peak=[each * sample for each in self.peak],
+            widths=[max(each * math.sqrt(room), LEAST) for each in self.widths],
+        )
+
+
+def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> list[float]:
+    """By what each tube's level is multiplied at the next sample, whose inputs are u (n_u,)."""
+    return [meters[j].update(u) if j in meters else each for j, each in enumerate(g)]
+
+
+def _floats(values: Any) -> list[float]:
+    """One number, or those of a vector."""
+    if isinstance(values, float | int):
+        return [float(values)]
+    return np.array(values, dtype=np.float64).ravel().tolist()
+
+
+def _within(rows: Rows, box: Rows) -> bool:
+    """Whether the numbers of every row are in the box: the least and the greatest of each."""
+    return all(lo <= v <= hi for row in rows for v, (lo, hi) in zip(row, box, strict=True))
 
 
 def assuming(tubes: Sequence[Tube]) -> str:

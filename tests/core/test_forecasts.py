@@ -257,7 +257,7 @@ def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:
 def test_around_a_plan_there_is_no_forecast(planned: OutputTubeDesign) -> None:
     monitor = planned.monitor(centre=Centre.PROFILE)
     with pytest.raises(DataError, match="around the model's simulation"):
-        monitor.ahead()
+        monitor.forecast(np.zeros((1, 1)))
 
 
 @pytest.fixture

@@ -11,10 +11,17 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
+<<<<<<< HEAD
     ("nlsid_core",): 18_537,
     ("bags",): 12_023,
     ("nlsid_ros",): 2_666,
     ("tests",): 22_918,
+=======
+    ("nlsid_core",): 18_551,
+    ("bags",): 12_027,
+    ("nlsid_ros",): 2_664,
+    ("tests",): 22_991,
+>>>>>>> main
     ("benchmarks", "examples"): 3_807,
 }
 ARGUMENTS, FIELDS = 6, 8

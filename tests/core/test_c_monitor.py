@@ -1,0 +1,105 @@
+"""The monitor in C beside the one in Python, on recordings: the same verdicts and numbers."""
+
+import ctypes
+import math
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bags.samples import f1tenth
+from bags.signals.grid import read_dataset
+from bags.signals.sampling import Grid
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid_core.errors import DataError
+from nlsid_core.identification import Polynomial, identify
+from nlsid_core.running.c_table import c_table, write_table
+from nlsid_core.running.reading import Status
+from tests.core.kernel.tube_claims import design
+
+CORE = Path(__file__).parents[2] / "examples" / "rclcpp_monitor"
+COMPILER = shutil.which("cc") or shutil.which("gcc")
+CLOSE = 1e-12  # only a start's sums are in another order
+
+
+class Read(ctypes.Structure):
+    """A reading in C."""
+
+    _fields_ = (
+        ("status", ctypes.c_int),
+        ("margin", ctypes.c_double),
+        ("assumption", ctypes.c_double),
+        ("nominal", ctypes.c_double),
+    )
+
+
+@pytest.fixture(scope="module")
+def trials() -> Dataset:
+    """F1TENTH's, as shipped."""
+    speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+    grid = Grid(max_gap=0.1)
+    return read_dataset(f1tenth(), responses=[speed], excitations=[command], grid=grid)
+
+
+@pytest.fixture(scope="module")
+def made(trials: Dataset) -> OutputTubeDesign:
+    """Two tubes of constant width."""
+    model = identify(trials, Polynomial(6)).model
+    return design_output_tube(OutputTube(model, trials, level="constant"))
+
+
+def compiled(made: OutputTubeDesign, folder: Path) -> Any:
+    if COMPILER is None:
+        pytest.skip("no C compiler")
+    write_table(made, folder / "table.c")
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off"]
+    sources = [folder / "table.c", CORE / "nlsid_monitor.c", "-lm"]
+    library = folder / "monitor.so"
+    command = [COMPILER, *flags, f"-I{CORE}", "-shared", "-fPIC", "-o", library, *sources]
+    subprocess.run(list(map(str, command)), check=True)
+    loaded = ctypes.CDLL(str(library))
+    loaded.nlsid_update.argtypes = [ctypes.c_void_p, *[ctypes.c_double] * 3]
+    loaded.nlsid_update.restype = Read
+    return loaded
+
+
+def test_c_says_what_python_says_of_every_sample(
+    made: OutputTubeDesign, trials: Dataset, tmp_path: Path
+) -> None:
+    library, monitor = compiled(made, tmp_path), made.monitor()
+    place = ctypes.create_string_buffer(1 << 14)
+    statuses = list(Status)
+    seen = set()
+    for number, trial in enumerate(trials):
+        monitor.restart()
+        library.nlsid_start(place, ctypes.byref(ctypes.c_char.in_dll(library, "nlsid_table")))
+        t, y, u = trial.t.copy(), trial.y[:, 0].copy(), trial.u[:, 0].copy()
+        y[60:] += (0.0, 0.08, 0.3)[number % 3]  # a fault
+        y[30], u[40] = math.nan, math.nan if number % 2 else u[40]
+        t[50:] += made.model.period * (number % 4)  # samples that are lost
+        for row in zip(t.tolist(), y.tolist(), u.tolist(), strict=True):
+            expected, read = monitor.update(*row), library.nlsid_update(place, *row)
+            assert statuses[read.status] is expected.status, (trial.name, row)
+            seen.add(expected.status)
+            if expected.status is Status.UNKNOWN:
+                continue
+            found = read.margin, read.assumption, read.nominal
+            wanted = expected.margin, expected.assumption, expected.nominal[0]
+            assert found == pytest.approx(wanted, rel=CLOSE, abs=CLOSE)
+    assert seen == set(Status)
+
+
+@pytest.mark.parametrize("name", ["two_outputs", "cascade", "following"])
+def test_other_designs_have_no_table_and_it_says_why(name: str) -> None:
+    other = design(name)
+    with pytest.raises(DataError, match=r"linear model of one|level: constant"):
+        c_table(other.model, other.funnel)
+
+
+def test_a_name_cannot_end_the_comment(made: OutputTubeDesign) -> None:
+    model = replace(made.model, y=replace(made.model.y, name="*/ int evil; /*"))
+    assert c_table(model, made.funnel).split("\n")[0].count("*/") == 1
