@@ -142,8 +142,9 @@ def _expanded(
     assert expansion is not None  # as in `sweep_expanded`
     guess, after, cap = levels
     held = None if steps.widths is None else steps.widths[k]
-    tries = TRIES
-    box, looks = (guess, LOOKS) if duals is not None else (min(LARGER * guess, cap), 0)
+    # Of modes there is no estimate that is near enough.
+    known = duals is not None and not len(steps.limits)
+    box, looks, tries = (guess, LOOKS, TRIES) if known else (min(LARGER * guess, cap), 0, 2)
     while True:
         try:
             steps.local[k] = expansion.around(policy, P, k, (box, after), held)
