@@ -439,7 +439,7 @@ class FunnelMonitor(ManagedNode):
         if severity >= SEVERITY[State.ASSUMPTION_VIOLATED]:
             if news:
                 self._latched = state, reading.reason
-            if not self._help.is_awaited:
+            if not self._help.asked:
                 self._help.call()
         self._flag()
         message = self._report()

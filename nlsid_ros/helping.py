@@ -15,51 +15,46 @@ THROTTLE = 5.0  # s between log lines about a service that does not answer
 class Help:
     """Calls std_srvs/Trigger services until each has said that it did it.
 
-    failures: why a service did not, by its name; empty if all did.
+    failures: why a service did not, by its name; empty if all did. asked: those still asked.
     """
 
     def __init__(self, node: ManagedNode, services: Iterable[str]) -> None:
         self.failures: dict[str, str] = {}
         self._node = node
         self._clients = [node.create_client(Trigger, name) for name in services if name]
-        self._asked: dict[Client, Future | None] = {}
+        self.asked: dict[Client, Future | None] = {}
         self._retry = node.every(RETRY, self._ask)
         self._retry.cancel()
 
-    @property
-    def is_awaited(self) -> bool:
-        """Whether a service is still asked."""
-        return bool(self._asked)
-
     def call(self) -> None:
         """Ask all of them, also those that did it before."""
-        self._asked = dict.fromkeys(self._clients)
+        self.asked = dict.fromkeys(self._clients)
         self._ask()
         self._retry.reset()
 
     def call_off(self) -> None:
         """Ask nobody any more."""
-        self._asked.clear()
+        self.asked.clear()
         self.failures.clear()
 
     def _ask(self) -> None:
         """Ask those that have not said that they did it."""
-        for client, future in list(self._asked.items()):
+        for client, future in list(self.asked.items()):
             answer = future.result() if future is not None and future.done() else None
             if answer is not None and answer.success:
                 self._node.get_logger().info(f"{client.srv_name}: {answer.message}")
                 self.failures.pop(client.srv_name, None)
-                del self._asked[client]
+                del self.asked[client]
                 continue
             if future is not None:
                 client.remove_pending_request(future)
                 self.failures[client.srv_name] = answer.message if answer else "no answer"
-            self._asked[client] = None
+            self.asked[client] = None
             if client.service_is_ready():
-                self._asked[client] = client.call_async(Trigger.Request())
+                self.asked[client] = client.call_async(Trigger.Request())
             else:
                 self.failures[client.srv_name] = "not there to be called"
         for name, why in self.failures.items():
             self._node.get_logger().error(f"{name}: {why}", throttle_duration_sec=THROTTLE)
-        if not self._asked:
+        if not self.asked:
             self._retry.cancel()

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from bags.tools.info import BagInfo, Messages, TopicInfo
     from bags.tools.listing import Listed
 
-WORDS = ("good", "look", "bad")  # of the levels of a finding
 STYLES = ("green", "dark_orange3", "red")
 VERDICTS = ("fit for identification", "usable, with care", "not fit for identification")
 
@@ -133,9 +132,9 @@ def fitness_json(results: Sequence[Fitness]) -> str:
         [
             {
                 "bag": str(result.bag),
-                "verdict": WORDS[result.verdict],
+                "verdict": result.verdict.name.lower(),
                 "findings": [
-                    {"level": WORDS[found.level], "check": found.check, "what": found.what}
+                    {"level": found.level.name.lower(), "check": found.check, "what": found.what}
                     for found in result.findings
                 ],
             }
@@ -162,7 +161,7 @@ def show_fitness(console: Console, fitness: Fitness) -> None:
     verdict = VERDICTS[fitness.verdict]
     console.print(Text(f"{fitness.bag}: {verdict}", style=STYLES[fitness.verdict]), soft_wrap=True)
     for finding in sorted(fitness.findings, key=lambda found: -found.level):
-        line = Text(f"  {WORDS[finding.level]} ", style=STYLES[finding.level])
+        line = Text(f"  {finding.level.name.lower()} ", style=STYLES[finding.level])
         line.append(f"{finding.check}: {finding.what}", style="default")
         console.print(line, soft_wrap=True)
 

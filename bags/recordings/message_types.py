@@ -53,8 +53,8 @@ def fields_of(msgtype: str, types: Typestore) -> Mapping[str, FieldDesc]:
     if msgtype not in types.fielddefs:
         raise BagError(
             f"message type '{msgtype}' is not known: it is no ROS 2 Jazzy common interface and "
-            "nothing defines it here; give its .msg files (--definitions, or `definitions` in a "
-            "configuration)"
+            "nothing defines it here; give its .msg, .idl, .srv or .action file (--definitions, or "
+            "`definitions` in a configuration)"
         )
     return dict(types.fielddefs[msgtype][1])
 

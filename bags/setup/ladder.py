@@ -31,7 +31,7 @@ STEPS = 6  # of a search while it is one of many
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
 EVERY = 100  # least squares is quick
 DROPPED = 1.1  # times the best: what is worse on the first fold is not judged on the others
-LEAP = 0.25  # of the error before: where an attempt leaves less, its stage ends
+LEAP = 0.25  # of the error before: where a network leaves less, no others are tried
 MOST_FILTERED = 6  # states of filters: as many as lags of the best by least squares, or fewer
 SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
 ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
@@ -46,19 +46,17 @@ def choose(
 ) -> Choice:
     """Try what there is for such data: all on the first fold, the best of each stage on all.
 
-    known: what was tried before.
+    known: what was tried before. A stage sees what its own attempts gave on the first fold.
     """
     rows = list(known)
     for number, (stage, kept) in enumerate(stages):
-        before = {row.attempt for row in rows}
-        attempts = [one for one in dict.fromkeys(stage(held_out.data, rows)) if one not in before]
-        glances: list[Row] = []
-        known_best = least(rows)
-        for attempt in attempts:
-            if known_best and glances and glances[-1].percent < LEAP * known_best.percent:
-                break
-            progress(str(attempt), number / len(stages))
-            glances.append(held_out.glance(attempt))
+        begun = len(rows)
+        seen = list(rows)
+        for attempt in stage(held_out.data, seen):
+            if all(row.attempt != attempt for row in seen):
+                progress(str(attempt), number / len(stages))
+                seen.append(held_out.glance(attempt))
+        glances = seen[begun:]
         for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
             best = least(rows)
             limit = DROPPED * (math.inf if best is None else best.percent)
@@ -77,7 +75,7 @@ def least(rows: Iterable[Row]) -> Row | None:
     return min((row for row in rows if not row.refusal), key=lambda row: row.percent, default=None)
 
 
-Stage = Callable[[Dataset, Sequence[Row]], Iterator[Attempt]]
+Stage = Callable[[Dataset, Sequence[Row]], Iterator[Attempt]]  # of the rows that are there by then
 
 
 def linear(data: Dataset, _rows: Sequence[Row]) -> Iterator[Attempt]:
@@ -119,25 +117,35 @@ def curved(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
 
 
 def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
-    """Filters around a map, with as many states as linear models need, followers, rows of cells."""
-    outputs, inputs = signals_of(data)
-    best = least(rows)
-    if outputs > 1 or best is None or best.percent < ENOUGH:
+    """Filters around a map, with as many states as linear models need, followers, rows of cells.
+
+    Until one of them explains most; else a loop through a map, which takes longest.
+    """
+    before = least(rows)
+    if signals_of(data)[0] > 1 or before is None or before.percent < ENOUGH:
         return
-    certified = Sem(STEPS, certified=True)
-    if inputs == 1:
+    found, certified = before, Sem(STEPS, certified=True)
+    for structure in _structures(data, rows):
+        yield Attempt(Network(structure), certified)
+        found = least(rows) or found
+        if found.percent < LEAP * before.percent:
+            return
+    if found.percent > SWINGS:
+        yield Attempt(Network(Feedback(2, stages=2, imitated=20)), certified)
+
+
+def _structures(
+    data: Dataset, rows: Sequence[Row]
+) -> Iterator[FilterMapFilter | Follower | CellRow]:
+    if signals_of(data)[1] == 1:
         straight = least(row for row in rows if row.attempt.method == LeastSquares())
         n = 4 if straight is None else max(2, min(_lags(straight), MOST_FILTERED))
         for orders in dict.fromkeys(((n, 0), (0, n), (n - n // 2, n // 2))):
-            filters = FilterMapFilter(orders, intervals=12, starts=4)
-            yield Attempt(Network(filters), certified)
-        yield Attempt(Network(Follower()), certified)
+            yield FilterMapFilter(orders, intervals=12, starts=4)
+        yield Follower()
     limits: tuple[tuple[int, Limit], ...] = ((1, "none"), (1, "friction"), (2, "top"))
     for cells, limit in limits:
-        yield Attempt(Network(CellRow(cells, intervals=4, limit=limit)), certified)
-    if best.percent > SWINGS:
-        loop = Network(Feedback(2, stages=2, imitated=20))
-        yield Attempt(loop, certified)
+        yield CellRow(cells, intervals=4, limit=limit)
 
 
 def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
@@ -154,9 +162,13 @@ def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
             higher = replace(made.degrees, inputs=3, leading=2 if signals_of(data) == (1, 1) else 1)
             yield replace(attempt, model_class=replace(made, lags=made.lags - 1, degrees=higher))
     if isinstance(part := getattr(made, "structure", None), FilterMapFilter):
-        for phases, intervals in ((1, 24), (2, 24), (3, 48)):
-            finer = replace(part, phases=phases, intervals=intervals)
-            yield replace(attempt, model_class=Network(finer))
+        one, two, three = (
+            replace(attempt, model_class=Network(replace(part, phases=phases, intervals=intervals)))
+            for phases, intervals in ((1, 24), (2, 24), (3, 48))
+        )
+        yield from (one, two)
+        if rows[-1].percent < rows[-2].percent:
+            yield three
     if isinstance(method := attempt.method, Rse | Sem):
         yield replace(attempt, method=replace(method, iterations=1))
 

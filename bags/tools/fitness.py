@@ -7,7 +7,7 @@ their reasons; none of them proves anything, they say where to look.
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Final
@@ -59,24 +59,19 @@ class Finding:
 
 @dataclass(frozen=True)
 class Fitness:
-    """The findings about one bag."""
+    """The findings about one bag.
+
+    commands: of each excitation the values where responses were recorded.
+    """
 
     bag: Path
-    findings: tuple[Finding, ...]
+    findings: list[Finding] = field(default_factory=list)
+    commands: dict[str, FloatArray] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Level:
         """The worst finding's level."""
         return max((finding.level for finding in self.findings), default=Level.GOOD)
-
-
-@dataclass
-class _Look:
-    """What one bag shows; commands: of each excitation the values where responses were recorded."""
-
-    bag: Path
-    findings: list[Finding]
-    commands: dict[str, FloatArray]
 
 
 def check_fitness(
@@ -110,7 +105,7 @@ def check_fitness(
     )
     looks = []
     for path in map(place, bags):
-        look = _Look(path, [], {})
+        look = Fitness(path)
         try:
             with Bag(path, unfinished=True, definitions=definitions) as bag:
                 look.findings.extend(_clocks(bag, [*u_texts, *y_texts]))
@@ -120,10 +115,12 @@ def check_fitness(
         except BagError as error:
             look.findings.append(Finding(Level.BAD, "readable", str(error)))
         looks.append(look)
-    return [Fitness(look.bag, (*look.findings, *_constant(look, looks))) for look in looks]
+    for look in looks:
+        look.findings.extend(_constant(look, looks))
+    return looks
 
 
-def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: _Look) -> None:
+def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: Fitness) -> None:
     """Add what the signals of one bag show; BagError if they cannot be read."""
     u_names, y_names = list(expanded(bag, u_texts)), list(expanded(bag, y_texts))
     read = read_signals(bag, [*u_names, *y_names], sort=True)
@@ -182,7 +179,7 @@ def _samples(
     commands |= {samples.path: c for samples, c in zip(excitations, u.T, strict=True)}
 
 
-def _constant(look: _Look, looks: Sequence[_Look]) -> Iterator[Finding]:
+def _constant(look: Fitness, looks: Sequence[Fitness]) -> Iterator[Finding]:
     """The commands that do not change where responses were recorded, here or in all bags."""
     for name, values in look.commands.items():
         if np.ptp(values) > 0.0:

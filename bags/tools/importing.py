@@ -159,7 +159,7 @@ def import_table(
         msgtype = types.get(topic, NUMBER if is_number else "")
         if not msgtype:
             raise BagError(
-                f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
+                f"no type for {topic}; state it, e.g. --type {topic}=sensor_msgs/msg/JointState"
             )
         streams.append(_Stream(topic, msgtype, columns))
     said = _said_times(times, rows, unit)

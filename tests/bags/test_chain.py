@@ -117,6 +117,20 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     assert "probability at most 1/17" in said
 
 
+def test_false_alarms_are_promised_as_far_as_the_calibration_trials_go(
+    chain: Path, tmp_path: Path
+) -> None:
+    """Three of 17: the third largest scale, and no factor on it."""
+    again = shutil.copytree(chain, tmp_path / "again")
+    said = nlsid("funnel", again, "--config", CONFIG, "--false-alarms", 0.2)
+    assert "with probability at most 3/17" in " ".join(said.replace("│", " ").split())
+    before, tube = (documents.load(d / documents.FUNNEL).funnel.tubes[0] for d in (chain, again))
+    assert (tube.measured.rank, tube.measured.safety_factor) == (3, 1.0)
+    assert tube.level < before.level
+    few = nlsid("funnel", again, "--config", CONFIG, "--false-alarms", 0.01, status=None)
+    assert "record more for less" in few
+
+
 @pytest.mark.slow
 def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: Path) -> None:
     """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
