@@ -3,7 +3,8 @@
     python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N] [--limit S] [--out FILE]
 
 Each function is all that a user writes. A refusal is reported, not hidden. Starts on the boundary
-at t0 and at a later knot follow the true equations; w is at random corners of its box. Each is then
+at t0 and at a later knot follow the true equations; w is at random corners of its box. `room` is
+how many times as far from the motion the nearest start at t0 is that misses the goal. Each is then
 designed for a computer: `hold="largest"`, states measured wrong by up to a hundredth of the goal;
 and simulated so, with samples a half to all of the hold apart.
 
@@ -11,7 +12,6 @@ A design that takes more than --limit of processor time is stopped and reported 
 became of each problem is printed, and written to --out, when it is known.
 """
 
-import ast
 import inspect
 import json
 import tempfile
@@ -25,7 +25,12 @@ import numpy as np
 
 from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.machine import parser, tell
-from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
+from benchmarks.thesis.soundness import (
+    OneSet,
+    simulate_boundary,
+    simulate_held,
+    smallest_escape,
+)
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
@@ -405,10 +410,7 @@ def lines_of(problem: Callable[..., Any]) -> int:
     """How many lines a user writes: the function's statements, without its docstring."""
     name = problem.__name__ if problem.__name__ != "<lambda>" else "dubins"
     source = inspect.getsource(globals()[name])
-    body = ast.parse(source).body[0]
-    assert isinstance(body, ast.FunctionDef)
-    first = body.body[1].lineno
-    return sum(bool(line.strip()) for line in source.splitlines()[first - 1 :])
+    return sum(bool(line.strip()) for line in source.splitlines()[2:])
 
 
 def designed(
@@ -448,6 +450,14 @@ def run(name: str, starts: int, limit: float) -> dict[str, Any]:
         "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
     }
     told |= judged(function, found, given, starts)
+    told["room"] = smallest_escape(
+        Truth(function, found, given),
+        found.policy,
+        found.funnel,
+        found.found.goal.P,
+        starts=starts // 8,
+        rng=np.random.default_rng(5),
+    )
     if found.model.m:  # without an input there is nothing to hold
         error = WRONG * np.asarray(problem.goal, dtype=np.float64)
         held, told["held"] = designed(lambda: replace(problem, hold="largest", error=error), limit)
@@ -487,10 +497,12 @@ def judged(
 def summary(results: dict[str, Any]) -> dict[str, Any]:
     """The figures over all problems that were tried, and what became of each."""
     held = [told["held"] for told in results.values() if "held" in told]
+    rooms = [told["room"] for told in results.values() if "room" in told]
     return {
         "proved_first_try": sum(told["proved"] for told in results.values()),
         "of": len(results),
         "left": sum(told.get("left", 0) for told in results.values()),
+        "median_room": float(np.median(rooms)) if rooms else None,
         "proved_held": sum(told["proved"] for told in held),
         "left_held": sum(told.get("left", 0) for told in held),
         "most_lines": max(told["lines"] for told in results.values()),

@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
-from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
+from nlsid_core.dynamics.taylor_model import (
+    DEGREE,
+    ROUNDING,
+    SUMMED,
+    TaylorModel,
+    variables_of,
+)
 from nlsid_core.dynamics.vector_field import (
     Plan,
     VectorField,
@@ -314,6 +320,7 @@ class Cubic:
             return tuple(range(n))
         return tuple(sorted({j - 1 for row in high for j in row if j <= n}))
 
+    @cached_property
     def equations(self) -> tuple[tuple[Polynomial, ...], FloatArray]:
         """(n) polynomials in t, x, u, w with exact coefficients, and bounds (n,) of the rest."""
         rates = self.rates
@@ -332,34 +339,38 @@ class Cubic:
         return np.nextafter(centre - radius, np.inf), np.nextafter(centre + radius, -np.inf)
 
     def _in_states(self, row: _Row, names: tuple[str, ...]) -> tuple[Polynomial, float]:
-        left = Fraction(row.bound)
-        size = float(np.abs(row.coefficients).sum()) + row.bound
-        centre = [Fraction(c) for c in self.centre.tolist()]
-        total: dict[tuple[int, ...], Fraction] = {}
-        for used, value in zip(row.monomials, row.coefficients.tolist(), strict=True):
-            if abs(value) <= NEGLIGIBLE * size:
-                left += abs(Fraction(value))
-                continue
-            scale = Fraction(1)
-            for j in used:
-                scale *= Fraction(float(self.radius[j]))
-            rounded = Fraction(float(Fraction(value) / scale))
-            left += abs(rounded * scale - Fraction(value))
-            parts = {(0,) * len(names): rounded}
-            for j in used:  # times z_j - centre_j
-                product: dict[tuple[int, ...], Fraction] = {}
+        """Σ (coefficient/Π r_j)·Π (z_j - c_j), the quotient rounded, and a bound of the rest."""
+        sizes = np.abs(row.coefficients)
+        kept = sizes > NEGLIGIBLE * (float(sizes.sum()) + row.bound)
+        scales = np.append(self.radius, 1.0)[row.places[kept]].prod(axis=1)
+        lost = float(sizes[~kept].sum() + ROUNDING * sizes.sum())
+        # Floats are whole numbers over powers of two: all of them over the same ones.
+        centre, unit = _whole(self.centre)
+        quotients, common = _whole(row.coefficients[kept] / scales)
+        total: dict[tuple[int, ...], int] = {}
+        for place, value in zip(np.flatnonzero(kept).tolist(), quotients, strict=True):
+            parts = {(0,) * len(names): value << unit * (3 - len(row.monomials[place]))}
+            for j in row.monomials[place]:  # times z_j - centre_j
+                product: dict[tuple[int, ...], int] = {}
                 for exponent, c in parts.items():
                     higher = (*exponent[:j], exponent[j] + 1, *exponent[j + 1 :])
-                    product[higher] = product.get(higher, Fraction(0)) + c
+                    product[higher] = product.get(higher, 0) + (c << unit)
                     if centre[j]:
-                        product[exponent] = product.get(exponent, Fraction(0)) - c * centre[j]
+                        product[exponent] = product.get(exponent, 0) - c * centre[j]
                 parts = product
             for exponent, c in parts.items():
-                total[exponent] = total.get(exponent, Fraction(0)) + c
+                total[exponent] = total.get(exponent, 0) + c
         coefficients = np.empty(len(total), dtype=object)
-        coefficients[:] = list(total.values())
+        coefficients[:] = [Fraction(c, 1 << common + 3 * unit) for c in total.values()]
         exponents = np.array(list(total), dtype=np.int64).reshape(-1, len(names))
-        return Polynomial(exponents, coefficients, names), nextafter(float(left), inf)
+        return Polynomial(exponents, coefficients, names), (row.bound + lost) * SUMMED
+
+
+def _whole(values: FloatArray) -> tuple[list[int], int]:
+    """Whole numbers that are the values times 2^k, and k."""
+    ratios = [value.as_integer_ratio() for value in values.tolist()]
+    k = max((below.bit_length() - 1 for _, below in ratios), default=0)
+    return [above << k - below.bit_length() + 1 for above, below in ratios], k
 
 
 def taylor_field(
@@ -404,7 +415,7 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
     pieces: list[tuple[Polynomial, ...]] = []
     valid = []
     for span, cubic in enumerate(cubics):
-        found, bounds = cubic.equations()
+        found, bounds = cubic.equations
         equations = [p.over(names) for p in found]
         for place, i in enumerate(rows):
             unit = np.zeros((1, len(names)), dtype=np.int64)

@@ -50,7 +50,6 @@ class VectorField:
     uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     expansion: str = ""
-    _slopes: dict[int, "Plan"] = field(init=False, default_factory=dict)  # built when first asked
 
     def __post_init__(self) -> None:
         bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
@@ -100,6 +99,12 @@ class VectorField:
     @cached_property
     def _plans(self) -> tuple["Plan", ...]:
         return tuple(Plan.of(p, self.names) for p in self.pieces)
+
+    @cached_property
+    def coefficients(self) -> tuple[IntArray, FloatArray]:
+        """(M, variables) the monomials that occur, and (pieces, n, M) their coefficients."""
+        exponents, table = _table([p for piece in self.pieces for p in piece], self.names)
+        return exponents, table.T.reshape(len(self.pieces), self.n, -1)
 
     @classmethod
     def from_function(
@@ -298,15 +303,29 @@ class VectorField:
 
     def jacobians(self, t: float, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A (n, n) = ∂f/∂x and B (n, m) = ∂f/∂u at one point, w in the centre of its box."""
-        span = self.span(t)
-        if span not in self._slopes:
-            names = self.names[1 : 1 + self.n + self.m]
-            slopes = [p.derivative(name) for p in self.pieces[span] for name in names]
-            self._slopes[span] = Plan.of(slopes, self.names)
+        exponents, table = self.coefficients
+        factors, powers, lower, home = self._slopes
         w = self.uncertain.mean(axis=1)
         point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float), w])
-        J = self._slopes[span](point[:, None]).reshape(self.n, self.n + self.m)
+        values = (point[:, None] ** np.arange(exponents.max(initial=0) + 1))[
+            range(len(point)), lower
+        ]
+        J = (table[self.span(t)][:, powers] * (factors * values.prod(axis=1))) @ home
         return J[:, : self.n], J[:, self.n :]
+
+    @cached_property
+    def _slopes(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
+        """Of every derivative of a monomial by an entry of (x, u): its factor, which monomial it is
+
+        of, its exponents, and (derivatives, n + m) 1 at the entry.
+        """
+        exponents, _ = self.coefficients
+        within = exponents[:, 1 : 1 + self.n + self.m]
+        monomial, entry = np.nonzero(within)
+        lower = exponents[monomial]
+        lower[np.arange(len(lower)), 1 + entry] -= 1
+        home = np.eye(within.shape[1])[entry]
+        return within[monomial, entry].astype(np.float64), monomial, lower, home
 
     def document(self) -> Json:
         """The JSON form; every coefficient is exact."""

@@ -15,12 +15,11 @@ Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Tod
 """
 
 from dataclasses import dataclass, field, replace
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import blas, lapack, qr
+from scipy.linalg import blas, lapack
 
 from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray, keep
@@ -31,7 +30,7 @@ from nlsid_core.polynomial.values import monomial_values
 
 CANDIDATES = 1.5  # random points per equality, of which pivoting keeps the best conditioned ones
 ONE = 0.25  # of the weights, of the monomial 1
-RANK_TOLERANCE = 1e-10  # of the QR diagonal: monomials of degree 4 and 6 on a sphere keep 12 digits
+RANK_TOLERANCE = 1e-12  # of a pivot: what a point adds that is needed is 1e-2, else 1e-14
 MAX_ITERATIONS = 60  # 8 to 12 are usual
 STEP_TO_BOUNDARY = 0.95  # of the way to where X or Z would be singular; 0.99 loses the centre
 REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
@@ -141,7 +140,7 @@ class SphereProgram:
         low = monomials(self.n, [self.half - 1])
         one = np.zeros((int(self.constant), self.n), dtype=np.int64)
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
-        points = unisolvent_points(basis, self.half)
+        points = unisolvent_points(basis)
         weight = weights_of(basis, np.isin(np.arange(self.n), chosen))
         keep(self, {"basis": basis, "weight": weight, "points": points})
         object.__setattr__(self, "_at", _AtPoints.of(basis, weight, points))
@@ -412,27 +411,20 @@ def multinomials(rows: IntArray) -> FloatArray:
     return np.asarray(factorials[rows.sum(axis=1)] / factorials[rows].prod(axis=1))
 
 
-def unisolvent_points(basis: IntArray, half: int) -> FloatArray:
-    """Points on the sphere that determine every function in the span of products of the basis."""
+def unisolvent_points(basis: IntArray) -> FloatArray:
+    """Points on the sphere that determine every function in the span of products of the basis.
+
+    The square of a kernel of the basis is one of its products, and a pivot is what a point adds.
+    """
     n = basis.shape[1]
     rng = np.random.default_rng(n)  # one fixed set per n: results repeat
-    if basis.any(axis=1).all() and len(basis) == len(monomials(n, [half - 1, half])):
-        # On the sphere all products are of the two highest degrees. With the roots of multinomials
-        # as weights their Gram matrix over the points is a sum of two powers.
-        count = sum(comb(n + degree - 1, degree) for degree in (2 * half - 1, 2 * half))
-        cloud = _cloud(rng, count, n)
-        cosine = cloud @ cloud.T
-        gram = cosine * (cosine**2) ** (half - 1) * (1.0 + cosine)
-        order = lapack.dpstrf(gram.T, lower=1, tol=0.0, overwrite_a=1)[1] - 1
-        return np.asarray(cloud[np.sort(order[:count])])
-    products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
-    cloud = _cloud(rng, len(products), n)
-    table = monomial_values(products, cloud)
-    table /= np.linalg.norm(table, axis=0)
-    R, order = qr(table.T, mode="r", pivoting=True, overwrite_a=True, check_finite=False)
-    diagonal = np.abs(np.diag(R))
-    rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
-    return np.asarray(cloud[np.sort(order[:rank])])
+    count = len(np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0))
+    cloud = _cloud(rng, count, n)
+    v = monomial_values(basis, cloud) * np.sqrt(multinomials(basis))
+    v /= np.linalg.norm(v, axis=1)[:, None]
+    gram = (v @ v.T) ** 2
+    _, order, rank, _ = lapack.dpstrf(gram.T, lower=1, tol=RANK_TOLERANCE, overwrite_a=1)
+    return np.asarray(cloud[np.sort(order[:rank] - 1)])
 
 
 def _cloud(rng: np.random.Generator, count: int, n: int) -> FloatArray:

@@ -37,7 +37,7 @@ def expanded(
     """Cubics in t, x, u, w on a box of (x, u), from t = 0 to 0.1, and the bounds of the rest."""
     centre, radius = np.asarray(centre, float), np.asarray(radius, float)
     rates = Rates.of(function, states, len(centre) - states, uncertain, affine=affine)
-    found, bounds = rates.on(centre - radius, centre + radius, (0.0, 0.1)).equations()
+    found, bounds = rates.on(centre - radius, centre + radius, (0.0, 0.1)).equations
     return list(found), bounds
 
 

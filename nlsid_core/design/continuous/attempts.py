@@ -33,7 +33,7 @@ from nlsid_core.progress import Progress
 
 HALVINGS = 6  # of intervals where P is far from linear
 FINER = ("knots", "remainder")  # what is less where knots are closer
-FASTER, SLOWER = 0.25, 4.0  # of the default R
+FASTER = 0.25  # of the default R
 MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
 AT_LIMIT = 0.99  # of ρ's cap: an input reaches its limit
 NARROW = 0.5  # of half-widths without limits: with less, few limited inputs may saturate
@@ -90,10 +90,7 @@ def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
         listed += HALVINGS * [("with more knots", partial(_finer, problem))]
     listed.append(("around what w reaches", partial(_pushed, problem)))
     if problem.policy is None and problem.R is None and setting.steps.field.m > 0:
-        listed += [
-            ("with a quarter of R", partial(_weighed, problem, FASTER)),
-            ("with four times R", partial(_weighed, problem, SLOWER)),
-        ]
+        listed.append(("with a quarter of R", partial(_weighed, problem)))
     if problem.policy is None and 0 < len(_limits(problem)) <= MOST_LIMITED:
         listed.append(("with inputs that saturate", partial(_saturated, problem)))
     return listed
@@ -189,10 +186,10 @@ def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
     return None
 
 
-def _weighed(problem: ContinuousTracking, factor: float, tried: list[Tried]) -> Setting:
-    """R times this, around the motion as it was given."""
+def _weighed(problem: ContinuousTracking, tried: list[Tried]) -> Setting:
+    """With a quarter of R, around the motion as it was given."""
     first = tried[0].setting
-    return prepare(replace(problem, nominal=motion_of(first), R=factor * first.weights[1]))
+    return prepare(replace(problem, nominal=motion_of(first), R=FASTER * first.weights[1]))
 
 
 def _saturated(problem: ContinuousTracking, tried: list[Tried]) -> Setting:

@@ -87,14 +87,11 @@ class InputRates:
     sign: IntArray
 
 
-def batches(field: VectorField, funnel: ContinuousFunnel, pieces: Pieces) -> Iterator[IntArray]:
-    """Indices of pieces that obey the same equations, as many as fit at once."""
+def batches(pieces: Pieces) -> Iterator[IntArray]:
+    """Indices of pieces, as many as fit at once."""
     size = max(1, CELLS // (len(pieces.basis) ** 2 * 16))
-    span = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]
-    for equations in np.unique(span):
-        chosen = np.flatnonzero(span == equations)
-        for start in range(0, len(chosen), size):
-            yield chosen[start : start + size]
+    for start in range(0, len(pieces), size):
+        yield np.arange(start, min(start + size, len(pieces)))
 
 
 def closed_loop_polynomial(
@@ -104,7 +101,7 @@ def closed_loop_polynomial(
     pieces: Pieces,
     end: int | None = None,
 ) -> Graded:
-    """c(s, z) of every piece, in Bernstein form times the binomials; all in one time span.
+    """c(s, z) of every piece, in Bernstein form times the binomials.
 
     end: 0 or 1 for the value at that end alone, of degree 0 in s.
 
@@ -217,10 +214,8 @@ class _Loop:
             w = vertices[pieces.vertex % len(vertices)]
         self.w = np.tile(field.uncertain.mean(axis=1), (len(pieces), 1)) if w is None else w
         self.policy, self.funnel = policy, funnel
-        spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]
-        self.span = int(spans[0])
-        assert (spans == self.span).all()  # pieces of one batch obey the same equations
-        self.equations = field.pieces[self.span]
+        spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")
+        self.span = spans[pieces.interval]
         self._variables = self._affine_forms()
         self._known: dict[tuple[int, ...], Graded] = {}
 
@@ -258,25 +253,27 @@ class _Loop:
     def field_times_h(self) -> list[Graded]:
         """h·f_i along the closed loop."""
         h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
-        rates: list[Graded] = [{} for _ in self.equations]
-        for i, p in enumerate(self.equations):
-            numbers = [float(c) for c in p.coefficients.tolist()]
-            for number, exponent in zip(numbers, p.exponents.tolist(), strict=True):
-                value = self._monomial(tuple(exponent)).items()
-                rates[i] = add(rates[i], {q: number * h * part for q, part in value})
+        rates: list[Graded] = [{} for _ in range(self.field.n)]
+        exponents, table = self.field.coefficients
+        numbers = table[self.span]
+        for i, j in np.argwhere(numbers.any(axis=0)).tolist():
+            scale = numbers[:, i, j][:, None, None] * h
+            value = self._monomial(tuple(exponents[j].tolist())).items()
+            rates[i] = add(rates[i], {q: scale * part for q, part in value})
         return rates
 
     def bounded_pushes(self, PT: FloatArray) -> list[Graded]:
         """h·r(κ(x̄'Pg)² + 1/κ) for each w, r half its range: at least 2|x̄'Pg|·h·|w - centre|."""
-        kappa, pushes = self.pieces.kappa, self.field.pushes(self.span)
-        if kappa is None or pushes is None:
+        kappa = self.pieces.kappa
+        if kappa is None:
             return []
+        pushes = np.array([self.field.pushes(span) for span in range(len(self.field.pieces))])
         h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
         terms = []
         scales = kappa[self.pieces.interval][:, :, None, None]
         for j, radius in enumerate((np.ptp(self.field.uncertain, axis=1) / 2).tolist()):
             scale = scales[:, j]
-            along: Graded = {1: np.einsum("bkij,i->bkj", PT, pushes[:, j])}
+            along: Graded = {1: np.einsum("bkij,bi->bkj", PT, pushes[self.span, :, j])}
             square = multiply(along, along, self.field.n)
             total = add({q: scale * part for q, part in square.items()}, {0: 1 / scale})
             terms.append({q: radius * h * part for q, part in total.items()})

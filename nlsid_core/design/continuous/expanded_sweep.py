@@ -16,23 +16,32 @@ from nlsid_core.design.continuous.expansion import BACK, NoExpansion
 from nlsid_core.design.continuous.lstep import section_at, sections
 from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.design.continuous.shape import validity_caps
-from nlsid_core.design.continuous.sweep import Ends, Wanted, largest_before, sweep_rho
+from nlsid_core.design.continuous.sweep import (
+    Again,
+    Ends,
+    Wanted,
+    estimated_before,
+    largest_before,
+    sweep_rho,
+)
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
-LARGER, CLOSE = 1.5, 1.02  # of ρ: the box in which it is looked for, and the one it is found in
+LOOKS, TRIES = 2, 3  # boxes in which ρ is estimated by the L-steps of the interval after; found
+LARGER = 1.5  # of the box before: the largest in which ρ is estimated, and the first one else
+CLOSE, NEAR = 1.02, 0.95  # of ρ, the box in which it is found; of that box, what is no smaller
 SMALLEST = 1e-3  # of ρ at an interval's end: it does not fall farther on one interval
 MAX_BACK = 40  # how often ρ is lowered for the interval before
 
 
 class Swept(NamedTuple):
-    """ρ (K,), the L-steps at the knots if they are at hand, and the setting of their field."""
+    """ρ (K,), the L-steps at the ends of intervals, and the setting of their field."""
 
     setting: Setting
     rho: FloatArray
-    ends: list[Ends] | None
+    ends: list[Ends]
 
 
 def wanted_of(
@@ -49,17 +58,29 @@ def wanted_of(
 
 
 def swept(
-    setting: Setting, wanted: Wanted, progress: Progress = silent, *, most_back: int = MAX_BACK
+    setting: Setting,
+    wanted: Wanted,
+    progress: Progress = silent,
+    *,
+    most_back: int = MAX_BACK,
+    again: Again | None = None,
 ) -> Swept:
     """The largest ρ(t), and what it was found with; see `sweep_rho` and `sweep_expanded`."""
     steps, policy = setting.steps, setting.policy
     if setting.expansion is not None:
-        return sweep_expanded(setting, wanted, most_back=most_back, progress=progress)
-    return Swept(setting, *sweep_rho(steps, sections(steps, policy, setting.P), wanted, progress))
+        return sweep_expanded(setting, wanted, progress, most_back=most_back, again=again)
+    instants = sections(steps, policy, setting.P)
+    found = sweep_rho(steps, instants, wanted, progress, again)
+    return Swept(replace(setting, steps=steps.as_it_is()), *found)
 
 
 def sweep_expanded(
-    setting: Setting, wanted: Wanted, *, most_back: int = MAX_BACK, progress: Progress = silent
+    setting: Setting,
+    wanted: Wanted,
+    progress: Progress = silent,
+    *,
+    most_back: int = MAX_BACK,
+    again: Again | None = None,
 ) -> Swept:
     """The largest ρ(t) backward from the end, each interval expanded around what it gives.
 
@@ -71,30 +92,31 @@ def sweep_expanded(
     policy, P, expansion = setting.policy, setting.P, setting.expansion
     assert expansion is not None  # else there is one field for the whole motion
     K = len(P)
-    rho = np.full(K, wanted.final)
+    rho, k, back = np.full(K, wanted.final), K - 2, 0
     caps = np.array([wanted.cap(k) for k in range(K)])
     ends: dict[int, Ends] = {}
-    k, back = K - 2, 0
+    if again is not None:
+        rho, ends, k = again.rho.copy(), dict(enumerate(again.ends)), again.last
     farthest, refusal, left = K, Infeasible(""), -np.inf
     while k >= 0:
         after = float(rho[k + 1])
-        share = expansion.room(policy, P, k, after)
-        if share == 1.0:
-            guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
-            duals = ends[k + 1].start if k + 1 in ends else None
-            try:
-                levels = (min(guess, float(caps[k])), after, float(caps[k]))
-                rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
-                progress(f"rho at {policy.t[k]:.3g} s", 1 - k / (K - 1))
-                k -= 1
-                continue
-            except NoFunnel as found:
-                if k < farthest or (k == farthest and found.left > left):
-                    farthest, refusal, left = k, found, found.left
-                back += 1
-                if back > most_back:
-                    raise refusal from None
-                share = BACK
+        guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
+        duals = ends[k + 1].start if k + 2 < K else None
+        try:
+            levels = (min(guess, float(caps[k])), after, float(caps[k]))
+            rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
+            progress(f"rho at {policy.t[k]:.3g} s", 1 - k / (K - 1))
+            k -= 1
+            continue
+        except NoExpansion:
+            share = expansion.room(policy, P, k, after)
+        except NoFunnel as found:
+            if k < farthest or (k == farthest and found.left > left):
+                farthest, refusal, left = k, found, found.left
+            share = BACK
+        back += 1
+        if back > most_back:
+            raise refusal from None
         # What ρ_{k+1} leaves at the end of this interval is too much for its box or its feedback.
         caps[k + 1] = share * after
         if k == K - 2:
@@ -113,34 +135,37 @@ def _expanded(
 ) -> tuple[float, Ends]:
     """The largest ρ, nearly, at the start of interval k, and its L-steps, for cubics around it.
 
-    levels: a guess of it, ρ at the interval's end, and what it is below. The box is first larger
-    than the guess, until it holds what is found; then once as large as that.
+    levels: a guess of it, ρ at the interval's end, and what it is below. duals: of the interval
+    after. They estimate ρ in boxes that come closer to it; it is then found in the last.
     """
     steps, policy, P, expansion = setting.steps, setting.policy, setting.P, setting.expansion
     assert expansion is not None  # as in `sweep_expanded`
     guess, after, cap = levels
-    box, last = min(LARGER * guess, cap), False
+    held = None if steps.widths is None else steps.widths[k]
+    # Of modes there is no estimate that is near enough.
+    known = duals is not None and not len(steps.limits)
+    box, looks, tries = (guess, LOOKS, TRIES) if known else (min(LARGER * guess, cap), 0, 2)
     while True:
-        held = None if steps.widths is None else steps.widths[k]
         try:
             steps.local[k] = expansion.around(policy, P, k, (box, after), held)
-        except NoExpansion:
-            box, cap = box / 2, box / 2
-            continue
-        shares = (0.0, 0.5, 1.0) if last else (0.0, 1.0)
-        instants = [section_at(steps, policy, P, k, s) for s in shares]
-        try:
-            rho, found = largest_before(steps, instants, after, min(cap, box), wanted, duals)
-        except NoFunnel:
+            instants = [section_at(steps, policy, P, k, s) for s in (0.0, 1.0)]
+            if looks and duals is not None:
+                most = min(LARGER * box, cap)
+                rho = estimated_before(steps, instants, after, most, wanted, duals)
+                rho = max(rho, box / 4)  # an estimate: whether there is none is found below
+                looks -= 1
+                box = float(np.sqrt(box * rho)) if looks else min(CLOSE * rho, cap)
+                continue
+            rho, found = largest_before(steps, instants, after, min(box, cap), wanted, duals)
+        except (NoExpansion, NoFunnel):
             if box <= SMALLEST * after:
                 raise
             box, cap = box / 2, box / 2
             continue
-        if last:
+        tries -= 1
+        if NEAR * box <= rho < box or rho >= cap or not tries:
             return rho, found
-        last = rho < box or box >= cap
-        box = min(CLOSE * rho if last else LARGER * box, cap)
-        duals = found.start
+        box, duals = min(CLOSE * rho if rho < box else LARGER * box, cap), found.start
 
 
 def with_field(setting: Setting) -> Setting:
@@ -149,5 +174,5 @@ def with_field(setting: Setting) -> Setting:
     field = field_of([steps.local[k] for k in range(len(policy.t) - 1)], policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)
-    proving.kappa = steps.kappa
+    proving.kappa = None if steps.kappa is None else steps.kappa.copy()
     return replace(setting, steps=proving, policy=policy)

@@ -1,6 +1,6 @@
 """Dynamics that are not polynomial, expanded anew on each interval around what the funnel needs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from traceback import extract_tb
 
@@ -27,6 +27,7 @@ class Expansion:
 
     rates: Rates
     nominal: Nominal
+    near: dict[int, Cubic] = field(default_factory=dict)
 
     def on(self, k: int, reach: FloatArray, limits: FloatArray | None = None) -> Cubic:
         """The cubics on interval k for (x, u) within reach (n + m,) of the motion's range."""
@@ -47,8 +48,14 @@ class Expansion:
 
     def linear(self) -> VectorField:
         """The field to linearise: expanded close to the motion, of no use anywhere else."""
-        cubics = [self.on(k, self._near()) for k in range(len(self.nominal.t) - 1)]
+        cubics = [self._close(k) for k in range(len(self.nominal.t) - 1)]
         return replace(field_of(cubics, self.nominal.t), valid=self.rates.valid)
+
+    def _close(self, k: int) -> Cubic:
+        """The cubics on interval k close to the motion; the same whenever it is asked."""
+        if k not in self.near:
+            self.near[k] = self.on(k, self._near())
+        return self.near[k]
 
     def _near(self) -> FloatArray:
         """(n + m,) so far from the motion a cubic is as good as the derivative."""
@@ -57,19 +64,19 @@ class Expansion:
 
     def refined(self, most: int) -> "Expansion":
         """Around the motion with knots, `most` in all, where it has no cubics as it is."""
-        nominal = self.nominal
+        found = self
         for _ in range(HALVINGS):
             coarse = []
-            for k in range(len(nominal.t) - 1):
+            for k in range(len(found.nominal.t) - 1):
                 try:
-                    Expansion(self.rates, nominal).on(k, self._near())
+                    found._close(k)
                     coarse.append(False)
                 except NoExpansion:
                     coarse.append(True)
-            if not any(coarse) or len(nominal.t) + sum(coarse) > most:
+            if not any(coarse) or len(coarse) + 1 + sum(coarse) > most:
                 break
-            nominal = nominal.halved(coarse)
-        return Expansion(self.rates, nominal)
+            found = Expansion(self.rates, found.nominal.halved(coarse))
+        return found
 
     def nonlinear_states(self) -> tuple[int, ...]:
         """The states that enter nonlinearly on some interval."""

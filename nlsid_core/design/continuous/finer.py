@@ -76,6 +76,8 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
     when = refusal_time(refusal)
     if when is None or K >= MOST_KNOTS:
         return None
+    if isinstance(refusal, Unproved):
+        return _first(refusal.intervals, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - K)
     around = nearby * float(t[-1] - t[0])
     chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
     if diagnosis is not None and not alone:

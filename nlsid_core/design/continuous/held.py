@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.closed_loop import InputRates, Pieces, rate_polynomial
+from nlsid_core.design.continuous.closed_loop import CELLS, InputRates, Pieces, rate_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import (
@@ -304,7 +304,7 @@ def _batches(
     *,
     signs: tuple[int, ...] = (-1, 1),
 ) -> Iterator[_Rates]:
-    """Every rate on these parts of time, one span of the equations after the other."""
+    """Every rate on these parts of time, as many as fit at once."""
     field, n = steps.field, steps.program.n
     own = _pushing(field, 1 + n + field.m, len(field.uncertain))
     boxes = [
@@ -325,9 +325,8 @@ def _batches(
     vertex, entry, sign, mode = np.array(cases).reshape(-1, 4).T
     limits = len(steps.limits)
     halves = np.ptp(field.uncertain, axis=1) / 2
-    spans = {part: field.span(float(policy.t[part.interval])) for part in parts}
-    for span in sorted(set(spans.values())):
-        alike = [part for part in parts if spans[part] == span]
+    size = max(1, CELLS // (len(cases) * len(basis) ** 2 * 16))
+    for alike in (parts[k : k + size] for k in range(0, len(parts), size)):
         count = len(alike) * len(cases)
         place = np.repeat(
             np.array([(p.interval, p.level, p.index) for p in alike]), len(cases), axis=0
@@ -348,8 +347,9 @@ def _batches(
             stated=np.empty(count, dtype=object),
         )
         gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
+        spans = np.searchsorted(field.breaks, policy.t[place[:, 0]], side="right")
         shoved, own_shoved = (
-            np.abs(gains @ _pushes(field, span, first, found)).max(axis=1)
+            np.abs(gains @ _pushes(field, first, found)[spans]).max(axis=1)
             for first, found in ((1 + n, _pushing(field, 1 + n, field.m)), (1 + n + field.m, own))
         )
         of = InputRates(pieces, values[v % len(values)], i, side)
@@ -374,15 +374,11 @@ def _pushing(field: VectorField, first: int, count: int) -> list[bool]:
     return [bool((rows[rows[:, first + j] > 0].sum(axis=1) == 1).all()) for j in range(count)]
 
 
-def _pushes(field: VectorField, span: int, first: int, pushing: list[bool]) -> FloatArray:
-    """(n, count) what a unit of each variable that only pushes adds to ẋ; zero for the others."""
-    g = np.zeros((field.n, len(pushing)))
-    for i, p in enumerate(field.pieces[span]):
-        for exponent, coefficient in p.terms():
-            for j in np.flatnonzero(pushing).tolist():
-                if exponent[first + j]:
-                    g[i, j] += float(coefficient)
-    return g
+def _pushes(field: VectorField, first: int, pushing: list[bool]) -> FloatArray:
+    """(spans, n, count) what a unit of each variable that only pushes adds to ẋ; else zero."""
+    exponents, table = field.coefficients
+    alone = exponents[:, first : first + len(pushing)] * (exponents.sum(axis=1) == 1)[:, None]
+    return np.asarray(table @ (alone * pushing))
 
 
 def _at_end(

@@ -98,7 +98,7 @@ class KnotForms:
         blank = replace(blank, tau=np.stack([tau, tau], axis=1))
         errors = np.zeros((len(blank), n, _count(n, 3)))
         targets = np.zeros((len(blank), _count(n, 4)))
-        for chosen in batches(steps.field, funnel, blank):
+        for chosen in batches(blank):
             alike = blank.select(chosen)
             found = error_at_end(steps.field, policy, funnel, alike, end)
             errors[chosen, :, : found.shape[2]] = found

@@ -7,7 +7,7 @@ depend on ρ̇. Source: thesis (6.4), in the sphere form.
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
@@ -311,22 +311,12 @@ class LSteps:
         solved = self.program.solve(g, tolerance=TOLERANCE, start=start, enough=enough)
         return replace(solved, tau=tau)
 
-    def predicted(
-        self,
-        section: Section,
-        rho: float,
-        duals: list[SphereSolution],
-        *,
-        saturated: bool = True,
-    ) -> float:
+    def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
         """An upper bound of φ at another ρ or section, from dual solutions: no program solved.
 
-        With limits it is an estimate: the multipliers of the mode stay what they are. saturated:
-        False leaves out the modes at a limit, for which that estimate may be far too low.
+        With limits it is an estimate: the multipliers of the mode stay what they are.
         """
-        free = not saturated and len(self.limits) > 0
-        cases = [c for c in range(len(duals)) if not (free and self.split(c)[-1].any())]
-        return min(self.bounds(section, rho, duals, cases))
+        return min(self.bounds(section, rho, duals, range(len(duals))))
 
     def bounds(
         self, section: Section, rho: float, duals: list[SphereSolution], cases: Sequence[int]
@@ -356,8 +346,14 @@ def sphere_program(
     """
     n, count = field.n, len(field.nonlinear_states if nonlinear is None else nonlinear)
     half = max(2, (field.degree + 2) // 2)
+    if half > 2 or count in (0, n) or not reduced:
+        return _program(n, n, half, constant=False)
+    return _program(n, count, half, constant=constant)
+
+
+@lru_cache(maxsize=16)
+def _program(n: int, nonlinear: int, half: int, *, constant: bool) -> SphereProgram | LineProgram:
     if n == 1:
         return LineProgram(half=half)
-    if half > 2 or count in (0, n) or not reduced:
-        return SphereProgram(n, half=half)
-    return SphereProgram(n, tuple(range(n - count, n)), constant=constant)
+    last = None if nonlinear == n else tuple(range(n - nonlinear, n))
+    return SphereProgram(n, last, half, constant)

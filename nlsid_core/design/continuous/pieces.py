@@ -6,9 +6,8 @@ which no proof is found is halved, with a new L-step in its middle. `witnesses` 
 for the kernel, which decides.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import groupby
 
 import numpy as np
 
@@ -56,33 +55,46 @@ class Proved:
     margins: FloatArray
     unproved: tuple[Part, ...]
 
+    def on(self, intervals: Collection[int]) -> "Proved":
+        """The pieces of these intervals that are proved from end to end."""
+        left = set(intervals) - {part.interval for part in self.unproved}
+        chosen = np.flatnonzero(np.isin(self.pieces.interval, list(left)))
+        return Proved(self.pieces.select(chosen), self.margins[chosen], ())
+
 
 def prove_pieces(
     steps: LSteps,
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     ends: list[Ends] | None = None,
+    *,
+    kept: Proved | None = None,
+    most: int = MAX_LEVEL,
 ) -> Proved:
     """A proof for all time, or parts on which there is none.
 
-    ends: L-steps at the ends of the intervals, where they are at hand.
+    ends: L-steps at the ends of the intervals, where they are at hand. kept: pieces that are proved
+    already; other intervals are halved `most` times at most.
     """
     known: dict[tuple[int, float], list[SphereSolution]] = {}
     for k, pair in enumerate(ends or []):
         known[k, 0.0], known[k, 1.0] = pair.start, pair.end
-    waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1)]
     done: list[tuple[Pieces, FloatArray]] = []
+    over: set[int] = set()
+    if kept is not None and len(kept.pieces):
+        done = [(replace(kept.pieces, kappa=steps.kappa), kept.margins)]
+        over = set(kept.pieces.interval.tolist())
+    waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1) if k not in over]
     unproved: list[Part] = []
     while waiting:
-        unproved += [p for p in waiting if not _solved(steps, policy, funnel, p, known)]
-        if unproved:  # the rest is not worth a program
+        solved = [_solved(steps, policy, funnel, part, known) for part in waiting]
+        unproved += [part for part, good in zip(waiting, solved, strict=True) if not good]
+        waiting = [part for part, good in zip(waiting, solved, strict=True) if good]
+        if not waiting:
             break
-        waiting.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
-        alike = groupby(waiting, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
-        pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
-        pieces = rounded(pieces)
+        pieces = rounded(_pieces(steps, policy, funnel, waiting, known))
         margins = np.full(len(pieces), np.nan)
-        for chosen in batches(steps.field, funnel, pieces):
+        for chosen in batches(pieces):
             margins[chosen] = piece_margins(steps.field, policy, funnel, pieces.select(chosen))
         by_part = np.asarray(np.isfinite(margins).reshape(len(waiting), -1).all(axis=1))
         keep = np.repeat(by_part, steps.cases)
@@ -90,8 +102,8 @@ def prove_pieces(
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
         failed = [part for part, good in zip(waiting, by_part.tolist(), strict=True) if not good]
-        unproved += [part for part in failed if part.level == MAX_LEVEL]
-        waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
+        unproved += [part for part in failed if part.level == most]
+        waiting = [half for part in failed if part.level < most for half in part.halves()]
     return Proved(*_joined(steps, done), unproved=tuple(unproved))
 
 
@@ -109,8 +121,9 @@ def _solved(
         rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
         if (k, s) not in known:
             section = section_at(steps, policy, funnel.P, k, s)
+            near = next((known[k, end] for end in part.ends() if (k, end) in known), None)
             try:
-                known[k, s] = steps.solve(section, rho)
+                known[k, s] = steps.solve(section, rho, near)
             except SolverError:
                 return False
         growth = (funnel.rho[k + 1] - funnel.rho[k]) / h / rho
@@ -336,7 +349,7 @@ def proof_of(
     pieces, n = proved.pieces, funnel.n
     margin = stated_margin(proved.margins)
     written: list[Json] = [{}] * len(pieces)
-    for chosen in batches(steps.field, funnel, pieces):
+    for chosen in batches(pieces):
         found = documents(steps.field, policy, funnel, pieces.select(chosen), margin)
         for i, document in zip(chosen.tolist(), found, strict=True):
             written[i] = document

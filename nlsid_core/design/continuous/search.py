@@ -25,13 +25,15 @@ from nlsid_core.design.continuous.held_sweep import (
 )
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import Ends, Wanted
+from nlsid_core.design.continuous.sweep import Again, Wanted
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
 
-LARGER, ROUNDS = 16.0, 4  # times the margin where a piece is not proved, so many times
+LARGER = 16.0  # times the margin where a piece is not proved
+LEVELS = (0, 1, 2, 3, 4)  # how often an interval is halved for its proof, before its margin grows
+LEVELS_OF_MODES = (4, 4, 4)  # of the same: to sweep again takes longer than halves do
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 
@@ -155,33 +157,38 @@ def expected(setting: Setting, progress: Progress) -> FloatArray:
 
 
 def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
-    """ρ by the backward sweep, and its proof; with larger margins where there is none."""
-    times = np.ones(len(setting.P) - 1)
-    for _ in range(ROUNDS):
-        made, rho, ends = swept(setting, replace(wanted, times=times), progress)
-        try:
-            return proved(made, rho, ends, wanted.margin)
-        except Unproved as error:
-            refusal = error
-            times = np.where(error.intervals, LARGER * times, times)
-    raise refusal
+    """ρ by the backward sweep, and its proof; with larger margins where there is none.
 
-
-def proved(setting: Setting, rho: FloatArray, ends: list[Ends] | None, margin: float) -> Found:
-    """The funnel with this ρ and its proof; Unproved if there is none on some part of time.
-
-    ends: the L-steps at the knots, if they are at hand. margin: what was left in these, in 1/s.
+    What is proved stays as long as its interval does.
     """
-    steps, policy = setting.steps, setting.policy
-    digest = files.digest(policy.document())
-    funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
-    refuse_unmonitorable(funnel)
-    shown = prove_pieces(steps, policy, funnel, ends)
-    if shown.unproved:
-        raise Unproved(
+    intervals = range(len(setting.P) - 1)
+    times, again, kept = np.ones(len(intervals)), None, None
+    for most in LEVELS_OF_MODES if len(setting.policy.limits) else LEVELS:
+        try:
+            made = swept(setting, replace(wanted, times=times), progress, again=again)
+            last = False
+        except NoFunnel:
+            if kept is None:
+                raise
+            most, last = LEVELS[-1], True  # no larger margin: smaller parts have to do
+        if again is not None and kept is not None:
+            kept = kept.on([k for k in intervals if made.ends[k] is again.ends[k]])
+        steps, policy = made.setting.steps, made.setting.policy
+        digest = files.digest(policy.document())
+        funnel = ContinuousFunnel(policy.x, setting.P, made.rho, policy.vector_field, digest)
+        refuse_unmonitorable(funnel)
+        shown = prove_pieces(steps, policy, funnel, made.ends, kept=kept, most=most)
+        if not shown.unproved:
+            return Found(made.setting, funnel, shown, wanted.margin)
+        left = np.isin(intervals, [part.interval for part in shown.unproved])
+        refusal = Unproved(
             f"no proof from {unsolved(policy, shown.unproved)} although the L-steps at its "
             "knots hold: try more knots there",
-            float(policy.t[shown.unproved[-1].interval]),
-            np.isin(np.arange(len(policy.t) - 1), [part.interval for part in shown.unproved]),
+            float(policy.t[int(np.flatnonzero(left)[-1])]),
+            left,
         )
-    return Found(setting, funnel, shown, margin)
+        if last:
+            break
+        kept, times = shown, np.where(left, LARGER * times, times)
+        again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
+    raise refusal

@@ -7,6 +7,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -58,28 +59,36 @@ class Ends:
     end: list[SphereSolution]
 
 
+class Again(NamedTuple):
+    """ρ (K,) and L-steps of a sweep that is made again from interval `last` backward."""
+
+    rho: FloatArray
+    ends: list[Ends]
+    last: int
+
+
 def sweep_rho(
     steps: LSteps,
     instants: Sequence[Sequence[Section]],
     wanted: Wanted,
     progress: Progress = silent,
+    again: Again | None = None,
 ) -> tuple[FloatArray, list[Ends]]:
     """ρ (K,) and the L-steps at both ends of every interval.
 
     instants: per interval its start, its end and, between them, others where ρ has to hold too.
     Raises Infeasible naming the time.
     """
-    rho = np.empty(len(instants) + 1)
-    rho[-1] = wanted.final
-    ends: list[Ends] = []
-    duals: list[SphereSolution] | None = None
-    for k in range(len(instants) - 1, -1, -1):
+    count = len(instants)
+    rho, ends, last = np.full(count + 1, wanted.final), {}, count - 1
+    if again is not None:
+        rho, ends, last = again.rho.copy(), dict(enumerate(again.ends)), again.last
+    for k in range(last, -1, -1):
         after, cap = float(rho[k + 1]), wanted.cap(k)
-        rho[k], found = largest_before(steps, instants[k], after, cap, wanted.on(k), duals)
-        ends.append(found)
-        duals = found.start
-        progress(f"rho at {instants[k][0].t:.3g} s", 1 - k / len(instants))
-    return rho, ends[::-1]
+        duals = ends[k + 1].start if k + 1 < count else None
+        rho[k], ends[k] = largest_before(steps, instants[k], after, cap, wanted.on(k), duals)
+        progress(f"rho at {instants[k][0].t:.3g} s", 1 - k / count)
+    return rho, [ends[k] for k in range(count)]
 
 
 def largest_before(
@@ -103,8 +112,7 @@ def largest_before(
     near = None
     if duals is not None and not wanted.expected and not len(steps.limits):
         near = duals
-        phi = steps.predicted(end, after, duals)
-        cap = first.bound(duals, min(cap, first.allowed(phi)))
+        cap = estimated_before(steps, instants, after, cap, wanted, duals)
     at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + wanted.margin)
     phi = min(s.m for s in at_end)
     cap = min(cap, first.allowed(phi))
@@ -117,6 +125,22 @@ def largest_before(
         cap, _ = inner.largest(cap, at_end)
     rho, at_start = first.largest(cap, near or at_end)
     return rho, Ends(at_start, at_end)
+
+
+def estimated_before(
+    steps: LSteps,
+    instants: Sequence[Section],
+    after: float,
+    cap: float,
+    wanted: Wanted,
+    duals: list[SphereSolution],
+) -> float:
+    """The ρ ≤ cap that `largest_before` may find, by bounds of these dual solutions alone."""
+    start, end = instants[0], instants[-1]
+    steps.bound_pushes(end, after)
+    first = _Instant(steps, start, 0.0, after, end.t - start.t, wanted)
+    cap = min(cap, first.allowed(steps.predicted(end, after, duals)))
+    return first.bound(duals, cap)
 
 
 @dataclass(frozen=True, eq=False)

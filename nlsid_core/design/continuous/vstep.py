@@ -185,7 +185,7 @@ def _at_points(basis: bytes, n: int) -> tuple[FloatArray, FloatArray]:
         return np.column_stack([degree - powers.sum(axis=1), powers])
 
     squared = filled(np.frombuffer(basis, dtype=np.int64).reshape(-1, n), DEGREE // 2)
-    points = unisolvent_points(squared, DEGREE // 2)
+    points = unisolvent_points(squared)
     V = np.linalg.qr(monomial_values(squared, points))[0] * np.sqrt(len(points))
     powers = np.concatenate([monomials_of(n, q) for q in range(DEGREE + 1)])
     return V, monomial_values(filled(powers, DEGREE), points)
