@@ -11,8 +11,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_583,
-    ("bags",): 12_027,
+    ("nlsid_core",): 18_592,
+    ("bags",): 12_031,
     ("nlsid_ros",): 2_664,
     ("tests",): 23_001,
     ("benchmarks", "examples"): 3_805,
