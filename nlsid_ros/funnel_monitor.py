@@ -13,6 +13,7 @@ judged inside, and ~/alarm, whether there was one that was not since ~/restart.
 What is outside, or violates the assumption, stays so until `~/restart`, which begins a new run.
 """
 
+import gc
 import math
 from collections import deque
 from collections.abc import Iterable
@@ -192,6 +193,7 @@ class FunnelMonitor(ManagedNode):
             self.get_logger().warning("no forecasts: they are of tubes around a simulation")
         self._begin()
         self._look()
+        gc.freeze()  # a collection that looks through a design and its proof stops it for 0.1 s
 
     def _forget(self) -> None:
         """Whatever the next messages are compared with."""

@@ -13,7 +13,7 @@ from tests.house.sources import sources
 STATEMENTS = {
     ("nlsid_core",): 18_583,
     ("bags",): 12_027,
-    ("nlsid_ros",): 2_662,
+    ("nlsid_ros",): 2_664,
     ("tests",): 23_001,
     ("benchmarks", "examples"): 3_805,
 }
