@@ -33,7 +33,7 @@ from nlsid_core.progress import Progress
 
 LARGER = 16.0  # times the margin where a piece is not proved
 LEVELS = (0, 1, 2, 3, 4)  # how often an interval is halved for its proof, before its margin grows
-LEVELS_OF_MODES = (4, 4, 4)  # of the same: to sweep again takes longer than halves do
+LEVELS_OF_CASES = (4, 4, 4)  # of several cases: to sweep again takes longer than halves do
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 
@@ -163,7 +163,7 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
     """
     intervals = range(len(setting.P) - 1)
     times, again, kept = np.ones(len(intervals)), None, None
-    for most in LEVELS_OF_MODES if len(setting.policy.limits) else LEVELS:
+    for most in LEVELS if setting.steps.cases == 1 else LEVELS_OF_CASES:
         try:
             made = swept(setting, replace(wanted, times=times), progress, again=again)
             last = False
