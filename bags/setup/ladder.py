@@ -31,7 +31,7 @@ STEPS = 6  # of a search while it is one of many
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
 EVERY = 100  # least squares is quick
 DROPPED = 1.1  # times the best: what is worse on the first fold is not judged on the others
-LEAP = 0.25  # of the error before: where a network leaves less, no others are tried
+LEAP = 0.25  # of the error before: where filters or a follower leave less, no others are tried
 MOST_FILTERED = 6  # states of filters: as many as lags of the best by least squares, or fewer
 SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
 ENOUGH = 5.0  # % of the spread, below which nothing more curved is tried
@@ -121,16 +121,16 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
 
     Until one of them explains most; else a loop through a map, which takes longest.
     """
-    before = least(rows)
-    if signals_of(data)[0] > 1 or before is None or before.percent < ENOUGH:
+    before = min((row.percent for row in rows), default=math.inf)
+    if signals_of(data)[0] > 1 or not ENOUGH <= before < math.inf:
         return
-    found, certified = before, Sem(STEPS, certified=True)
+    certified = Sem(STEPS, certified=True)
     for structure in _structures(data, rows):
-        yield Attempt(Network(structure), certified)
-        found = least(rows) or found
-        if found.percent < LEAP * before.percent:
+        reached = min(row.percent for row in rows)
+        if reached < LEAP * before and not isinstance(structure, FilterMapFilter):
             return
-    if found.percent > SWINGS:
+        yield Attempt(Network(structure), certified)
+    if min(row.percent for row in rows) > SWINGS:
         yield Attempt(Network(Feedback(2, stages=2, imitated=20)), certified)
 
 
