@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_592,
     ("bags",): 12_031,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_001,
+    ("tests",): 23_002,
     ("benchmarks", "examples"): 3_805,
 }
 ARGUMENTS, FIELDS = 6, 8
