@@ -199,7 +199,7 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
         for goal in (widths, P, skewed, Goal(np.zeros(2), P))
     ]
     for rho in found[1:]:
-        assert rho == pytest.approx(found[0], rel=1e-8), "to what the solver is asked for"
+        assert rho == pytest.approx(found[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(

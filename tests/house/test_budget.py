@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_592,
+    ("nlsid_core",): 18_593,
     ("bags",): 12_031,
     ("nlsid_ros",): 2_664,
-    ("tests",): 23_002,
+    ("tests",): 23_001,
     ("benchmarks", "examples"): 3_805,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -142,13 +142,15 @@ def _expanded(
     assert expansion is not None  # as in `sweep_expanded`
     guess, after, cap = levels
     held = None if steps.widths is None else steps.widths[k]
+    # Of a held input the middle counts too: else few knots do, for a narrow funnel.
+    shares = (0.0, 1.0) if held is None else (0.0, 0.5, 1.0)
     # Of modes there is no estimate that is near enough.
     known = duals is not None and not len(steps.limits)
     box, looks, tries = (guess, LOOKS, TRIES) if known else (min(LARGER * guess, cap), 0, 2)
     while True:
         try:
             steps.local[k] = expansion.around(policy, P, k, (box, after), held)
-            instants = [section_at(steps, policy, P, k, s) for s in (0.0, 1.0)]
+            instants = [section_at(steps, policy, P, k, s) for s in shares]
             if looks and duals is not None:
                 most = min(LARGER * box, cap)
                 rho = estimated_before(steps, instants, after, most, wanted, duals)

@@ -32,7 +32,7 @@ from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
 
 LARGER = 16.0  # times the margin where a piece is not proved
-LEVELS = (0, 1, 2, 3, 4)  # how often an interval is halved for its proof, before its margin grows
+LEVELS = (1, 2, 3, 4)  # how often an interval is halved for its proof, before its margin grows
 LEVELS_OF_CASES = (4, 4, 4)  # of several cases: to sweep again takes longer than halves do
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it

@@ -250,8 +250,8 @@ def _wanted_goal(goal: Goal | ArrayLike, nominal: Nominal, n: int) -> Goal:
             f"the goal should be {n} half-widths, or an ellipsoid's ({n}, {n}) matrix; its "
             f"shape is {wanted.P.shape}"
         )
-    P = (wanted.P + wanted.P.T) / 2
-    skew = np.abs(wanted.P - P).max(initial=0.0)
+    P = np.tril(wanted.P) + np.tril(wanted.P, -1).T  # the other triangle differs by rounding
+    skew = np.abs(wanted.P - P).max(initial=0.0) / 2
     if not skew <= ASYMMETRY * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0:
         raise DataError("the goal's matrix should be symmetric positive definite")
     d = nominal.x.ends()[-1] - wanted.centre
