@@ -225,7 +225,7 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
         elif len(columns):
             back = int((np.diff(columns.stamp_ns) < 0).sum())
             if back:
-                yield Finding(Level.BAD, "clock", f"{topic}: stamps go back {back} times")
+                yield Finding(Level.BAD, "clock", f"{topic}: stamps that go back: {back}")
             relation = clock_relation(columns.stamp_ns, columns.log_ns)
             offsets[topic] = relation.offset
             level = Level.LOOK if relation.drift else Level.GOOD

@@ -385,6 +385,7 @@ class TubeRun:
             hidden = np.array([tube.hidden(largest, none) for tube in self._tubes])
             if self._linear is not None and self._carried is not None:
                 hidden = np.minimum(hidden, self._carried @ self._linear.rounded(largest))
+            hidden[np.isnan(hidden)] = math.inf  # of states near the largest float
             self._largest, self._hidden = largest.tolist(), hidden.tolist()
         own = [STEPS * UNIT * abs(each) for each in simulated]
         return [list(map(add, each, own)) for each in self._hidden]

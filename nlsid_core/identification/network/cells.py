@@ -23,7 +23,7 @@ from nlsid_core.identification.network.fit import Minimum, Problem, Scaled, mini
 from nlsid_core.identification.network.lowering import network_of
 from nlsid_core.identification.network.maps import DeadZone, Knotted, Limit, Limited, Top, rising
 from nlsid_core.identification.network.options import CellRow, Network
-from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Taps, Trial
+from nlsid_core.identification.network.signals import NONE, Mapped, Signal, Signals, Taps, Trial
 from nlsid_core.identification.trail import Task
 from nlsid_core.models import CellNetwork
 
@@ -36,7 +36,6 @@ STARTS, KEPT = 3, 2  # combinations of poles; minima that are refined
 START_SAMPLES, START_INTERVALS = 5000, 2
 START_STEPS = 40  # 20 stop far from minima: test error 12.4 % in place of 11.5 % on F1TENTH
 TOLERANCE = 1e-6
-NONE: IntArray = np.zeros(0, dtype=np.int64)
 LIMITS: dict[int, Limit] = {1: Top(), 2: DeadZone()}  # by how many numbers they have
 
 

@@ -19,12 +19,20 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible, ShapeError
 from nlsid_core.identification.fit import Step
-from nlsid_core.identification.network.cells import NONE, SMOOTHING, TOLERANCE
+from nlsid_core.identification.network.cells import SMOOTHING, TOLERANCE
 from nlsid_core.identification.network.fit import Minimum, Problem, Scaled, minimise, shortened
 from nlsid_core.identification.network.lowering import network_of
 from nlsid_core.identification.network.maps import Knotted, rising
 from nlsid_core.identification.network.options import Follower, Network
-from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Taps, Trial, delayed
+from nlsid_core.identification.network.signals import (
+    NONE,
+    Mapped,
+    Signal,
+    Signals,
+    Taps,
+    Trial,
+    delayed,
+)
 from nlsid_core.identification.trail import Task
 from nlsid_core.models import CellNetwork
 
@@ -130,8 +138,8 @@ def follower(
     refined = []
     for loop, found in sorted(tried, key=lambda entry: entry[1].rms)[:KEPT]:
         begun = [replace(t, start=loop.errors(found.parameters, t)[:2]) for t in trials]
-        steps_left = task.wanted("sem_certified").iterations
-        last = loop.fitted(found.parameters, begun, slowest, steps_left)
+        most = task.wanted("sem_certified").iterations
+        last = loop.fitted(found.parameters, begun, slowest, most)
         refined.append((loop, last))
         steps.append(Step("of all samples", scaled.y[1] * last.rms))
     loop, best = min(refined, key=lambda entry: entry[1].rms)

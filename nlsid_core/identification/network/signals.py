@@ -20,6 +20,7 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.identification.network.maps import Map, as_piecewise_linear
 
+NONE: IntArray = np.zeros(0, dtype=np.int64)  # taps without parameters
 DIVERGED = 1e3  # spreads of a signal, at which a loop's simulation is held
 
 
