@@ -175,7 +175,8 @@ class Excitation(ManagedNode):
             if self._still:
                 self._still -= 1
                 if not self._still:
-                    self._close_bag()
+                    self._say(f"repeat {self._repeat + 1}: closing the bag")
+                    self._ask("stop", self._on_bag_closed)
             return
         if lacking := self._command.lacking():
             self._fail(lacking)
@@ -271,10 +272,6 @@ class Excitation(ManagedNode):
         else:  # the next one goes on where this one ends
             self._next_repeat(self._start_ns + len(self._once) * round(self._period * 1e9))
 
-    def _close_bag(self) -> None:
-        self._say(f"repeat {self._repeat + 1}: closing the bag")
-        self._ask("stop", self._on_bag_closed)
-
     def _on_bag_closed(self, answer: Trigger.Response) -> None:
         if answer.success:
             self._next_repeat(None)
@@ -313,12 +310,15 @@ class Excitation(ManagedNode):
             return False, "it runs already"
         if lacking := self._command.lacking():
             return False, lacking
-        if not all(client.service_is_ready() for client in self._bags.values()):
+        if not self._has_recorder():
             return False, f"there is no recorder {self._recorder}; start it with at_once:=false"
         self._busy, self._failed, self._repeat = True, False, 0
         self._did = {}
         self._begin_repeat()
         return True, "running"
+
+    def _has_recorder(self) -> bool:
+        return all(client.service_is_ready() for client in self._bags.values())
 
     def _on_stop(self) -> tuple[bool, str]:
         said = "stopping" if self._busy else "nothing runs"
@@ -336,6 +336,8 @@ class Excitation(ManagedNode):
             "of": str(len(self._once)),
             "repeat": str(min(self._repeat + 1, self.values.repeats)),
         }
+        if self._recorder:
+            values["recorder"] = "ready" if self._has_recorder() else "not found"
         level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
         text = self._state
         if named := graph.rivals(self, self._publisher):

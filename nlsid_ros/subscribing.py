@@ -328,5 +328,4 @@ class Subscriptions:
 
 def _has_one_publisher(kind: str) -> bool:
     """Whether a topic is one robot's signal: stamped, and not of a kind that many nodes share."""
-    fields = message_class(kind).get_fields_and_field_types()
-    return "header" in fields and kind not in SHARED
+    return kind not in SHARED and "header" in message_class(kind).get_fields_and_field_types()

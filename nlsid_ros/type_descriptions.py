@@ -33,7 +33,7 @@ class TypeDescriptions:
         Raises BagError if no definition is to be had, or none that has this hash.
         """
         known = self._known(msgtype)
-        if known is not None and (known.type_hash == type_hash or not _is_stated(type_hash)):
+        if known is not None and (known.type_hash == type_hash or not type_hash.startswith(HASHED)):
             return known
         since, asked = self._asked.get((msgtype, type_hash), (time.monotonic(), None))
         if asked is None and self._client.service_is_ready():
@@ -56,10 +56,6 @@ class TypeDescriptions:
             return standard_definition(msgtype)
         except BagError:
             return None
-
-
-def _is_stated(type_hash: str) -> bool:
-    return type_hash.startswith(HASHED)
 
 
 def _described(

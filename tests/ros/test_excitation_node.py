@@ -248,7 +248,7 @@ def test_a_recorder_that_gives_no_bag_stops_the_experiment_before_it_moves(
         answer = bench.call("/excitation/start")
         assert "there is no recorder trajectory_recorder" in answer.message
         return
-    bench.spin_until(lambda: bench.node.count_clients(f"/{name}/start") == 1)
+    bench.spin_until(lambda: bench.said["excitation"][-1][1]["recorder"] == "ready")
     if recorder == "does not answer":
         process.send_signal(signal.SIGSTOP)
     bench.spin_until(lambda: bench.call("/excitation/start").success)
