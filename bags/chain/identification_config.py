@@ -170,10 +170,10 @@ def _values(
     section = create_model("section", __config__=ConfigDict(strict=True, extra="forbid"), **kinds)
     single = {key: [given[key]] for key in RANGES if _is_range(given.get(key))}
     try:
-        found = section.model_validate_json(json.dumps({**given, **single}, default=str))
+        found: Any = section.model_validate_json(json.dumps({**given, **single}, default=str))
     except ValidationError as error:
         raise _error(*(_said(details, hints) for details in error.errors())) from error
-    return found.model_dump(exclude_unset=True)
+    return dict(found.model_dump(exclude_unset=True))
 
 
 def _is_range(value: object) -> bool:
@@ -207,7 +207,7 @@ def _listed(known: Sequence[str]) -> str:
 
 def _error(*wrong: Wrong) -> ValidationError:
     details = [
-        InitErrorDetails(type=PydanticCustomError("option", said), loc=where, input=found)  # type: ignore[arg-type]
+        InitErrorDetails(type=PydanticCustomError("option", said), loc=where, input=found)
         for where, found, said in wrong
     ]
     return ValidationError.from_exception_data("identification", details)

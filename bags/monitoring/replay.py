@@ -164,8 +164,7 @@ class Replay:
     @property
     def said_filled(self) -> str:
         """The same in words, of how many; empty if there is none."""
-        count = sum(not reading.waits for reading in self.readings)
-        return said_filled(self.filled, count)
+        return said_filled(self.filled, sum(not reading.waits for reading in self.readings))
 
     @property
     def said_wide(self) -> str:
@@ -407,8 +406,7 @@ def announced_runs(
 ) -> list[Run]:
     """The runs of this funnel that a controller announced in `bag`, in the order it did."""
     with Bag(bag, definitions=definitions) as source:
-        messages = source.messages(_run_topics(source))
-        found = [_run(message, source) for message in messages]
+        found = [_run(message, source) for message in source.messages(_run_topics(source))]
     digest = design.digest
     return [run for run in found if run.funnel == digest and not run.ended]
 

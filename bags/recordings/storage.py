@@ -249,8 +249,7 @@ class Storage:
         def translate(data: bytes) -> bytes:
             for padding in range(MOST_PADDING + 1):
                 try:
-                    there = data[: len(data) - padding]
-                    return bytes(types.ros1_to_cdr(there, channel.msgtype))
+                    return bytes(types.ros1_to_cdr(data[: len(data) - padding], channel.msgtype))
                 except Exception as error:  # generated code raises what the bytes make it raise
                     reason = f"{type(error).__name__}: {str(error)[:200]}"
             raise BagError(f"not a '{channel.msgtype}' of ROS 1: {reason}")

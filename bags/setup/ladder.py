@@ -56,8 +56,7 @@ def choose(
             if all(row.attempt != attempt for row in seen):
                 progress(str(attempt), number / len(stages))
                 seen.append(held_out.glance(attempt))
-        glances = seen[begun:]
-        for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
+        for place, row in enumerate(sorted(seen[begun:], key=lambda row: row.percent)):
             best = least(rows)
             limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
