@@ -423,7 +423,7 @@ def _fed(
     digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
-        clock.start_ns = source.storage.start_ns
+        clock.start_ns = source.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
         doubt = _doubt(watch.pairing, source)
