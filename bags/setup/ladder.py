@@ -69,6 +69,14 @@ def choose(
     return Choice(held_out, tuple(rows))
 
 
+def tried(train: Dataset, stages: "Stages", *, progress: Progress) -> Choice | None:
+    """Everything that was tried for these trials; None if they are too few to hold some out."""
+    try:
+        return choose(HeldOut.of(train), stages, progress=progress)
+    except DataError:
+        return None
+
+
 def least(rows: Iterable[Row]) -> Row | None:
     """The row with the least error, if one has an error."""
     return min((row for row in rows if not row.refusal), key=lambda row: row.percent, default=None)
