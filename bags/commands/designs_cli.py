@@ -16,6 +16,7 @@ from bags.commands.options import (
     DesignArgument,
     Sharing,
     SomeBagsArgument,
+    VerboseOption,
     Wired,
     config_of,
     out,
@@ -29,6 +30,7 @@ from nlsid_core.errors import CertificateRejected, DocumentError
 if TYPE_CHECKING:
     from bags.chain.config import Config
     from bags.fleet.workers import Workers
+    from nlsid_core.design import OutputTubeDesign
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Given:
         list[Path] | None,
         typer.Option(help="Bind the funnels of these folders, in the order of time; repeat."),
     ] = None
+    verbose: VerboseOption = False
 
 
 def funnel(
@@ -113,7 +116,7 @@ def _proof_in(path: Path) -> Path:
     return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
-def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> None:
+def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> OutputTubeDesign:
     """Design a tube around the model in a folder, and what it catches.
 
     false_alarms: in place of what the settings say, None for that.
@@ -131,15 +134,15 @@ def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> N
         progress("sabotaging the test trials", 0.7)
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
-    out.print(show.funnel_table(design))
+    show.say_tube(out, design)
     written = [folder / name for name in design.documents()]
     if catching is None:
         out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
     else:
         tables.say_catching(out, catching)
         written += write_catching(folder, catching)
-    for path in written:
-        out.print(f"wrote {path}", soft_wrap=True)
+    show.say_written(out, written)
+    return design
 
 
 def _around_trajectory(

@@ -11,7 +11,14 @@ from typing import Annotated
 import typer
 
 from bags.commands import designs_cli, models_cli
-from bags.commands.options import CONFIG, BagsArgument, DefinitionsOption, Signals, out
+from bags.commands.options import (
+    CONFIG,
+    BagsArgument,
+    DefinitionsOption,
+    Signals,
+    VerboseOption,
+    out,
+)
 from nlsid_core import deciding
 from nlsid_core.errors import DataError
 
@@ -21,6 +28,7 @@ def learn(
     signals: Signals,
     folder: Annotated[Path, typer.Option("--out", help="The design's folder.")] = Path("design"),
     definitions: DefinitionsOption = None,
+    _verbose: VerboseOption = False,
 ) -> None:
     """Make a checked design from bags: init, identify, funnel, check and report, asking nothing.
 

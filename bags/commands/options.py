@@ -28,6 +28,7 @@ CONFIG = "robot.yaml"  # of a design's folder
 
 out = Console()
 err = Console(stderr=True)
+details = Console(quiet=True)  # the numbers behind a sentence; --verbose shows them
 
 
 class Clock(StrEnum):
@@ -68,6 +69,18 @@ DefinitionsOption = Annotated[
         "--definitions",
         help="PACKAGE/msg/Type.msg, .idl, .srv, .action, or folders of packages: types that the "
         "bags do not define.",
+    ),
+]
+
+
+def _show_details(wanted: bool) -> None:
+    details.quiet = not wanted
+
+
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", callback=_show_details, help="Print the numbers behind each sentence too."
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]

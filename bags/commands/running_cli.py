@@ -19,6 +19,7 @@ from bags.commands.options import (
     DefinitionsOption,
     DesignArgument,
     JsonOption,
+    VerboseOption,
     Wired,
     err,
     out,
@@ -184,6 +185,7 @@ def demo(
             "simulated in MuJoCo (extra `sim`), or the YAML of another that is."
         ),
     ] = "f1tenth",
+    _verbose: VerboseOption = False,
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there.
 
