@@ -50,7 +50,7 @@ class Wiring:
     period: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Design(Generic[D, P, F, S]):
     """A model, a policy and a funnel that belong together, with their proof.
 
@@ -85,6 +85,10 @@ class Design(Generic[D, P, F, S]):
 
     def __str__(self) -> str:
         return str(self.verdict) if self.found is None else f"{self.verdict}\n{self.found}"
+
+    def __repr__(self) -> str:
+        said = "not decided" if self.decision is None else self.decision.statement
+        return f"<Design of {self.name}: {said}>"
 
     @property
     def verdict(self) -> Verdict:

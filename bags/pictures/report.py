@@ -96,7 +96,8 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 
     chosen, test = fit.chosen, parts["test"]
     outputs = range(test.trajectories[0].y.shape[1])
-    simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
+    drawn = {c.method.title: c.model for c in (*fit.candidates[:1], chosen)}
+    simulated = "".join(plots.svg(model_plots.simulations(test, drawn, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     listed = "".join(_recordings(data, use) for use, data in parts.items())
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())

@@ -11,6 +11,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
+from nlsid_core.models.difference_equation import DifferenceEquation
 
 M = TypeVar("M", bound=Model, covariant=True)
 
@@ -99,7 +100,7 @@ class History:
         return f"{self.value} {first.value:.4g} -> {last.value:.4g} in {len(self.steps)} steps"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
@@ -154,4 +155,8 @@ class Fit(Generic[M]):
             state = stated_rate(c.proof, c.model.period) if c.proof else c.unproved
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
-        return "\n".join([str(self.model), str(self.history), self.slowest, header, *rows])
+        equation = [self.model.equation] if isinstance(self.model, DifferenceEquation) else []
+        found = [str(self.model), *equation, str(self.history), self.slowest]
+        return "\n".join([*found, header, *rows])
+
+    __repr__ = __str__

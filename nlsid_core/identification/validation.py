@@ -7,11 +7,11 @@ ones, in standard deviations, is held against the quantile that all of them exce
 Source: Bartlett 1946; Ljung, System Identification, Section 16.6.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.signal import correlate, lfilter
 from scipy.stats import chi2, norm
 
 from nlsid_core.arrays import FloatArray
@@ -26,7 +26,7 @@ from nlsid_core.identification.prediction import (
     simulate_trial,
     simulate_trials,
 )
-from nlsid_core.models import StateAffineModel
+from nlsid_core.models import DifferenceEquation, StateAffineModel
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
@@ -309,3 +309,29 @@ def cross_correlation(
             product = _correlation(e, e, horizon) * _correlation(u, u, horizon)
             variances[i, j] = max(float(product.sum()), 1.0)
     return cross, np.sqrt(variances / N)
+
+
+def compare(data: Dataset, models: Mapping[str, Model]) -> dict[str, float]:
+    """Simulate models on the same trials: the error of each in %, 100·‖y - ŷ‖/‖y - mean(y)‖."""
+    return {name: simulation_percent(model, data) for name, model in models.items()}
+
+
+def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
+    """Give the standard errors (2n+2,) of a, b and c, in this order, by trials they were fitted to.
+
+    They are right where the simulation's errors are white; `validate` says whether they are.
+    J = ∂ŷ/∂(a, b, c) is the row of the equation through the filter 1/(1 - Σ a_k z⁻ᵏ), and the
+    covariance σ² (J'J)⁻¹. Source: Ljung, System Identification, Section 9.3, of an output error.
+    """
+    n = len(model)
+    jacobian, errors = [], []
+    for trial in data:
+        simulated, u = simulate_trial(model, trial)[:, 0], trial.u[:, 0]
+        past = [simulated[n - k : len(u) - k] for k in range(1, n + 1)]
+        driven = [u[n - j : len(u) - j] for j in range(n + 1)]
+        rows = np.column_stack([*past, *driven, np.ones(len(u) - n)])
+        jacobian.append(lfilter([1.0], np.append(1.0, -model.a), rows, axis=0))
+        errors.append((trial.y[:, 0] - simulated)[n:])
+    J, e = np.concatenate(jacobian), np.concatenate(errors)
+    variance = e @ e / (len(e) - J.shape[1])
+    return np.asarray(np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J))))

@@ -1,6 +1,7 @@
 """`DifferenceEquation`: a linear model with one input and one output."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,22 @@ class DifferenceEquation(Recorded):
         """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n."""
         return np.roots(np.concatenate([[1.0], -self.a])).astype(np.complex128)
 
+    @property
+    def equation(self) -> str:
+        """The equation with its numbers, in four digits."""
+        past = [f"{a:+.4g} y(t-{k})" for k, a in enumerate(self.a.tolist(), 1)]
+        driven = [f"{b:+.4g} u(t-{j})" for j, b in enumerate(self.b.tolist())]
+        return f"y(t) = {' '.join((*past, *driven))} {self.c:+.4g}".replace("(t-0)", "(t)")
+
+    def to_control(self) -> Any:
+        """Give the same as a discrete TransferFunction of python-control: steps, Bode, margins.
+
+        The constant c is in the output's offset, and no part of it. Source: (4.1).
+        """
+        import control
+
+        return control.TransferFunction(self.b, np.append(1.0, -self.a), self.period)
+
     # Observer form, the state of every later proof: x_i is the part of y(t+i-1) that is already
     # determined before sample t. With ŷ = x₁ + b₀u + c,
     #   x⁺ = a ŷ + shift(x) + b₁..ₙ u = A x + B u + f,   y = C x + D u + c.
@@ -106,10 +123,13 @@ class DifferenceEquation(Recorded):
 
         The first n outputs are y_start itself.
         """
-        inputs, start = np.asarray(u, dtype=np.float64), np.asarray(y_start, dtype=np.float64)
+        columns = (np.squeeze(np.asarray(each, dtype=np.float64)) for each in (u, y_start))
+        inputs, start = map(np.atleast_1d, columns)
         n = len(self)
         if inputs.ndim != 1 or len(inputs) < n or start.shape != (n,):
-            raise ShapeError(f"u should be (N,), N >= {n}, y_start ({n},)")
+            raise ShapeError(
+                f"u should be (N,), N >= {n}, y_start ({n},): {inputs.shape}, {start.shape}"
+            )
         forcing = np.convolve(inputs, self.b)[n : len(inputs)] + self.c
         outputs = np.concatenate([start, forcing])
         backwards = self.a[::-1]
