@@ -87,8 +87,7 @@ class Design(Generic[D, P, F, S]):
         return str(self.verdict) if self.found is None else f"{self.verdict}\n{self.found}"
 
     def __repr__(self) -> str:
-        said = "not decided" if self.decision is None else self.decision.statement
-        return f"<Design of {self.name}: {said}>"
+        return f"<Design of {self.name}: {getattr(self.decision, 'statement', 'not decided')}>"
 
     @property
     def verdict(self) -> Verdict:

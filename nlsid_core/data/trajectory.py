@@ -170,24 +170,31 @@ class Dataset:
             t = table.index.to_numpy()
             if t.dtype.kind == "M":
                 t = (t - t[0]) / np.timedelta64(1, "s")
-            signals = {"y": table[list(y)], "u": table[list(u)]}
-            trials.append(Trajectory(t=t, **signals, y_names=tuple(y), u_names=tuple(u), name=name))
+            trials.append(
+                Trajectory(
+                    t=t,
+                    y=table[list(y)],
+                    u=table[list(u)],
+                    y_names=tuple(y),
+                    u_names=tuple(u),
+                    name=name,
+                )
+            )
         return cls(tuple(trials))
 
     def __repr__(self) -> str:
-        first, samples = self.trajectories[0], sum(map(len, self))
-        answers, drives = ", ".join(first.y_names), ", ".join(first.u_names)
-        trials = f"{len(self)} trial{'s' * (len(self) > 1)}"
-        return f"<Dataset: {trials}, {samples} samples of {self.period:g} s, {drives} -> {answers}>"
+        first = self.trajectories[0]
+        return (
+            f"<Dataset: {len(self)} trial{'s' * (len(self) > 1)}, {sum(map(len, self))} samples of "
+            f"{self.period:g} s, {', '.join(first.u_names)} -> {', '.join(first.y_names)}>"
+        )
 
     def _repr_html_(self) -> str:
         """The same, and the first trial's first excitation and response, each over its range."""
         first = self.trajectories[0]
-        lines = [
-            _svg_line(first.t, values, colour)
-            for values, colour in ((first.u[:, 0], "#9aa0a6"), (first.y[:, 0], "#1f6fb4"))
-        ]
-        drawn = f'<svg viewBox="0 0 600 100" width="600" height="100">{"".join(lines)}</svg>'
+        drives = _svg_line(first.t, first.u[:, 0], "#9aa0a6")
+        answers = _svg_line(first.t, first.y[:, 0], "#1f6fb4")
+        drawn = f'<svg viewBox="0 0 600 100" width="600" height="100">{drives}{answers}</svg>'
         return f"<div>{escape(repr(self))}<br>{drawn}</div>"
 
     def __len__(self) -> int:

@@ -20,7 +20,7 @@ from nlsid_core.identification.network.options import (
     Network,
 )
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
-from nlsid_core.identification.prediction import Model, predict, simulate_trial
+from nlsid_core.identification.prediction import Model, simulate_trial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.identification.repeats import compare_repeats
@@ -67,7 +67,6 @@ __all__ = [
     "describe",
     "identify",
     "methods_of",
-    "predict",
     "prove_implicit",
     "prove_stability",
     "simulate_trial",

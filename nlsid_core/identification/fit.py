@@ -70,10 +70,9 @@ class Candidate(Generic[M]):
         """What is said in the place of a proof."""
         return f"not proved: {self.remark}" if self.remark else "not proved"
 
-    def validate(self, dataset: Dataset, *, transient: int | None = None) -> Validation:
+    def validate(self, dataset: Dataset) -> Validation:
         """Simulation and prediction errors and the tests of the residuals over `dataset`."""
-        skipped = self.transient if transient is None else transient
-        return validate(self.model, dataset, transient=skipped)
+        return validate(self.model, dataset, transient=self.transient)
 
 
 @dataclass(frozen=True)
@@ -119,11 +118,6 @@ class Fit(Generic[M]):
         return next(c for c in self.candidates if c.method.name == method)
 
     @property
-    def methods(self) -> tuple[str, ...]:
-        """The names of the methods there is a candidate of."""
-        return tuple(candidate.method.name for candidate in self.candidates)
-
-    @property
     def chosen(self) -> Candidate[M]:
         """The candidate that was asked for."""
         return self[self.method.name]
@@ -156,7 +150,8 @@ class Fit(Generic[M]):
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
         equation = [self.model.equation] if isinstance(self.model, DifferenceEquation) else []
-        found = [str(self.model), *equation, str(self.history), self.slowest]
-        return "\n".join([*found, header, *rows])
+        return "\n".join(
+            [str(self.model), *equation, str(self.history), self.slowest, header, *rows]
+        )
 
     __repr__ = __str__

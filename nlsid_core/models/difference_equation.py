@@ -123,8 +123,7 @@ class DifferenceEquation(Recorded):
 
         The first n outputs are y_start itself.
         """
-        columns = (np.squeeze(np.asarray(each, dtype=np.float64)) for each in (u, y_start))
-        inputs, start = map(np.atleast_1d, columns)
+        inputs, start = (np.atleast_1d(np.squeeze(np.array(x, float))) for x in (u, y_start))
         n = len(self)
         if inputs.ndim != 1 or len(inputs) < n or start.shape != (n,):
             raise ShapeError(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid import compare, identify, standard_errors
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import Fit, Polynomial
@@ -42,11 +42,6 @@ def test_data_frames_are_trials(train: Dataset) -> None:
         Dataset.from_pandas(tables["run_0"].drop(index=tables["run_0"].index[3]), y=["speed"], u=[])
     with pytest.raises(DataError, match=r"DataFrame.*from_pandas"):
         identify(tables["run_0"], Polynomial(2))
-
-
-def test_signals_are_given_by_name() -> None:
-    with pytest.raises(TypeError):
-        Trajectory([0.0, 1.0], [1.0, 2.0], [3.0, 4.0])  # type: ignore[misc]
 
 
 def test_a_trials_own_columns_are_simulated(train: Dataset, fit: Fit[DifferenceEquation]) -> None:
