@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from bags.designs.documents import load
-    from bags.pictures.model_plots import simulations as plot
+    from bags.pictures.notebook import plot, to_control
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
     from bags.signals.sampling import Grid
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
         identify,
         standard_errors,
     )
-    from nlsid_core.models import Signal
     from nlsid_core.proofs import check
     from nlsid_core.running.monitor import Monitor
     from nlsid_core.running.reading import Status
@@ -75,7 +74,6 @@ __all__ = [
     "Rse",
     "SampledTracking",
     "Sem",
-    "Signal",
     "Status",
     "Trajectory",
     "VectorField",
@@ -93,6 +91,7 @@ __all__ = [
     "read_bags",
     "standard_errors",
     "taylor_field",
+    "to_control",
 ]
 
 _FAMILIES: Final = (
@@ -108,13 +107,12 @@ _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
 _MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
 _HOMES: Final = {
-    "bags.pictures.model_plots": ("plot",),
+    "bags.pictures.notebook": ("plot", "to_control"),
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),
     "bags.tools.tables": ("frame",),
     "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
-    "nlsid_core.models": ("Signal",),
     "nlsid_core.identification": (
         "identify",
         "Fit",
@@ -133,7 +131,7 @@ _HOMES: Final = {
     "nlsid_core.running.reading": ("Status",),
     "nlsid_core.errors": ("NlsidError",),
 }
-_CALLED_THERE: Final = {"read_bags": "read_dataset", "plot": "simulations"}
+_CALLED_THERE: Final = {"read_bags": "read_dataset"}
 _HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
 
 

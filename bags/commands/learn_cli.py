@@ -32,8 +32,8 @@ def learn(
 ) -> None:
     """Make a checked design from bags: init, identify, funnel, check and report, asking nothing.
 
-    The configuration that it uses is written beside, robot.yaml. Where a person has to decide, it
-    ends with the reason, status 2; status 1 if nothing can be identified from these bags.
+    The configuration that it uses is written too: robot.yaml. Where a person has to decide, it
+    ends with the reason and status 2. Status 1: nothing can be identified from these bags.
     """
     from bags.chain.config import load_config
     from bags.recordings.folders import expand_bags

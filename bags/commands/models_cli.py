@@ -40,15 +40,15 @@ def init(
     bags: BagsArgument,
     signals: Signals,
     definitions: DefinitionsOption = None,
-    robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
+    robot: Annotated[str, typer.Option(help="The robot's name.")] = "robot",
     yes: Annotated[
-        bool, typer.Option("--yes", help="Take the likeliest signals, and what seems wrong too.")
+        bool, typer.Option("--yes", help="Ask nothing: take the likeliest signals, doubts and all.")
     ] = False,
 ) -> None:
     """Write a first configuration from bags, DIR/robot.yaml: signals, period, split, model, tube.
 
-    It is tried on the bags, every key says why, and what later steps will meet is said first.
-    Status 1 if nothing can be identified from these bags.
+    It is tried on the bags, and every key says why it is as it is. What later steps will meet is
+    said first. Status 1 if nothing can be identified from these bags.
     """
     proposed(folder, bags, signals, definitions, robot=robot, yes=yes)
 
@@ -96,9 +96,10 @@ def identify(
 ) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html.
 
-    Of a configuration with a motion: a model of the measured state, and a policy for the motion.
-    Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
-    cannot be used is listed and left out, and the next run reads only what is new.
+    If the configuration has a motion, the model is of the measured state, and there is a policy
+    for the motion. Workers read the bags if these are in object storage, or with --workers or
+    --scheduler. A bag that cannot be used is then listed and left out. The next run reads only
+    what is new.
     """
     from bags.chain.config import load_config
     from bags.chain.tracking_config import is_tracking, load_tracking_config

@@ -13,7 +13,7 @@ LONGEST = 48  # characters of one value
 SPACE, HYPHEN = "\N{NO-BREAK SPACE}", "\N{NON-BREAKING HYPHEN}"
 THOUSANDS = 1e4  # numbers from here on have no digits behind the point
 FEWEST = 3  # figures that make keys with a common beginning a table
-RESULTS = Path(__file__).with_name("results.md")  # what a newcomer reads first
+RESULTS = Path(__file__).with_name("results.txt")  # what a newcomer reads first
 FIGURE = re.compile(r"\{\{(\w+) ([\w.]+) ([\w.]+)\}\}")
 
 

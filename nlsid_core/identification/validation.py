@@ -223,7 +223,7 @@ def _clipped_percent(model: Model, dataset: Dataset) -> float:
     return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
-def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
+def _percent(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
     spread = np.maximum(centred.std(axis=0), np.finfo(float).tiny)

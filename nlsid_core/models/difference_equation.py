@@ -1,7 +1,6 @@
 """`DifferenceEquation`: a linear model with one input and one output."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,15 +60,6 @@ class DifferenceEquation(Recorded):
         past = [f"{a:+.4g} y(t-{k})" for k, a in enumerate(self.a.tolist(), 1)]
         driven = [f"{b:+.4g} u(t-{j})" for j, b in enumerate(self.b.tolist())]
         return f"y(t) = {' '.join((*past, *driven))} {self.c:+.4g}".replace("(t-0)", "(t)")
-
-    def to_control(self) -> Any:
-        """Give the same as a discrete TransferFunction of python-control: steps, Bode, margins.
-
-        The constant c is in the output's offset, and no part of it. Source: (4.1).
-        """
-        import control
-
-        return control.TransferFunction(self.b, np.append(1.0, -self.a), self.period)
 
     # Observer form, the state of every later proof: x_i is the part of y(t+i-1) that is already
     # determined before sample t. With ŷ = x₁ + b₀u + c,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid import compare, identify, standard_errors
+from nlsid import compare, identify, standard_errors, to_control
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, ShapeError
@@ -65,7 +65,7 @@ def test_models_are_compared_on_the_same_trials(
 def test_python_control_steps_like_the_model(fit: Fit[DifferenceEquation]) -> None:
     control = pytest.importorskip("control")
     model = replace(fit.model, c=0.0)
-    stepped = control.step_response(model.to_control(), T=np.arange(50) * model.period)
+    stepped = control.step_response(to_control(model), T=np.arange(50) * model.period)
     inputs = np.concatenate([np.zeros(2), np.ones(50)])
     simulated = model.simulate(inputs, np.zeros(2))[2:]
     np.testing.assert_allclose(np.squeeze(stepped.outputs), simulated, atol=1e-9)
