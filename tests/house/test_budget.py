@@ -11,8 +11,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_594,
-    ("bags",): 11_932,
+    ("nlsid_core",): 18_590,
+    ("bags",): 11_914,
     ("nlsid_ros",): 2_662,
     ("tests",): 23_000,
     ("benchmarks", "examples"): 3_805,
