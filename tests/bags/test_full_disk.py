@@ -19,6 +19,7 @@ SCRIPT = f"""
 import resource, sys
 from bags.recordings.definitions import standard_definition
 from bags.recordings.writer import BagWriter
+from bags.signals.recording import Arrival, Recording
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
 recording = Recording(BagWriter(sys.argv[1], in_place=True), least_free=0.0)
