@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_590,
-    ("bags",): 12_029,
+    ("bags",): 12_031,
     ("nlsid_ros",): 2_663,
     ("tests",): 23_001,
     ("benchmarks", "examples"): 3_805,
