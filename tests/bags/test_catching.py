@@ -254,7 +254,7 @@ def test_the_picture_has_a_bar_for_every_fault_that_is_seen_and_every_detector(
     seen = [row for row in found.rows[1:] if row.fault != "5 samples lost"]
     assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in seen]
     assert len(caught.patches) == len(seen) * (1 + 3)
-    bars = zip(caught.patches, seen, strict=False)
+    bars: Any = zip(caught.patches, seen, strict=False)
     assert all(bar.get_width() == row.funnel.after for bar, row in bars)
 
 
