@@ -1,6 +1,7 @@
 """What a tube catches: every count, delay, share and warning against an independent computation."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
