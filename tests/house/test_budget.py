@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_590,
-    ("bags",): 11_914,
+    ("bags",): 11_916,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_955,
     ("benchmarks", "examples"): 3_805,
