@@ -228,8 +228,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     """
     table = Table(
         title="held against the funnel",
-        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
-        "assumed",
+        caption="margin: the worst; 1 in the middle of the tube, 0 on its edge. used: how much "
+        "of the assumption",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
