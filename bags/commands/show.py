@@ -44,10 +44,9 @@ UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their num
 
 def say_identified(console: Console, result: Identified) -> None:
     """What the model is worth in a sentence, every method, what to know, and the files."""
-    fit = result.fit
     say(console, worth(result))
-    console.print(tables.methods_table(fit, result.test))
-    for line in (str(fit.history), fit.slowest, *_residuals(result)):
+    console.print(tables.methods_table(result.fit, result.test))
+    for line in (str(result.fit.history), result.fit.slowest, *_residuals(result)):
         say(details, line)
     for line in notes(result):
         say(console, line)
@@ -106,10 +105,11 @@ def promise(design: OutputTubeDesign) -> str:
     )
     lasting = "for ever" if tube.samples is None else f"for {tube.samples} samples"
     measured, count = tube.measured, len(tube.measured.measured_on)
+    trials = f"{count}" if measured.rank == 1 else f"{count + 1 - measured.rank} of {count}"
     return (
         f"Proved: the measured {stays}{scaled} of the model's simulation, {lasting}. It holds "
         f"while the model's one-step errors are at most {measured.safety_factor:g} times as large "
-        f"as in {count + 1 - measured.rank} of {count} trials; the monitor watches that."
+        f"as in {trials} trials; the monitor watches that."
     )
 
 
@@ -227,8 +227,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     """
     table = Table(
         title="held against the funnel",
-        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
-        "assumed",
+        caption="margin: the worst; 1 in the middle of the tube, 0 on its edge. used: how much "
+        "of the assumption",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,

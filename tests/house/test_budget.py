@@ -11,7 +11,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_590,
+    ("nlsid_core",): 18_591,
     ("bags",): 11_916,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_955,
