@@ -30,13 +30,8 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
     """
     data, options = read_signals_of(bags, config), config.identification
     validation = data.select(options.validation)
-    fit = identify_states(
-        data.without(options.validation),
-        validation,
-        degrees=options.degrees,
-        refuse_above=options.refuse_above,
-        biased_without_repeats=options.biased_without_repeats,
-    )
+    train = data.without(options.validation)
+    fit = identify_states(train, validation, degrees=options.degrees)
     files.write_document(out / documents.MODEL, fit.model.document())
     if report_available():
         from bags.pictures import plots, tubes  # matplotlib only where something is drawn
@@ -69,8 +64,7 @@ def design_tracking_funnel(
         raise DataError("policy.json was made with other weights than this configuration's")
     recorded, factor = read_signals_of(runs, config), config.disturbance.safety_factor
     assumption = assume(model, policy, feedback, recorded, safety_factor=factor)
-    problem = SampledTracking(model, policy, feedback, assumption)
-    made = design(problem, progress=progress)
+    made = design(SampledTracking(model, policy, feedback, assumption), progress=progress)
     made.save(folder)
     return made
 
@@ -78,8 +72,7 @@ def design_tracking_funnel(
 def widest_start(made: TrackingDesign, runs: Dataset) -> float:
     """How far out of the inlet's boundary, 1, the runs started at most."""
     first = [trial.y[0] - made.policy.x[0] for trial in runs]
-    radius = float(made.funnel.inlet[0])
-    return max(made.funnel.norm(0, x_bar) / radius for x_bar in first)
+    return max(made.funnel.norm(0, x_bar) / float(made.funnel.inlet[0]) for x_bar in first)
 
 
 def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:

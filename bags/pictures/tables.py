@@ -11,7 +11,8 @@ from rich.table import Table
 from bags.monitoring.catching import Breaking, Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import duration, percent
-from nlsid_core.identification import Candidate, Fit, Model, stated_rate
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
+from nlsid_core.models import StateAffineModel
 
 STABILITY = "proved rate a sample (time constant)"
 PAGE_COLUMNS = 110  # of what a page shows as it is printed
@@ -52,6 +53,24 @@ def stability(candidate: Candidate[Model]) -> str:
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
+def stability_sentence(chosen: Candidate[Model]) -> str:
+    """What is proved of the model, and for which inputs."""
+    if chosen.proof is None:
+        why = f" ({chosen.remark})" if chosen.remark else ""
+        return f"It is NOT PROVED stable{why}: nothing that is built on it is certified."
+    inputs = "whatever these inputs are"
+    if isinstance(chosen.model, StateAffineModel):
+        low_high = ", ".join(f"[{low:g}, {high:g}]" for low, high in chosen.model.u_range)
+        beyond = "clipped to it" if chosen.model.on_out_of_range == "clip" else "refused"
+        inputs = f"for every input in {low_high}; others are {beyond}"
+    if chosen.proof.rate >= 1.0 and isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
+        inputs = "while these inputs keep them in the box of the proof"
+    how = f"at the rate {stated_rate(chosen.proof, chosen.model.period)} a sample or faster"
+    if chosen.proof.rate >= 1.0:
+        how = "at no rate that is stated"
+    return f"Proved: two of its runs under the same inputs approach each other {how}, {inputs}."
+
+
 def catching_table(catching: Catching) -> Table:
     """What the funnel and other detectors catch of every sabotage, and how soon."""
     detectors = list(catching.rows[0].others)
@@ -83,10 +102,10 @@ def catching_table(catching: Catching) -> Table:
 
 
 CATCHING_CAPTION = (
-    "outside, violated (what is assumed) and alarm (only the monitor's own CUSUM, of which nothing "
-    "is proved) are all caught; unknown: not judged to the end. "
-    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
-    "(untouched). Coloured: one of them catches more."
+    "Outside, violated (an assumption) and alarm (only the monitor's CUSUM, of which nothing is "
+    "proved) all count as caught. Unknown: not judged to the end. "
+    "CUSUM, 3σ and box have the same safety factor and calibration trials, and no more false "
+    "alarms (untouched). Coloured: one of them catches more."
 )
 
 

@@ -374,7 +374,9 @@ def test_a_row_is_proved_near_the_rate_of_its_slowest_cell_whatever_it_passes_on
         next=np.array([[1.0, 0, 0, 0, 1.0, 0], [gain, 1.0, 0, 0, 0, 0]]),
         output=np.array([[0, 0, 0, 1.0, 0, 0]]),
     )
-    assert (proof := prove_stability(made)) is not None and 0.9 < proof.rate < 0.92
+    proof = prove_stability(made)
+    assert proof is not None
+    assert 0.9 < proof.rate < 0.92
 
 
 def test_a_damaged_network_or_cascade_is_refused() -> None:
