@@ -13,8 +13,7 @@ from rich.text import Text
 
 from bags.chain.config import Config
 from bags.chain.steps import Identified
-from bags.commands.options import details
-from bags.commands.progress import progress_bar
+from bags.commands.options import details, progress_bar
 from bags.designs import documents
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
