@@ -92,11 +92,6 @@ def inverse_bound(ST: Sequence[Sequence[Fraction]]) -> float:
     return float(ABOVE / np.linalg.svd(floats(ST), compute_uv=False)[-1])
 
 
-def norm_bound(M: Sequence[Sequence[Fraction]]) -> float:
-    """At least the largest singular value."""
-    return float(ABOVE * np.linalg.norm(floats(M), 2))
-
-
 def curvature_bounds(p: Sequence[Polynomial], ring: Ring) -> list[float]:
     """γ_m of the parts of degree m = 1, 2, … of p; as in the kernel."""
     columns: dict[int, list[list[float]]] = {}
