@@ -2,7 +2,7 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 # python3 where it is 3.11-3.13 (for which there are ROS wheels) and can make a venv, else the
 # newest such python on PATH, else anything newer. `make PYTHON=...` overrides.
@@ -63,6 +63,7 @@ clean:
 # Editable, so that both commands run the checkout and an edit needs no second install.
 # $(call install,EXTRAS): with ROS where its wheels exist, else without, said in one line.
 define install
+@echo 'nlsid: installing into $(VENV), about two minutes the first time'
 $(PIP) install --editable '.[ros,$(1)]' || { \
   echo 'nlsid: no ROS wheels for this Python or platform; installing without (nothing live runs).'; \
   $(PIP) install --editable '.[$(1)]'; }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from bags.designs.documents import load
+    from bags.pictures.notebook import plot, to_control
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
     from bags.signals.sampling import Grid
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         Goal,
         OutputTube,
         SampledTracking,
-        compose_funnels,
         design,
         integrate_nominal,
         nominal_through,
@@ -43,12 +43,13 @@ if TYPE_CHECKING:
         Rie,
         Rse,
         Sem,
+        compare,
         identify,
+        standard_errors,
     )
-    from nlsid_core.models import Signal
     from nlsid_core.proofs import check
     from nlsid_core.running.monitor import Monitor
-    from nlsid_core.running.reading import Reading, Status
+    from nlsid_core.running.reading import Status
 
 __all__ = [
     "CellRow",
@@ -69,17 +70,15 @@ __all__ = [
     "Nominal",
     "OutputTube",
     "Polynomial",
-    "Reading",
     "Rie",
     "Rse",
     "SampledTracking",
     "Sem",
-    "Signal",
     "Status",
     "Trajectory",
     "VectorField",
     "check",
-    "compose_funnels",
+    "compare",
     "design",
     "f1tenth",
     "frame",
@@ -88,8 +87,11 @@ __all__ = [
     "load",
     "nominal_through",
     "plan_motion",
+    "plot",
     "read_bags",
+    "standard_errors",
     "taylor_field",
+    "to_control",
 ]
 
 _FAMILIES: Final = (
@@ -105,21 +107,28 @@ _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
 _MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
 _HOMES: Final = {
+    "bags.pictures.notebook": ("plot", "to_control"),
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),
     "bags.tools.tables": ("frame",),
     "nlsid_core.data.trajectory": ("Dataset", "Trajectory"),
-    "nlsid_core.models": ("Signal",),
-    "nlsid_core.identification": ("identify", "Fit", *_FAMILIES, *_METHODS),
-    "nlsid_core.design": ("design", *_PROBLEMS, *_MOTIONS, "compose_funnels"),
+    "nlsid_core.identification": (
+        "identify",
+        "Fit",
+        "compare",
+        "standard_errors",
+        *_FAMILIES,
+        *_METHODS,
+    ),
+    "nlsid_core.design": ("design", *_PROBLEMS, *_MOTIONS),
     "nlsid_core.designs": ("Design",),
     "bags.designs.documents": ("load",),
     "nlsid_core.dynamics": ("Nominal", "VectorField"),
     "nlsid_core.dynamics.taylor": ("taylor_field",),
     "nlsid_core.proofs": ("check",),
     "nlsid_core.running.monitor": ("Monitor",),
-    "nlsid_core.running.reading": ("Reading", "Status"),
+    "nlsid_core.running.reading": ("Status",),
     "nlsid_core.errors": ("NlsidError",),
 }
 _CALLED_THERE: Final = {"read_bags": "read_dataset"}

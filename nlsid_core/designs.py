@@ -50,7 +50,7 @@ class Wiring:
     period: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Design(Generic[D, P, F, S]):
     """A model, a policy and a funnel that belong together, with their proof.
 
@@ -85,6 +85,9 @@ class Design(Generic[D, P, F, S]):
 
     def __str__(self) -> str:
         return str(self.verdict) if self.found is None else f"{self.verdict}\n{self.found}"
+
+    def __repr__(self) -> str:
+        return f"<Design of {self.name}: {getattr(self.decision, 'statement', 'not decided')}>"
 
     @property
     def verdict(self) -> Verdict:

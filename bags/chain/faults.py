@@ -27,6 +27,9 @@ def held_at_zero(t: float, value: float) -> float:
 FAULTS: Mapping[str, Fault] = MappingProxyType(
     {"scaled by 0.6": scaled, "zero after 1 s": held_at_zero}
 )
+ONSETS: Mapping[str, float] = MappingProxyType(
+    {"scaled by 0.6": 0.0, "zero after 1 s": 1.0}
+)  # s from the signal's first message
 
 
 def write_faulty_copy(bag: Path | str, out: Path | str, signal: str, fault: Fault) -> None:

@@ -45,9 +45,6 @@ class StateIdentification(Section):
         Field(min_length=1, strict=False),
         Key("bags that choose the degrees", example=["arm_4_0"]),
     ]
-    refuse_above: Annotated[
-        Positive, Key("of error in free run, above which the model is refused", "%", 25.0)
-    ] = 25.0
     degrees: Annotated[
         tuple[Annotated[tuple[int, ...], Field(strict=False)], ...] | None,
         Field(strict=False),
@@ -56,9 +53,6 @@ class StateIdentification(Section):
             example=[[1, 1, 1], [3, 1, 1]],
         ),
     ] = None
-    biased_without_repeats: Annotated[
-        bool, Key("least squares where no excitation was repeated; noise biases it", example=True)
-    ] = False
 
 
 class MotionConfig(Section):

@@ -30,13 +30,8 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
     """
     data, options = read_signals_of(bags, config), config.identification
     validation = data.select(options.validation)
-    fit = identify_states(
-        data.without(options.validation),
-        validation,
-        degrees=options.degrees,
-        refuse_above=options.refuse_above,
-        biased_without_repeats=options.biased_without_repeats,
-    )
+    train = data.without(options.validation)
+    fit = identify_states(train, validation, degrees=options.degrees)
     files.write_document(out / documents.MODEL, fit.model.document())
     if report_available():
         from bags.pictures import plots, tubes  # matplotlib only where something is drawn

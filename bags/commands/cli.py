@@ -14,7 +14,7 @@ from bags.commands.options import flat
 
 app = typer.Typer(
     name="nlsid",
-    help="From a recorded bag to a proved model, a proved tracking tube and a monitor.",
+    help="Learn how a robot answers its commands, prove it, and tell when it no longer does.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -51,7 +51,7 @@ def _say_version(wanted: bool) -> None:
 def nlsid(
     _version: Annotated[
         bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="Say which it is."),
+        typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
-    """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
+    """Learn how a robot answers its commands, prove it, and tell when it no longer does."""

@@ -1,29 +1,31 @@
 """`nlsid demo`: the chain on the shipped bags, step by step, then live where rclpy is there."""
 
 import importlib.util
+import math
 import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Final
 
 from rich.console import Console
 
 from bags import samples
 from bags.chain.config import Config, load_config
-from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.faults import FAULTS, ONSETS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.chain.simulation import simulate_excitations, simulate_runs
 from bags.chain.tracking_config import is_tracking, load_tracking_config
 from bags.commands import designs_cli, models_cli, show, states
-from bags.commands.options import CONFIG
+from bags.commands.options import CONFIG, details
 from bags.commands.progress import progress_bar
 from bags.designs import documents
+from bags.monitoring.replay import Replay
 from bags.pictures.report import drawable, write_margins
 from nlsid_core.errors import DataError
 from nlsid_core.proofs import check
@@ -74,24 +76,48 @@ def run_demo(out: Path, console: Console, robot: str) -> bool:
         config = Path(robot) if robot.endswith(".yaml") else config_file(f"{robot}.yaml")
         return _simulated(config, out, console)
 
-    started, shown = time.perf_counter(), DEMOS[robot]()
+    console.quiet = details.quiet  # what the verbs print are details here
+    try:
+        return _driven(out, Console(), DEMOS[robot]())
+    finally:
+        console.quiet = False
+
+
+def _driven(out: Path, console: Console, shown: Shown) -> bool:
+    """Run every step on recordings that ship: what was found, and what it means."""
     out.mkdir(parents=True, exist_ok=True)
     shutil.copy(config_file(shown.config), out / CONFIG)
     settings = load_config(out / CONFIG)
+
     bags = shown.bags[0].parent
-    _step(console, "1  identify a model from the recordings", f"identify {out} {bags}")
-    models_cli.identify_here(shown.bags, settings, out)
-    _step(console, "2  design a tube, and see what it would catch", f"funnel {out}")
-    designs_cli.tube(out, settings)
-    _step(console, "3  check both proofs, exactly and without a solver", f"check {out}")
+    _step(console, "1  identify a model from recordings", f"identify {out} {bags}")
+    result = models_cli.identify_here(shown.bags, settings, out)
+    _say(console, f"{len(result.train)} recordings made it. {show.worth(result)}")
+    _say(console, "The commands alone tell what will be measured, and no command upsets the model.")
+
+    _step(console, "2  prove a tube around it", f"funnel {out}")
+    design = designs_cli.tube(out, settings)
+    _say(console, show.promise(design))
+    _say(console, "A robot that leaves the tube is not the robot that was recorded.")
+
+    _step(console, "3  check both proofs", f"check {out}")
     for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
-        _say(console, str(check(out / name)))
-    _step(console, "4  hold unseen recordings against the tube", f"monitor {out} BAG...")
-    monitored = _monitor(console, shown, settings, out)
-    _step(console, "5  the same live, over ROS 2")
+        _say(details, str(check(out / name)))
+    _say(
+        console, "Both hold in exact arithmetic, with no solver: nobody needs to trust the search."
+    )
+
+    _step(console, "4  hold other recordings against the tube", f"monitor {out} BAG...")
+    right, sentences = _monitor(console, shown, settings, out)
+
+    _step(console, "5  the same live, over ROS 2", f"run monitor {out}")
     live = _live(console, shown, out)
-    _say(console, f"{time.perf_counter() - started:.0f} s in all")
-    return monitored and live
+
+    console.rule()
+    _say(console, f"{'; '.join(sentences)}.")
+    _say(console, f"Look at {out / OTHERS_PLOT} and {out / documents.REPORT}.")
+    _say(console, "Your own recordings: nlsid learn BAG... --out DIR")
+    return right and live
 
 
 def _simulated(config: Path, out: Path, console: Console) -> bool:
@@ -113,30 +139,48 @@ def _simulated(config: Path, out: Path, console: Console) -> bool:
     return inside == len(runs)
 
 
-def _monitor(console: Console, shown: Shown, settings: Config, out: Path) -> bool:
-    """Hold the test trials against the tube, and what should be flagged; whether all are right."""
+def _monitor(console: Console, shown: Shown, settings: Config, out: Path) -> tuple[bool, list[str]]:
+    """Hold the test trials against the tube, and what should be flagged.
+
+    Whether all are right, and a sentence about each kind.
+    """
     design = documents.load(out)
     test = [bag for bag in shown.bags if bag.name in settings.split.test]
     replays = show.replayed(design, test, settings)
     if drawable(replays):
         write_margins(out / documents.MARGIN_PLOT, replays)
-    console.print(show.replay_table(replays))
+    details.print(show.replay_table(replays))
     inside = sum(replay.verdict == Status.INSIDE.value for replay in replays)
-    _say(console, f"{inside} of {len(replays)} test trials inside")
+    sentences = [f"{inside} of {len(replays)} healthy recordings inside"]
+    _say(console, sentences[0])
 
     right, every = inside == len(replays), []
     with tempfile.TemporaryDirectory() as folder:
         for what, bags in _others(shown, test, settings, Path(folder)).items():
             others = show.replayed(design, bags, settings)
-            console.print(show.replay_table(others))
-            flagged = sum(replay.first_bad is not None for replay in others)
-            _say(console, f"{what}: {flagged} of {len(others)} flagged")
-            right = right and (shown.floors.get(what, False) or flagged == len(others))
+            details.print(show.replay_table(others))
+            said, all_flagged = _flagged(what, others)
+            sentences.append(said)
+            _say(console, said)
+            right = right and (shown.floors.get(what, False) or all_flagged)
             every += others
     if drawable(every):
         write_margins(out / OTHERS_PLOT, every)
-    _say(console, shown.said)
-    return right
+    if shown.said:
+        _say(console, shown.said)
+    return right, sentences
+
+
+def _flagged(what: str, replays: Sequence[Replay]) -> tuple[str, bool]:
+    """How many were flagged and how soon after the fault, and whether all were."""
+    onset = ONSETS.get(what, math.inf)
+    delays = [
+        replay.first_bad.t - max(onset, replay.judged[0].t)
+        for replay in replays
+        if replay.first_bad is not None
+    ]
+    soon = f", half of them within {median(delays):.2f} s" if delays and onset < math.inf else ""
+    return f"{what}: {len(delays)} of {len(replays)} caught{soon}", len(delays) == len(replays)
 
 
 def _others(
@@ -176,12 +220,11 @@ def _live(console: Console, shown: Shown, out: Path) -> bool:
     return done.returncode == 0
 
 
-def _step(console: Console, title: str, command: str = "") -> None:
+def _step(console: Console, title: str, command: str) -> None:
     """A heading, and the command that does the same."""
     console.print()
     console.rule(title, align="left")
-    if command:
-        _say(console, f"$ nlsid {command}")
+    _say(console, f"$ nlsid {command}")
 
 
 def _say(console: Console, text: str) -> None:

@@ -16,6 +16,7 @@ from bags.commands.options import (
     DesignArgument,
     Sharing,
     SomeBagsArgument,
+    VerboseOption,
     Wired,
     config_of,
     out,
@@ -29,6 +30,7 @@ from nlsid_core.errors import CertificateRejected, DocumentError
 if TYPE_CHECKING:
     from bags.chain.config import Config
     from bags.fleet.workers import Workers
+    from nlsid_core.design import OutputTubeDesign
 
 
 @dataclass(frozen=True)
@@ -37,27 +39,29 @@ class Given:
 
     problem: Annotated[
         Path | None,
-        typer.Option(help="Dynamics, nominal and goal in a file, in the place of a model."),
+        typer.Option(help="Take dynamics, motion and goal from this file instead of a model."),
     ] = None
     seconds: Annotated[
-        float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
+        float, typer.Option(min=0.0, help="Average a push over this long; default one sample.")
     ] = 0.0
     safety_factor: Annotated[
-        float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
+        float,
+        typer.Option(min=1.0, help="How much wider the box is than the largest push."),
     ] = 1.5
     false_alarms: Annotated[
         float | None,
         typer.Option(
             min=0.0,
             max=1.0,
-            help="Of a model: in which part of further trials a sound robot may set off an alarm, "
-            "in place of funnel.safety_factor.",
+            help="In which part of further trials a healthy robot may raise an alarm; takes the "
+            "place of funnel.safety_factor.",
         ),
     ] = None
     compose: Annotated[
         list[Path] | None,
-        typer.Option(help="Bind the funnels of these folders, in the order of time; repeat."),
+        typer.Option(help="Join the funnels of these folders, in the order of time; repeat."),
     ] = None
+    verbose: VerboseOption = False
 
 
 def funnel(
@@ -70,10 +74,11 @@ def funnel(
 ) -> None:
     """Design a proved funnel in DIR: funnel.json, funnel.proof.json, policy.json if it has one.
 
-    Around the simulation of the model in DIR, and a plan of a linear one; around the motion of a
-    measured state, whose disturbance is measured on BAG...; around a trajectory of given equations
-    (--problem), which BAG... with -y and -u show to be off by a push; or of funnels that follow
-    each other (--compose). Of an identified model it says what the funnel catches.
+    Without options it is around the simulation of the model in DIR, and of a linear one's plan
+    too; it then says what faults it catches. If the configuration has a motion, it is around that
+    motion, and BAG... measure the disturbance. With --problem it is around a trajectory of given
+    equations, and BAG... with -y and -u measure how far these are off. --compose joins funnels
+    that follow each other.
     """
     from bags.chain.config import load_config
     from bags.chain.tracking_config import is_tracking, load_tracking_config
@@ -113,7 +118,7 @@ def _proof_in(path: Path) -> Path:
     return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
-def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> None:
+def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> OutputTubeDesign:
     """Design a tube around the model in a folder, and what it catches.
 
     false_alarms: in place of what the settings say, None for that.
@@ -131,15 +136,15 @@ def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> N
         progress("sabotaging the test trials", 0.7)
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
-    out.print(show.funnel_table(design))
+    show.say_tube(out, design)
     written = [folder / name for name in design.documents()]
     if catching is None:
         out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
     else:
         tables.say_catching(out, catching)
         written += write_catching(folder, catching)
-    for path in written:
-        out.print(f"wrote {path}", soft_wrap=True)
+    show.say_written(out, written)
+    return design
 
 
 def _around_trajectory(
@@ -187,20 +192,20 @@ def check(
         typer.Argument(metavar="DIR...", help="Designs' folders, or files (FILE.proof.json)."),
     ],
     second: Annotated[
-        bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
+        bool, typer.Option("--second", help="Ask the checker that Coq proves right, too.")
     ] = False,
     seconds: Annotated[
-        int, typer.Option(min=1, help="Processor time that a proof may take.")
+        int, typer.Option(min=1, help="Seconds of processor time that a proof may take.")
     ] = deciding.USUAL.seconds,
     memory: Annotated[
         int, typer.Option(min=1, help="MB that a proof may take.")
     ] = deciding.USUAL.memory,
 ) -> None:
-    """Decide proofs without a solver: PROVED (status 0), or REJECTED (status 1).
+    """Check proofs in exact arithmetic, without a solver: PROVED (status 0) or REJECTED (1).
 
-    Below the verdict stands what its assumptions were measured on, which is not proved: status 1 if
-    that contradicts itself. Status 2 if a proof cannot be read, so that nothing was decided about
-    it, or if the second kernel was asked and has no opinion of it.
+    The lines below the verdict say what its assumptions were measured on. That is not proved, but
+    status is 1 if it contradicts itself. Status 2: a proof could not be read, or the second
+    kernel was asked and has no opinion of it.
     """
     raise typer.Exit(decided(paths, deciding.Limits(seconds, memory), second=second))
 
@@ -249,10 +254,10 @@ def report(
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
     ] = None,
 ) -> None:
-    """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
+    """Write one page about a design: proofs, model, what it catches, pictures, recordings.
 
-    The proofs are decided again. Of the bags, those are held against the funnel that it was not
-    made with. The page needs nothing else, and prints.
+    The proofs are checked again. Bags that the design was not made with are held against its
+    funnel. The page is one file, and can be printed.
     """
     from bags.commands import show
     from bags.commands.page import folder_page, recorded
@@ -291,14 +296,14 @@ def export(
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option("--c", help="In their place a linear tube's table for a monitor in C."),
+        typer.Option("--c", help="Write a linear tube's table for a monitor in C instead."),
     ] = None,
 ) -> None:
     """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
 
-    Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
-    of Autoware's validators for speeds and distances, and a table of all signals. The tube has to
-    be as wide always: `funnel: {level: constant}` in the configuration.
+    These are path and goal tolerances of ros2_control's joint_trajectory_controller for positions,
+    thresholds of Autoware's validators for speeds and distances, and a table of all signals. The
+    tube's width has to be constant: `funnel: {level: constant}` in the configuration.
     """
     from bags.designs import documents, tolerances
     from nlsid_core.running.c_table import write_table

@@ -11,7 +11,14 @@ from typing import Annotated
 import typer
 
 from bags.commands import designs_cli, models_cli
-from bags.commands.options import CONFIG, BagsArgument, DefinitionsOption, Signals, out
+from bags.commands.options import (
+    CONFIG,
+    BagsArgument,
+    DefinitionsOption,
+    Signals,
+    VerboseOption,
+    out,
+)
 from nlsid_core import deciding
 from nlsid_core.errors import DataError
 
@@ -21,11 +28,12 @@ def learn(
     signals: Signals,
     folder: Annotated[Path, typer.Option("--out", help="The design's folder.")] = Path("design"),
     definitions: DefinitionsOption = None,
+    _verbose: VerboseOption = False,
 ) -> None:
     """Make a checked design from bags: init, identify, funnel, check and report, asking nothing.
 
-    The configuration that it uses is written beside, robot.yaml. Where a person has to decide, it
-    ends with the reason, status 2; status 1 if nothing can be identified from these bags.
+    The configuration that it uses is written too: robot.yaml. Where a person has to decide, it
+    ends with the reason and status 2. Status 1: nothing can be identified from these bags.
     """
     from bags.chain.config import load_config
     from bags.recordings.folders import expand_bags

@@ -20,18 +20,18 @@ from bags.commands.options import (
     PatienceOption,
     Sharing,
     Signals,
+    VerboseOption,
     config_of,
     err,
     out,
 )
 from bags.commands.progress import progress_bar
-from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from bags.chain.config import Config
-    from bags.chain.steps import Trials
+    from bags.chain.steps import Identified, Trials
     from bags.setup.proposal import Proposal
 
 
@@ -40,15 +40,15 @@ def init(
     bags: BagsArgument,
     signals: Signals,
     definitions: DefinitionsOption = None,
-    robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
+    robot: Annotated[str, typer.Option(help="The robot's name.")] = "robot",
     yes: Annotated[
-        bool, typer.Option("--yes", help="Take the likeliest signals, and what seems wrong too.")
+        bool, typer.Option("--yes", help="Ask nothing: take the likeliest signals, doubts and all.")
     ] = False,
 ) -> None:
     """Write a first configuration from bags, DIR/robot.yaml: signals, period, split, model, tube.
 
-    It is tried on the bags, every key says why, and what later steps will meet is said first.
-    Status 1 if nothing can be identified from these bags.
+    It is tried on the bags, and every key says why it is as it is. What later steps will meet is
+    said first. Status 1 if nothing can be identified from these bags.
     """
     proposed(folder, bags, signals, definitions, robot=robot, yes=yes)
 
@@ -92,16 +92,14 @@ def identify(
     bags: BagsArgument,
     reading: Reading,
     config: ConfigOption = None,
-    only_check: Annotated[
-        bool,
-        typer.Option("--check", help="Only say what is wrong, status 1; no message is read."),
-    ] = False,
+    _verbose: VerboseOption = False,
 ) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html.
 
-    Of a configuration with a motion: a model of the measured state, and a policy for the motion.
-    Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
-    cannot be used is listed and left out, and the next run reads only what is new.
+    If the configuration has a motion, the model is of the measured state, and there is a policy
+    for the motion. Workers read the bags if these are in object storage, or with --workers or
+    --scheduler. A bag that cannot be used is then listed and left out. The next run reads only
+    what is new.
     """
     from bags.chain.config import load_config
     from bags.chain.tracking_config import is_tracking, load_tracking_config
@@ -109,9 +107,7 @@ def identify(
     from bags.recordings.remote import is_url
 
     path = config_of(folder, config)
-    if only_check:
-        _check(path, expand_bags(bags))
-    elif is_tracking(path):
+    if is_tracking(path):
         from bags.commands import states
 
         states.identify(expand_bags(bags), load_tracking_config(path), folder)
@@ -123,13 +119,13 @@ def identify(
             identify_here(expand_bags(bags), settings, folder)
 
 
-def identify_here(bags: Sequence[Path], settings: Config, folder: Path) -> None:
+def identify_here(bags: Sequence[Path], settings: Config, folder: Path) -> Identified:
     """Read and identify in this process, and say what was found."""
     from bags.chain.steps import read_trials
 
     with progress_bar("reading") as progress:
         trials = read_trials(bags, settings, progress=progress)
-    _identify(trials, settings, folder)
+    return _identify(trials, settings, folder)
 
 
 def _by_workers(bags: list[Path], settings: Config, folder: Path, reading: Reading) -> None:
@@ -146,31 +142,12 @@ def _by_workers(bags: list[Path], settings: Config, folder: Path, reading: Readi
     _identify(found.trials, settings, folder)
 
 
-def _identify(trials: Trials, settings: Config, folder: Path) -> None:
+def _identify(trials: Trials, settings: Config, folder: Path) -> Identified:
     """Identify as configured, and say what was found."""
     from bags.chain.steps import identify_trials
     from bags.commands import show
 
     with progress_bar("identifying") as progress:
-        show.say_identified(out, identify_trials(trials, settings, folder, progress=progress))
-
-
-def _check(path: Path, bags: list[Path]) -> None:
-    """Say all that is wrong with a configuration, and with it for these bags."""
-    from bags.chain.config import load_config
-    from bags.chain.fitting import misfits
-    from bags.chain.tracking_config import is_tracking, load_tracking_config
-
-    wrong: list[str] = []
-    try:
-        if is_tracking(path):
-            load_tracking_config(path)
-        else:
-            wrong = misfits(load_config(path), bags)
-    except DataError as error:
-        wrong = [str(error)]
-    for line in wrong:
-        typer.echo(line)
-    if wrong:
-        raise typer.Exit(1)
-    typer.echo(f"{path}: nothing is wrong with it for {len(bags)} bags; no message was read")
+        result = identify_trials(trials, settings, folder, progress=progress)
+    show.say_identified(out, result)
+    return result

@@ -28,6 +28,7 @@ CONFIG = "robot.yaml"  # of a design's folder
 
 out = Console()
 err = Console(stderr=True)
+details = Console(quiet=True)  # the numbers behind a sentence; --verbose shows them
 
 
 class Clock(StrEnum):
@@ -60,7 +61,7 @@ ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="The robot's YAML; default robot.yaml in DIR.")
 ]
 ClockOption = Annotated[
-    Clock, typer.Option("--clock", help="The signals' stamps: their header's, or of logging.")
+    Clock, typer.Option("--clock", help="Which stamps count: those of headers, or of logging.")
 ]
 DefinitionsOption = Annotated[
     list[Path] | None,
@@ -70,7 +71,19 @@ DefinitionsOption = Annotated[
         "bags do not define.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
+
+
+def _show_details(wanted: bool) -> None:
+    details.quiet = not wanted
+
+
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", callback=_show_details, help="Print the numbers behind each sentence too."
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 
 
 @dataclass(frozen=True)
@@ -92,7 +105,8 @@ class Wired(Signals):
     """Where state and inputs of given equations are."""
 
     period: Annotated[
-        float, typer.Option("--period", min=0.0, help="s between samples, of given equations.")
+        float,
+        typer.Option("--period", min=0.0, help="s between samples, for given equations."),
     ] = 0.0
 
     def wiring(self) -> Wiring | None:
@@ -107,10 +121,11 @@ class Sharing:
     """Who shares the work."""
 
     count: Annotated[
-        int, typer.Option("--workers", min=0, help="Processes that share the work; 0: this one.")
+        int,
+        typer.Option("--workers", min=0, help="Processes that share the work; 0: only this one."),
     ] = 0
     scheduler: Annotated[
-        str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
+        str, typer.Option("--scheduler", help="Use a Dask cluster instead: tcp://HOST:PORT.")
     ] = ""
 
     def workers(self) -> Workers:

@@ -19,6 +19,7 @@ from bags.commands.options import (
     DefinitionsOption,
     DesignArgument,
     JsonOption,
+    VerboseOption,
     Wired,
     err,
     out,
@@ -49,10 +50,10 @@ def monitor(
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside, breaks the
-    assumption or raises the CUSUM alarm, 2 if something was not judged. A tube of one output is
-    drawn too. Bags that the design was made with are left out where others are given.
-    -y, -u and --period: where state and input of a continuous funnel are.
+    Status 0: every bag is inside, and its errors are as small as assumed. Status 1: one is not, or
+    raises the CUSUM alarm. Status 2: something was not judged. A tube of one output is drawn too.
+    Bags that the design was made with are left out where there are others. -y, -u and --period
+    say where state and input of a continuous funnel are.
     """
     from bags.commands import show
     from bags.designs import documents
@@ -184,10 +185,11 @@ def demo(
             "simulated in MuJoCo (extra `sim`), or the YAML of another that is."
         ),
     ] = "f1tenth",
+    _verbose: VerboseOption = False,
 ) -> None:
-    """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there.
+    """Run the whole chain on recordings that ship, then live over ROS 2 where rclpy is there.
 
-    Of a simulated robot: bags, model, policy, runs that measure the disturbance, funnel, monitor.
+    A simulated robot is recorded first, and again with its policy, to measure the disturbance.
     """
     from bags.commands.demo import run_demo
 

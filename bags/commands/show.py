@@ -13,21 +13,22 @@ from rich.text import Text
 
 from bags.chain.config import Config
 from bags.chain.steps import Identified
+from bags.commands.options import details
 from bags.commands.progress import progress_bar
 from bags.designs import documents
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
 from bags.monitoring.replay import Replay, replay_bag
+from bags.pictures import tables
 from bags.pictures.report import report_available
-from bags.pictures.tables import methods_table
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import AnyDesign
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, percent
+from nlsid_core.funnels.tube import Tube
 from nlsid_core.kernel import text
-from nlsid_core.models import Signal
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -43,76 +44,100 @@ UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their num
 
 
 def say_identified(console: Console, result: Identified) -> None:
-    """Every method, what is to be known about the model, and the files that were written."""
-    console.print(methods_table(result.fit, result.test))
+    """What the model is worth in a sentence, every method, what to know, and the files."""
+    fit = result.fit
+    _say(console, worth(result))
+    console.print(tables.methods_table(fit, result.test))
+    for line in (str(fit.history), fit.slowest, *_residuals(result)):
+        _say(details, line)
     for line in notes(result):
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
-    for file in result.files:
-        console.print(f"wrote {file}", soft_wrap=True)
+        _say(console, line)
+    say_written(console, result.files)
     if not report_available():
         console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
 
 
-def notes(result: Identified) -> list[str]:
-    """What a user should know beside the table: the search, the residuals, what was skipped."""
-    lines = [str(result.fit.history), result.fit.slowest]
+def worth(result: Identified) -> str:
+    """How well the model simulates, and what is proved of it."""
+    fit = result.fit
+    error = percent(fit.errors["test"][fit.method.name])
+    return (
+        f"The model simulates {len(result.test)} test trials with an error of {error}. "
+        f"{tables.stability_sentence(fit.chosen)}"
+    )
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def say_written(console: Console, paths: Sequence[Path]) -> None:
+    """The files by name, and their folder."""
+    names = ", ".join(dict.fromkeys(path.name for path in paths))
+    _say(console, f"wrote {names} in {paths[0].parent}")
+
+
+def _residuals(result: Identified) -> list[str]:
+    """What is left in the errors of the test trials, or why that is not known."""
     try:
-        scores = result.fit.chosen.validate(result.test)
+        return str(result.fit.chosen.validate(result.test)).splitlines()
     except DataError as reason:
-        lines.append(f"residuals not tested: {reason}")
-    else:
-        lines += str(scores).splitlines()
+        return [f"residuals not tested: {reason}"]
+
+
+def notes(result: Identified) -> list[str]:
+    """What a user should know beside the table: what was skipped, filled or not proved."""
+    lines = []
     if result.trials.skipped:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
     if said := said_filled(result.trials.filled, sum(map(len, result.trials.every))):
         lines.append(said)
-    lines += [*said_restarts(result.trials.every), *result.trials.apart]
-    if result.fit.chosen.proof is None:
-        lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
-    return lines
+    return [*lines, *said_restarts(result.trials.every), *result.trials.apart]
 
 
-def funnel_table(design: OutputTubeDesign) -> Table:
-    """What the tube promises and on what."""
-    model, funnel = design.model, design.funnel
-    table = Table(title="proved tube", title_justify="left", show_header=False)
-    table.add_column(style="dim")
-    table.add_column()
-    table.add_row("around", "the model's simulation under the inputs it receives")
-    if design.policy is not None:
-        played = Fraction(model.period) * (len(design.policy) - 1)
-        engaged = "an LQR around it" if design.policy.K.any() else "its inputs played, K = 0"
-        lasts = f"{len(design.policy)} samples, which span {text.below(played)} s"
-        table.add_row("and", f"the policy's plan, {engaged}, for {lasts}")
-    signals = (model.y,) if isinstance(model.y, Signal) else model.y
-    washouts = washouts_of(signals)
-    for tube in funnel.tubes:
-        lasting = "for ever"
-        if tube.samples is not None:
-            span = (tube.samples - 1) * Fraction(model.period)
-            lasting = f"for {tube.samples} samples, which span {text.below(span)} s"
-        widths = zip(tube.half_widths.tolist(), signals, strict=True)
-        said = ", ".join(
-            f"{text.above(Fraction(width))} {signal.unit} of {signal.name}"
-            for width, signal in widths
-        )
-        if tube.follows is not None:
-            said += " times sqrt(g), which follows the commands"
-        table.add_row("half-width", f"{said}, {lasting}")
-        for time, width, signal in zip(washouts, tube.half_widths.tolist(), signals, strict=True):
-            if time is not None and tube.samples is None:
-                moved = text.above(displacement_half_width(width, time, time))
-                times = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
-                table.add_row(
-                    "position",
-                    f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
-                    f"{signal.unit}{times} of what the simulation moves",
-                )
-    for line in design.verdict.assumptions:
-        table.add_row("assuming", escape(line))
-    for line in of_funnel(model.document(), funnel.document()).said:
-        table.add_row("measured", escape(line))
-    return table
+def promise(design: OutputTubeDesign) -> str:
+    """What the tube promises and on what, without its formulas."""
+    tube = _plainest(design)
+    scaled = " times sqrt(g), g of the commands," if tube.follows is not None else ""
+    widths = zip(design.signals[0], tube.half_widths.tolist(), strict=True)
+    stays = " and ".join(
+        f"{signal.name} stays within {text.above(Fraction(width))} {signal.unit}"
+        for signal, width in widths
+    )
+    lasting = "for ever" if tube.samples is None else f"for {tube.samples} samples"
+    measured, count = tube.measured, len(tube.measured.measured_on)
+    return (
+        f"Proved: the measured {stays}{scaled} of the model's simulation, {lasting}. It holds "
+        f"while the model's one-step errors are at most {measured.safety_factor:g} times as large "
+        f"as in {count + 1 - measured.rank} of {count} trials; the monitor watches that."
+    )
+
+
+def _plainest(design: OutputTubeDesign) -> Tube:
+    """The tube whose half-widths hold as they stand, and for ever, if there is one."""
+    tubes = design.funnel.tubes
+    return min(tubes, key=lambda tube: (tube.follows is not None, tube.samples or 0))
+
+
+def say_tube(console: Console, design: OutputTubeDesign) -> None:
+    """What the tube promises, of positions and of a next trial too; its formulas are details."""
+    _say(console, promise(design))
+    signals, tube = design.signals[0], _plainest(design)
+    moving = zip(washouts_of(signals), tube.half_widths.tolist(), signals, strict=True)
+    for time, width, signal in moving if tube.samples is None else ():
+        if time is not None:
+            moved = text.above(displacement_half_width(width, time, time))
+            scaled = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
+            _say(
+                console,
+                f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
+                f"{signal.unit}{scaled} of what the simulation moves",
+            )
+    provenance = of_funnel(design.model.document(), design.funnel.document())
+    for line in dict.fromkeys(provenance.promised):
+        _say(console, line)
+    for line in (*str(design.verdict).splitlines(), *provenance.said):
+        _say(details, line)
 
 
 def replayed(

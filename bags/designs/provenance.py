@@ -48,9 +48,13 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What is said of the trials behind a proved funnel, and what of it contradicts itself."""
+    """What is said of the trials behind a proved funnel, and what of it contradicts itself.
+
+    promised: how often a next trial sets off an alarm, or why that is not known.
+    """
 
     said: tuple[str, ...] = ()
+    promised: tuple[str, ...] = ()
     wrong: tuple[str, ...] = ()
 
 
@@ -92,8 +96,9 @@ def of_funnel(model: Json, funnel: Json) -> Provenance:
             pairs = zip(peak["at_most"], peak["measured"], strict=True)
             bounds += [("a peak", Fraction(bound), most * Fraction(seen)) for bound, seen in pairs]
         found.append(_judged(f"innovation energy of tube {i}", given, fitted, bounds))
-    said = tuple(line for line, _ in found)
-    return Provenance(said, tuple(line for _, lines in found for line in lines))
+    said = tuple(f"{line}; {promise}" for line, promise, _ in found)
+    promised = tuple(promise for _, promise, _ in found)
+    return Provenance(said, promised, tuple(line for *_, lines in found for line in lines))
 
 
 def _judged(
@@ -101,8 +106,8 @@ def _judged(
     given: Mapping[str, Any],
     fitted: list[Json] | None,
     bounds: Iterable[tuple[str, Fraction, Fraction]],
-) -> tuple[str, list[str]]:
-    """One line, and what contradicts it."""
+) -> tuple[str, str, list[str]]:
+    """What was measured, what that promises of a next trial, and what contradicts it."""
     trials, before = (
         [Recorded.of(trial["digest"]) for trial in given.get(key) or ()]
         for key in ("measured_on", "designed_on")
@@ -130,11 +135,11 @@ def _judged(
     says = "breaks an assumption or sets off any other alarm of this funnel"
     if "rank" not in given:
         scale, says = f"largest of {those} {text.above(measured)}", "exceeds their largest"
-    worth = _worthless(trials, fitted) or (
+    promise = _worthless(trials, fitted) or (
         f"a next trial that is exchangeable with them {says} with probability at most "
         f"{rank}/{count + 1}"
     )
-    return f"{what}: {scale}, safety factor {text.below(factor)}; {worth}", wrong
+    return f"{what}: {scale}, safety factor {text.below(factor)}", promise, wrong
 
 
 def distinct(trials: Iterable[Recorded]) -> int:

@@ -6,19 +6,18 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from bags.monitoring.catching import Catching
 from bags.pictures.plots import BLUE, INK, LINE, ORANGE, tidy
 
 TITLE = 60  # letters of a line
-SHADES = ("#5f6b73", "#9aa0a6", "#cfd3d6")  # of the other detectors
+SHADES = (BLUE, "#5f6b73", "#9aa0a6", "#cfd3d6")  # of the tube and the other detectors
 
 
 def catching(found: Catching) -> Figure:
     """Left, each output's error on the untouched trials in the tube, beside half the range.
 
-    Right, the part of the trials in which each sabotage is caught, by the funnel and by others.
+    Right, how long after each fault the tube and other detectors alarm, and in how many trials.
     """
     p = len(found.widths)
     figure = Figure(figsize=(11, max(4.2, 2.4 * p)), layout="constrained")
@@ -27,9 +26,9 @@ def catching(found: Catching) -> Figure:
     for j, axes in enumerate(panels):
         _errors(axes, found, j)
     panels[-1].set_xlabel("time [s]", fontsize=8)
-    caught = halves[1].subplots()
-    _caught(caught, found)
-    tidy([*panels, caught])
+    delays = halves[1].subplots()
+    _delays(delays, found)
+    tidy([*panels, delays])
     return figure
 
 
@@ -70,27 +69,28 @@ def _errors(axes: Axes, found: Catching, j: int) -> None:
     axes.legend(frameon=False, fontsize=7, loc="lower left", bbox_to_anchor=(-0.02, 1), ncols=2)
 
 
-def _caught(axes: Axes, found: Catching) -> None:
-    rows = [row for row in found.rows if not row.refused]
-    detectors = list(rows[0].others)
-    height = 0.8 / (1 + len(detectors))
-    places = np.arange(len(rows), dtype=float)
-    left = np.zeros(len(rows))
-    for label, color, counts in (
-        ("outside", BLUE, [row.funnel.outside for row in rows]),
-        ("assumption violated", "#7fb0d9", [row.funnel.violated for row in rows]),
-        ("alarm (CUSUM)", "#b9d6b0", [row.funnel.alarmed for row in rows]),
-        ("unknown", "#e8d9c4", [row.funnel.unjudged for row in rows]),
-    ):
-        axes.barh(places, counts, height, left=left, color=color, label=f"funnel: {label}")
-        left += counts
-    for number, name in enumerate(detectors, 1):
-        counts = [row.others[name].count for row in rows]
-        color = SHADES[(number - 1) % len(SHADES)]
-        axes.barh(places + number * height, counts, height, color=color, label=name)
-    axes.set_yticks(places + 1.5 * height, [row.fault for row in rows])
+def _delays(axes: Axes, found: Catching) -> None:
+    """How long each fault goes unseen by each detector, and in how many trials it is seen at all.
+
+    Faults that nothing sees are left out.
+    """
+    tried = [row for row in found.rows[1:] if not row.refused]
+    rows = [row for row in tried if row.funnel.count or any(o.count for o in row.others.values())]
+    untouched = found.rows[0]
+    detectors = {"tube": untouched.funnel, **untouched.others}
+    height = 0.8 / len(detectors)
+    for number, name in enumerate(detectors):
+        caught = [row.others.get(name, row.funnel) for row in rows]
+        delays = np.nan_to_num([each.after for each in caught])
+        places = np.arange(len(rows)) + number * height
+        bars = axes.barh(places, delays, height, color=SHADES[number % len(SHADES)], label=name)
+        counts = [f"{c.count} of {found.trials}" if c.count else "not caught" for c in caught]
+        axes.bar_label(bars, counts, padding=3, fontsize=6)
+    axes.set_yticks(np.arange(len(rows)) + 1.5 * height, [row.fault for row in rows])
     axes.invert_yaxis()
-    axes.set_xlim(0, found.trials)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel(f"caught, of {found.trials} held-back trials", fontsize=8)
-    axes.legend(frameon=False, fontsize=7, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+    axes.margins(x=0.15)
+    axes.set_xlabel("time from the fault to the alarm [s], median; shorter is better", fontsize=8)
+    false = ", ".join(f"{name} {caught.count}" for name, caught in detectors.items())
+    said = f"false alarms in {found.trials} trials without a fault: {false}"
+    axes.set_title(said, fontsize=8, loc="left", pad=24)
+    axes.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", bbox_to_anchor=(-0.02, 1))

@@ -1,13 +1,16 @@
 """Pictures of an identified model (extra `report`: matplotlib). Each function returns a Figure."""
 
+from collections.abc import Mapping
+from itertools import cycle
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, grid, legend, thinned, tidy
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, grid, legend, thinned, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Candidate, Fit, Model, Validation, simulate_trial
+from nlsid_core.identification import Candidate, Model, Validation, simulate_trial
 from nlsid_core.identification.prediction import history, learns
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
@@ -16,11 +19,19 @@ DRAWN = 800  # points of a residual over time
 COLUMNS = 4
 
 
-def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
-    """Measured against simulated on the test trials, with an input of the same unit."""
-    chosen = fit.chosen
-    beside = next((c for c in fit.candidates if c is not chosen), None)
-    simulated = {trial.name: simulate_trial(chosen.model, trial)[:, output] for trial in test}
+def simulations(test: Dataset, models: Mapping[str, Model], output: int = 0) -> Figure:
+    """Draw what was measured on trials against what models simulate, the last one on top.
+
+    Args:
+        test: the trials; of many, those that the last model simulates worst are drawn.
+        models: by the names that the legend shows.
+        output: the number of the response.
+
+    Returns:
+        The figure, with an input of the same unit.
+    """
+    *others, (title, chosen) = models.items()
+    simulated = {trial.name: simulate_trial(chosen, trial)[:, output] for trial in test}
     trials = sorted(test, key=lambda t: -_size(t.y[:, output] - simulated[t.name]))[:MOST_TRIALS]
     trials.sort(key=lambda t: test.names.index(t.name))
     width = 3.1 if len(trials) > 1 else 9.1
@@ -33,12 +44,10 @@ def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
             if unit == trial.y_units[output]:
                 axes.step(t, u[rows_drawn], where="post", color=GREY, lw=LINE, label=name)
         axes.plot(t, y[rows_drawn], color=INK, lw=LINE, label="measured")
-        if beside is not None:
-            other = _bounded(simulate_trial(beside.model, trial)[rows_drawn, output], y)
-            axes.plot(t, other, color=ORANGE, lw=LINE, ls="--", label=beside.method.title)
-        axes.plot(
-            t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=chosen.method.title
-        )
+        for (name, model), color in zip(others, cycle((ORANGE, RED))):
+            other = _bounded(simulate_trial(model, trial)[rows_drawn, output], y)
+            axes.plot(t, other, color=color, lw=LINE, ls="--", label=name)
+        axes.plot(t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=title)
         drawn = "" if len(t) == len(trial) else f", {len(t)} of {len(trial)} samples"
         axes.set_title(f"{trial.name}{drawn}", fontsize=9, loc="left")
     figure.supxlabel("time [s]", fontsize=9)

@@ -13,8 +13,7 @@ from bags.pictures import tables
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
-from nlsid_core.models import StateAffineModel
+from nlsid_core.identification import Candidate, Fit, Model
 
 MODEL_BEGINS, MODEL_ENDS = "<!-- model begins -->", "<!-- model ends -->"
 FUNNEL_BEGINS, FUNNEL_ENDS = "<!-- funnel begins -->", "<!-- funnel ends -->"
@@ -97,7 +96,8 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 
     chosen, test = fit.chosen, parts["test"]
     outputs = range(test.trajectories[0].y.shape[1])
-    simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
+    drawn = {c.method.title: c.model for c in (*fit.candidates[:1], chosen)}
+    simulated = "".join(plots.svg(model_plots.simulations(test, drawn, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     listed = "".join(_recordings(data, use) for use, data in parts.items())
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
@@ -130,28 +130,8 @@ for this table and the pictures below{calibrated if "calibration" in parts else 
 
 
 def _stability(chosen: Candidate[Model]) -> str:
-    if chosen.proof is None:
-        return (
-            f'<p class="not">Not proved stable{chosen.remark and f" ({escape(chosen.remark)})"}: '
-            "there is no certificate for this model, and nothing built on it is certified.</p>"
-        )
-    inputs = "every input"
-    if isinstance(chosen.model, StateAffineModel):
-        low_high = ", ".join(f"[{low:g}, {high:g}]" for low, high in chosen.model.u_range)
-        inputs = f"every input in {low_high}"
-        clip = chosen.model.on_out_of_range == "clip"
-        inputs += " (others are clipped to it)" if clip else " (others are refused)"
-    if chosen.proof.rate < 1.0:
-        rate = stated_rate(chosen.proof, chosen.model.period)
-        approach = f"approach each other at the rate {rate} a sample or faster"
-    else:
-        approach = "differ by a square summable sequence; no rate is claimed"
-        if isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
-            inputs = "every input that keeps them in the box of the proof"
-    return (
-        f'<p class="proved">Incrementally stable for {inputs}, decided exactly: two solutions with '
-        f"the same input {approach}.</p>"
-    )
+    shown = "not" if chosen.proof is None else "proved"
+    return f'<p class="{shown}">{escape(tables.stability_sentence(chosen))}</p>'
 
 
 def _about(model: Model) -> str:

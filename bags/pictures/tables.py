@@ -11,7 +11,8 @@ from rich.table import Table
 from bags.monitoring.catching import Breaking, Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import duration, percent
-from nlsid_core.identification import Candidate, Fit, Model, stated_rate
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
+from nlsid_core.models import StateAffineModel
 
 STABILITY = "proved rate a sample (time constant)"
 PAGE_COLUMNS = 110  # of what a page shows as it is printed
@@ -50,6 +51,24 @@ def stability(candidate: Candidate[Model]) -> str:
     if candidate.proof is None:
         return f"[dark_orange3]{candidate.unproved}"
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
+
+
+def stability_sentence(chosen: Candidate[Model]) -> str:
+    """What is proved of the model, and for which inputs."""
+    if chosen.proof is None:
+        why = f" ({chosen.remark})" if chosen.remark else ""
+        return f"It is NOT PROVED stable{why}: nothing that is built on it is certified."
+    inputs = "whatever these inputs are"
+    if isinstance(chosen.model, StateAffineModel):
+        low_high = ", ".join(f"[{low:g}, {high:g}]" for low, high in chosen.model.u_range)
+        beyond = "clipped to it" if chosen.model.on_out_of_range == "clip" else "refused"
+        inputs = f"for every input in {low_high}; others are {beyond}"
+    if chosen.proof.rate >= 1.0 and isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
+        inputs = "while these inputs keep them in the box of the proof"
+    how = f"at the rate {stated_rate(chosen.proof, chosen.model.period)} a sample or faster"
+    if chosen.proof.rate >= 1.0:
+        how = "at no rate that is stated"
+    return f"Proved: two of its runs under the same inputs approach each other {how}, {inputs}."
 
 
 def catching_table(catching: Catching) -> Table:

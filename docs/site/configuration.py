@@ -21,8 +21,8 @@ from nlsid_core.identification import METHODS, methods_of
 HEAD = """# The configuration of a robot, key by key
 
 Made by `python -m docs.site.configuration`; a test keeps it true. Words are in the
-[glossary](glossary.md). `nlsid identify DIR BAG... --check` says all that is wrong with a file at
-once. A key without a default has to be given; a key that is not here is refused.
+[glossary](glossary.md). `nlsid identify` says all that is wrong with a file at once. A key
+without a default has to be given; a key that is not here is refused.
 """
 LIMITS = (
     (Gt, "gt", "> "),

@@ -13,6 +13,7 @@ LONGEST = 48  # characters of one value
 SPACE, HYPHEN = "\N{NO-BREAK SPACE}", "\N{NON-BREAKING HYPHEN}"
 THOUSANDS = 1e4  # numbers from here on have no digits behind the point
 FEWEST = 3  # figures that make keys with a common beginning a table
+RESULTS = Path(__file__).with_name("results.txt")  # what a newcomer reads first
 FIGURE = re.compile(r"\{\{(\w+) ([\w.]+) ([\w.]+)\}\}")
 
 
@@ -25,6 +26,10 @@ def page(results: Path, benchmarks: Path) -> str:
     lines = [
         "# Benchmarks",
         "",
+        *RESULTS.read_text(encoding="utf-8").splitlines(),
+        "",
+        "## All of them",
+        "",
         "These figures are written by `make benchmarks`, each with its date, machine and commit. A",
         "program that is compared with (*peers*) ran in the same run, each on one thread. Figures",
         "that were published elsewhere are in the descriptions. Seconds are wall-clock time unless",
@@ -36,27 +41,27 @@ def page(results: Path, benchmarks: Path) -> str:
     if not files:
         return "\n".join([*lines, "No results lie in benchmarks/results of this checkout.", ""])
     lines += [
-        "| benchmark | measured | took | load | commit | peers |",
-        "|---|---|---|---|---|---|",
+        "| what is measured | on | took | load | peers |",
+        "|---|---|---|---|---|",
     ]
     for name, found in files:
         load = found.get("load", "-")
+        title, _ = _docstring(_module(found, benchmarks))
         lines.append(
-            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10].replace('-', HYPHEN)} | "
-            f"{found['seconds']:g}{SPACE}s | {f'{SPACE}to{SPACE}'.join(map(str, load))} | "
-            f"{found['commit'][:8]} | {_peers(found['result'])} |"
+            f"| [{title.rstrip('.')}](#{name.replace('_', '-')}) | "
+            f"{found['date'][:10].replace('-', HYPHEN)} | {found['seconds']:g}{SPACE}s | "
+            f"{f'{SPACE}to{SPACE}'.join(map(str, load))} | {_peers(found['result'])} |"
         )
     if without := sorted(BENCHMARKS.keys() - dict(files).keys()):
         lines += ["", f"Not measured on this checkout: {', '.join(without)}. To measure one:", ""]
         lines += ["    python -m benchmarks NAME"]
     for name, found in files:
-        module = str(found["command"][2]).removeprefix("benchmarks.")
-        title, rest = _docstring(benchmarks / f"{module}.py")
+        title, rest = _docstring(_module(found, benchmarks))
         lines += ["", f"({name.replace('_', '-')})=", f"## {name}", "", title, ""]
         if rest:
             lines += ["```text", rest, "```", ""]
         command = " ".join(str(word) for word in found["command"])
-        lines += [f"`{command}` on {found['machine']}:"]
+        lines += [f"`{command}` on {found['machine']}, commit {found['commit'][:8]}:"]
         lines += _tables({key: of for key, of in found["result"].items() if key != "peers"})
     return "\n".join([*lines, ""])
 
@@ -75,6 +80,11 @@ def filled(text: str, results: Path) -> str:
         return "-" if value is None else format(value, match[3])
 
     return FIGURE.sub(figure, text)
+
+
+def _module(found: dict[str, Any], benchmarks: Path) -> Path:
+    """The file of the benchmark that wrote these figures."""
+    return benchmarks / f"{str(found['command'][2]).removeprefix('benchmarks.')}.py"
 
 
 def _docstring(module: Path) -> tuple[str, str]:

@@ -1,7 +1,9 @@
 """Recorded or nominal motions: `Trajectory`, and `Dataset`, several of them on one time grid."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -9,10 +11,11 @@ from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.errors import DataError, ShapeError
 
 ROUNDING = 1e-5  # ns; a mean step this close to whole nanoseconds was not meant to differ from them
+POINTS = 80  # of a line in a notebook
 GRID_TOLERANCE = 1e-6  # relative; stamps are integer nanoseconds, so a grid repeats to far better
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Trajectory:
     """Signals of one motion on its own time stamps; arrays are checked once and read-only.
 
@@ -66,6 +69,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __repr__(self) -> str:
+        signals = ", ".join((*self.y_names, *self.u_names))
+        return f"<Trajectory {self._label}: {len(self)} samples of {signals}>"
+
     @property
     def period(self) -> float:
         """The sample time in s; DataError if the stamps are not on a uniform grid."""
@@ -111,7 +118,7 @@ class Trajectory:
             object.__setattr__(self, f"{letter}_{key}", given)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """Trajectories with the same signals and the same sample time; `group` marks repeats.
 
@@ -139,6 +146,56 @@ class Dataset:
                     f"{other.name}: sample time {other.period:.6g} s, "
                     f"but {first.name} has {first.period:.6g} s"
                 )
+
+    @classmethod
+    def from_pandas(
+        cls, frames: Mapping[str, Any] | Any, *, y: Sequence[str], u: Sequence[str]
+    ) -> "Dataset":
+        """Make a dataset of pandas DataFrames, one a trial, on one grid of time.
+
+        Args:
+            frames: a DataFrame, or several by the names of their trials. The index is the time,
+                in s or as a DatetimeIndex; `frame` reads bags so, with a period.
+            y: the columns of the responses, what is measured.
+            u: the columns of the excitations, what drives the robot.
+
+        Returns:
+            The dataset; its signals are called as the columns.
+
+        Raises:
+            DataError: on NaN, and where the rows are not equally far apart in time.
+        """
+        trials = []
+        for name, table in (frames if isinstance(frames, Mapping) else {"data": frames}).items():
+            t = table.index.to_numpy()
+            if t.dtype.kind == "M":
+                t = (t - t[0]) / np.timedelta64(1, "s")
+            trials.append(
+                Trajectory(
+                    t=t,
+                    y=table[list(y)],
+                    u=table[list(u)],
+                    y_names=tuple(y),
+                    u_names=tuple(u),
+                    name=name,
+                )
+            )
+        return cls(tuple(trials))
+
+    def __repr__(self) -> str:
+        first = self.trajectories[0]
+        return (
+            f"<Dataset: {len(self)} trial{'s' * (len(self) > 1)}, {sum(map(len, self))} samples of "
+            f"{self.period:g} s, {', '.join(first.u_names)} -> {', '.join(first.y_names)}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """The same, and the first trial's first excitation and response, each over its range."""
+        first = self.trajectories[0]
+        drives = _svg_line(first.t, first.u[:, 0], "#9aa0a6")
+        answers = _svg_line(first.t, first.y[:, 0], "#1f6fb4")
+        drawn = f'<svg viewBox="0 0 600 100" width="600" height="100">{drives}{answers}</svg>'
+        return f"<div>{escape(repr(self))}<br>{drawn}</div>"
 
     def __len__(self) -> int:
         return len(self.trajectories)
@@ -175,6 +232,15 @@ class Dataset:
             if trajectory.group:
                 groups.setdefault(trajectory.group, []).append(trajectory)
         return {group: tuple(members) for group, members in groups.items() if len(members) > 1}
+
+
+def _svg_line(t: FloatArray, values: FloatArray, colour: str) -> str:
+    """Values (N,) over t (N,) as a line of an SVG picture of 600 x 100."""
+    rows = np.linspace(0, len(t) - 1, min(len(t), POINTS)).astype(int)
+    across = 600.0 * (t[rows] - t[0]) / (t[-1] - t[0])
+    up = 95.0 - 90.0 * (values[rows] - values.min()) / (np.ptp(values) or 1.0)
+    points = " ".join(f"{x:.0f},{y:.0f}" for x, y in zip(across, up, strict=True))
+    return f'<polyline points="{points}" fill="none" stroke="{colour}"/>'
 
 
 def _frozen(values: ArrayLike) -> FloatArray:

@@ -133,10 +133,6 @@ class ContinuousFunnel:
         x_bar = self._states(X) - self.nominal(t)
         return np.asarray(np.einsum("ni,ij,nj->n", x_bar, self.shape(t), x_bar))
 
-    def gradient(self, t: float, X: ArrayLike) -> FloatArray:
-        """∂V/∂x at states X (N, n), (N, n)."""
-        return np.asarray(2 * (self._states(X) - self.nominal(t)) @ self.shape(t))
-
     def boundary(self, t: float, directions: ArrayLike) -> FloatArray:
         """The boundary points (N, n) that the unit sphere's points (N, n) are mapped to."""
         L = np.linalg.cholesky(self.shape(t))

@@ -20,14 +20,16 @@ from nlsid_core.identification.network.options import (
     Network,
 )
 from nlsid_core.identification.polynomial.options import Degrees, Polynomial
-from nlsid_core.identification.prediction import Model, predict, simulate_trial
+from nlsid_core.identification.prediction import Model, simulate_trial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
-from nlsid_core.identification.repeats import RepeatTest, compare_repeats
+from nlsid_core.identification.repeats import compare_repeats
 from nlsid_core.identification.validation import (
     Residual,
     Validation,
+    compare,
     simulation_percent,
+    standard_errors,
     validate,
 )
 
@@ -52,7 +54,6 @@ __all__ = [
     "Polynomial",
     "Promise",
     "Proof",
-    "RepeatTest",
     "Residual",
     "Rie",
     "Row",
@@ -61,15 +62,16 @@ __all__ = [
     "StabilityProof",
     "Step",
     "Validation",
+    "compare",
     "compare_repeats",
     "describe",
     "identify",
     "methods_of",
-    "predict",
     "prove_implicit",
     "prove_stability",
     "simulate_trial",
     "simulation_percent",
+    "standard_errors",
     "stated_rate",
     "validate",
 ]

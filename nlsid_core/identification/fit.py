@@ -11,6 +11,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
+from nlsid_core.models.difference_equation import DifferenceEquation
 
 M = TypeVar("M", bound=Model, covariant=True)
 
@@ -69,10 +70,9 @@ class Candidate(Generic[M]):
         """What is said in the place of a proof."""
         return f"not proved: {self.remark}" if self.remark else "not proved"
 
-    def validate(self, dataset: Dataset, *, transient: int | None = None) -> Validation:
+    def validate(self, dataset: Dataset) -> Validation:
         """Simulation and prediction errors and the tests of the residuals over `dataset`."""
-        skipped = self.transient if transient is None else transient
-        return validate(self.model, dataset, transient=skipped)
+        return validate(self.model, dataset, transient=self.transient)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class History:
         return f"{self.value} {first.value:.4g} -> {last.value:.4g} in {len(self.steps)} steps"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
@@ -116,11 +116,6 @@ class Fit(Generic[M]):
 
     def __getitem__(self, method: str) -> Candidate[M]:
         return next(c for c in self.candidates if c.method.name == method)
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """The names of the methods there is a candidate of."""
-        return tuple(candidate.method.name for candidate in self.candidates)
 
     @property
     def chosen(self) -> Candidate[M]:
@@ -154,4 +149,9 @@ class Fit(Generic[M]):
             state = stated_rate(c.proof, c.model.period) if c.proof else c.unproved
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
-        return "\n".join([str(self.model), str(self.history), self.slowest, header, *rows])
+        equation = [self.model.equation] if isinstance(self.model, DifferenceEquation) else []
+        return "\n".join(
+            [str(self.model), *equation, str(self.history), self.slowest, header, *rows]
+        )
+
+    __repr__ = __str__

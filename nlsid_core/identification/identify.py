@@ -37,6 +37,11 @@ def identify(
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
     """
+    if not isinstance(train, Dataset):
+        raise DataError(
+            f"the data are a {type(train).__name__}; Dataset.from_pandas(frames, y=[...], u=[...]) "
+            "makes a Dataset of DataFrames, and read_bags one of bags"
+        )
     known = methods_of(model_class)
     chosen = known[0] if method is None else method
     for asked in (chosen, *(comparators or ())):

@@ -1,8 +1,6 @@
-"""Simulation and k-step prediction of any identified model, trial by trial, without time loops
-over single predictions: all starts advance together.
-"""
+"""Simulation of any identified model, and its prediction of one step, trial by trial."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,6 @@ from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.errors import DataError
 from nlsid_core.identification.polynomial.rollout import simulate_together
 from nlsid_core.models import (
     BlockCascade,
@@ -25,8 +22,6 @@ from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.starts import nearest_start
 
 Model = StableModel
-# [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
-Step = Callable[[list[FloatArray], slice], FloatArray]
 
 
 def history(model: Model) -> int:
@@ -91,48 +86,25 @@ def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArr
     return [simulate_trial(model, trial) for trial in trials]
 
 
-def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:
-    """(N - n - horizon + 1, n_y): ŷ(t) from measurements up to t - horizon, t = n + horizon - 1 ….
-
-    n is the model's history. A model that does not learn (`learns`) predicts what it simulates.
-    Raises DataError if the horizon is not positive or the trial is too short.
-    """
-    n, N = history(model), len(trial)
-    if horizon < 1 or n + horizon > N:
-        raise DataError(f"{trial.name}: a horizon of {horizon} needs 1 to {N - n} samples")
-    if isinstance(model, BlockCascade | CellNetwork):  # those that do not learn
-        return simulate_trial(model, trial)[n + horizon - 1 :]
-    step, lags = _step(model, trial)
-    starts = N - n - horizon + 1
-    past = [trial.y[n - k : n - k + starts] for k in range(1, lags + 1)]
-    predicted = past[0]
-    for ahead in range(horizon):
-        predicted = step(past, slice(ahead, ahead + starts))
-        past = [predicted, *past[:-1]]
-    return predicted
-
-
 def one_step_residual(model: Model, trial: Trajectory) -> FloatArray:
-    """(N - n, n_y): y(t) minus its prediction one sample ahead."""
-    return np.asarray(trial.y[history(model) :] - predict(model, trial, 1))
+    """(N - n, n_y): y(t) minus its prediction from the measurements before it, n the history.
 
-
-def _step(
-    model: DifferenceEquation | StateAffineModel | MonotoneEquation | ImplicitModel,
-    trial: Trajectory,
-) -> tuple[Step, int]:
-    """One step of the model at rows t = n …, in the outputs' units, and its number of lags."""
+    A model that does not learn (`learns`) predicts what it simulates.
+    """
+    n = history(model)
+    measured = trial.y[n:]
+    if isinstance(model, BlockCascade | CellNetwork):  # those that do not learn
+        return np.asarray(measured - simulate_trial(model, trial)[n:])
+    lags = model.lags if isinstance(model, ImplicitModel) else len(model)
+    past = [trial.y[n - k : len(trial) - k] for k in range(1, lags + 1)]
     if isinstance(model, MonotoneEquation):
-        return _monotone_step(model, trial), len(model)
+        return np.asarray(measured - _monotone_step(model, trial, past))
+    stacked = np.concatenate(past, axis=1)
     if isinstance(model, ImplicitModel):
-        return _implicit_step(model, trial), model.lags
+        predicted = model.step(stacked, model.windows(trial.u))
+        return np.asarray(measured - predicted[:, : model.unknowns])
     gains, forcing = _explicit(model, trial)
-
-    def step(past: list[FloatArray], rows: slice) -> FloatArray:
-        stacked = np.concatenate(past, axis=1)
-        return np.asarray(np.einsum("tij,tj->ti", gains[rows], stacked) + forcing[rows])
-
-    return step, len(model)
+    return np.asarray(measured - np.einsum("tij,tj->ti", gains, stacked) - forcing)
 
 
 def _explicit(
@@ -150,24 +122,14 @@ def _explicit(
     return gains, forcing * scale + offset - gains @ np.tile(offset, n)
 
 
-def _monotone_step(model: MonotoneEquation, trial: Trajectory) -> Step:
-    forcing, e = model.forcing(trial.u), tuple(model.e.tolist())
-
-    def step(past: list[FloatArray], rows: slice) -> FloatArray:
-        target = forcing[rows] + sum(
-            a * (y[:, 0] - model.y_offset) for a, y in zip(model.a, past, strict=True)
-        )
-        pairs = zip(target.tolist(), past[0][:, 0].tolist(), strict=True)
-        found = [solve_increasing(e, value, guess - model.y_offset) for value, guess in pairs]
-        return np.array(found)[:, None] + model.y_offset
-
-    return step
-
-
-def _implicit_step(model: ImplicitModel, trial: Trajectory) -> Step:
-    w = model.windows(trial.u)
-
-    def step(past: list[FloatArray], rows: slice) -> FloatArray:
-        return model.step(np.concatenate(past, axis=1), w[rows])[:, : model.unknowns]
-
-    return step
+def _monotone_step(
+    model: MonotoneEquation, trial: Trajectory, past: Sequence[FloatArray]
+) -> FloatArray:
+    """The outputs (T, 1) that solve the equation, from the outputs before them."""
+    target = model.forcing(trial.u) + sum(
+        a * (y[:, 0] - model.y_offset) for a, y in zip(model.a, past, strict=True)
+    )
+    pairs = zip(target.tolist(), past[0][:, 0].tolist(), strict=True)
+    e = tuple(model.e.tolist())
+    found = [solve_increasing(e, value, guess - model.y_offset) for value, guess in pairs]
+    return np.array(found)[:, None] + model.y_offset

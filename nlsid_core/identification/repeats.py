@@ -8,7 +8,6 @@ Source: Bartlett, "On the theoretical specification and sampling properties of a
 time-series", 1946; thesis assumptions (A1) and (A3).
 """
 
-from dataclasses import dataclass
 from itertools import combinations
 from statistics import NormalDist
 
@@ -24,43 +23,11 @@ LAGS = 20  # before and after, at which the response's difference is compared wi
 SHORTEST = 4 * LAGS  # samples: below, correlations at these lags mean nothing
 
 
-@dataclass(frozen=True)
-class RepeatTest:
-    """input_difference: rms over spread. correlation: the largest of the response difference with
-    the excitation, in standard deviations, at `lag` samples; limit: what chance explains.
-    """
+def compare_repeats(first: Trajectory, second: Trajectory, *, transient: int = 0) -> str:
+    """Say why two trials are not repeats, over their common samples after the first `transient`.
 
-    first: str
-    second: str
-    input_difference: float
-    correlation: float
-    lag: int
-    limit: float
-
-    @property
-    def passed(self) -> bool:
-        """True if nothing contradicts that these are repeats."""
-        return self.input_difference <= INPUT_TOLERANCE and self.correlation <= self.limit
-
-    def __str__(self) -> str:
-        if self.input_difference > INPUT_TOLERANCE:
-            return (
-                f"{self.first} and {self.second} are not repeats: their excitations differ by "
-                f"{self.input_difference:.0%} of their spread (at most {INPUT_TOLERANCE:.0%})"
-            )
-        if self.correlation > self.limit:
-            return (
-                f"{self.first} and {self.second} are not repeats: the difference of their "
-                f"responses correlates with the excitation {self.lag} samples before, "
-                f"{self.correlation:.1f} standard deviations (chance explains {self.limit:.1f})"
-            )
-        return f"{self.first} and {self.second}: nothing contradicts that they are repeats"
-
-
-def compare_repeats(first: Trajectory, second: Trajectory, *, transient: int = 0) -> RepeatTest:
-    """Compare two trials over their common samples, the first `transient` left out.
-
-    Raises DataError if they are shorter than SHORTEST samples or have a constant excitation.
+    Empty if nothing contradicts that they are. Raises DataError if they are shorter than SHORTEST
+    samples or have a constant excitation.
     """
     N = min(len(first), len(second))
     if N - transient < SHORTEST:
@@ -73,23 +40,29 @@ def compare_repeats(first: Trajectory, second: Trajectory, *, transient: int = 0
     spread = u.std(axis=0)
     if not (spread > 0).all():
         raise DataError(f"{first.name}: a constant excitation; repeats of it cannot be compared")
-    input_difference = float(np.max(np.sqrt(np.mean((u - other) ** 2, axis=0)) / spread))
+    apart = float(np.max(np.sqrt(np.mean((u - other) ** 2, axis=0)) / spread))
+    not_repeats = f"{first.name} and {second.name} are not repeats"
+    if apart > INPUT_TOLERANCE:
+        return (
+            f"{not_repeats}: their excitations differ by {apart:.0%} of their spread (at most "
+            f"{INPUT_TOLERANCE:.0%})"
+        )
     difference = first.y[rows] - second.y[rows]
     crossed, deviation = cross_correlation([difference], [(u + other) / 2], LAGS)
     scores = np.abs(crossed) / deviation[:, :, None]
     lag = int(np.argmax(scores.max(axis=(0, 1)))) - LAGS
     limit = NormalDist().inv_cdf(1.0 - LEVEL / (2.0 * scores.size))
-    correlation = float(scores.max())
-    return RepeatTest(first.name, second.name, input_difference, correlation, lag, limit)
+    if scores.max() <= limit:
+        return ""
+    return (
+        f"{not_repeats}: the difference of their responses correlates with the excitation {lag} "
+        f"samples before, {scores.max():.1f} standard deviations (chance explains {limit:.1f})"
+    )
 
 
-def refuse_false_repeats(data: Dataset, *, transient: int = 0) -> tuple[RepeatTest, ...]:
+def refuse_false_repeats(data: Dataset, *, transient: int = 0) -> None:
     """Compare every pair of every group; DataError names the first pair that is not a repeat."""
-    tests = []
     for members in data.repeats().values():
         for first, second in combinations(members, 2):
-            test = compare_repeats(first, second, transient=transient)
-            if not test.passed:
-                raise DataError(str(test))
-            tests.append(test)
-    return tuple(tests)
+            if said := compare_repeats(first, second, transient=transient):
+                raise DataError(said)

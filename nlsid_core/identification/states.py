@@ -47,19 +47,14 @@ def identify_states(
     validation: Dataset,
     *,
     degrees: Sequence[tuple[int, ...]] | None = None,
-    refuse_above: float = REFUSED_ERROR,
-    biased_without_repeats: bool = False,
 ) -> StateFit:
     """Fit x⁺ = f(x, u) to repeats; trajectories hold the measured state in y.
 
     degrees: classes to try, the highest power of each of [x; u]; default `classes_to_try`. The
-    least free-run error on `validation` wins. biased_without_repeats: least squares on single runs,
-    for recordings that have no repeats. Raises DataError if there are none and that was not asked
-    for, or if no class describes the data to `refuse_above` %, saying where they fail.
+    least free-run error on `validation` wins. Raises DataError if there are no repeats, or if no
+    class describes the data to REFUSED_ERROR %, saying where they fail.
     """
     groups = list(train.repeats().values())
-    if not groups and biased_without_repeats:
-        groups = [(trial,) for trial in train]
     if not groups:
         raise DataError("no excitation was repeated; record each at least twice, same inputs")
     for members in groups:
@@ -83,11 +78,11 @@ def identify_states(
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
             best = StateFit(model, error, ())
-    if best is None or not best.error <= refuse_above:
+    if best is None or not best.error <= REFUSED_ERROR:
         reached = f"the best gets {best.error:.3g} %" if best else "the excitation determines none"
         raise DataError(
-            f"no polynomial map describes this data to {refuse_above:g} % in free run ({reached}); "
-            + ("" if best is None else where_it_fails(best.model, train))
+            f"no polynomial map describes this data to {REFUSED_ERROR:g} % in free run "
+            f"({reached}); " + ("" if best is None else where_it_fails(best.model, train))
         )
     return StateFit(best.model, best.error, tuple(tried))
 
@@ -185,7 +180,7 @@ def _instrumented(
     for members in groups:
         total = np.sum([member.y for member in members], axis=0)
         for member in members:
-            others = (total - member.y) / (len(members) - 1) if len(members) > 1 else total
+            others = (total - member.y) / (len(members) - 1)
             instruments = monomials_at(others, member.u[:-1])
             moments += instruments.T @ monomials_at(member.y, member.u[:-1])
             target += instruments.T @ np.diff(member.y, axis=0)

@@ -7,11 +7,11 @@ ones, in standard deviations, is held against the quantile that all of them exce
 Source: Bartlett 1946; Ljung, System Identification, Section 16.6.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.signal import correlate, lfilter
 from scipy.stats import chi2, norm
 
 from nlsid_core.arrays import FloatArray
@@ -22,16 +22,14 @@ from nlsid_core.identification.prediction import (
     history,
     learns,
     one_step_residual,
-    predict,
     simulate_trial,
     simulate_trials,
 )
-from nlsid_core.models import StateAffineModel
+from nlsid_core.models import DifferenceEquation, StateAffineModel
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
 LAGS = 20
-HORIZONS = (1, 5, 20)
 DIVERGED = 1e100  # a residual whose square no sum of squares should meet
 
 
@@ -64,8 +62,8 @@ class Validation:
 
     simulation_percent: 100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation, output_percent of each output
     alone; fit_percent: 100 minus it. output_rms: of y - ŷ of each output with its name and unit.
-    prediction_percent: of the k-step predictions, by horizon k; empty of a model that predicts
-    what it simulates (`learns`). clipped_percent: of the samples with an input beyond the model's
+    one_step_percent: of the predictions one step ahead; None of a model that predicts what it
+    simulates (`learns`). clipped_percent: of the samples with an input beyond the model's
     range, where the model uses the nearest in the range instead.
     one_step is white where noise enters the equation, simulation where it enters the measurement:
     under a model that explains everything one of them is; they are the same where nothing is
@@ -75,7 +73,7 @@ class Validation:
     simulation_percent: float
     output_percent: tuple[float, ...]
     output_rms: tuple[tuple[str, float, str], ...]
-    prediction_percent: dict[int, float]
+    one_step_percent: float | None
     one_step: Residual
     simulation: Residual
     samples: int
@@ -86,34 +84,20 @@ class Validation:
         """100·(1 - ‖y - ŷ‖/‖y - mean(y)‖)."""
         return 100.0 - self.simulation_percent
 
-    @property
-    def white(self) -> bool:
-        """Whether one of the two residuals is white."""
-        return self.one_step.white or self.simulation.white
-
-    @property
-    def independent(self) -> bool:
-        """Whether neither residual follows the input."""
-        return self.one_step.independent and self.simulation.independent
-
     def __str__(self) -> str:
-        ahead = ", ".join(f"{k}: {p:.2f} %" for k, p in self.prediction_percent.items())
         predicted = [
-            f"prediction error, steps ahead: {ahead}",
+            f"prediction error, one step ahead: {self.one_step_percent or 0.0:.2f} %",
             f"one-step residual is {self.one_step}",
         ]
+        if self.one_step_percent is None:
+            predicted = [
+                "prediction error: -, as this class of models predicts what it simulates: it "
+                "learns nothing from outputs after the start"
+            ]
         lines = [
             f"simulation error {self.simulation_percent:.2f} % (fit {self.fit_percent:.2f} %) "
             f"over {self.samples} samples",
-            *(
-                predicted
-                if ahead
-                else [
-                    "prediction error: -, as this class of models predicts "
-                    "what it simulates: it learns nothing from outputs after "
-                    "the start"
-                ]
-            ),
+            *predicted,
             f"simulation residual is {self.simulation}",
         ]
         rms = []
@@ -134,30 +118,18 @@ class Validation:
         return "\n".join(lines)
 
 
-def validate(
-    model: Model,
-    dataset: Dataset,
-    *,
-    horizons: Sequence[int] | None = None,
-    lags: int | None = None,
-    transient: int = 0,
-) -> Validation:
+def validate(model: Model, dataset: Dataset, *, transient: int = 0) -> Validation:
     """Score `model` on every trial of `dataset`, all but its first `transient` samples.
 
-    horizons, lags: None is HORIZONS and LAGS as far as the shortest trial allows.
-    Raises DataError if a trial is too short.
+    Raises DataError if a trial is too short for correlations.
     """
     first = max(history(model), transient)
     shortest = min(dataset, key=len)
     room = len(shortest) - first - 1
-    lags = min(LAGS, room // 2) if lags is None else lags
-    horizons = [k for k in HORIZONS if k <= room] if horizons is None else horizons
-    horizons = horizons if learns(model) else []
-    longest = max(1, 2 * lags, *horizons)
-    if room < longest or lags < 1:
+    lags = min(LAGS, room // 2)
+    if lags < 1:
         raise DataError(
-            f"{shortest.name}: {len(shortest)} samples; horizons {tuple(horizons)} and {lags} "
-            f"correlation lags need more than {first + longest}"
+            f"{shortest.name}: {len(shortest)} samples; correlations need more than {first + 2}"
         )
     inputs = [trial.u[first:] for trial in dataset]
     simulated = _simulated(model, dataset, first)
@@ -165,6 +137,8 @@ def validate(
     one_step = [one_step_residual(model, trial)[late:] for trial in dataset]
     with np.errstate(over="ignore", invalid="ignore"):
         left = [measured - outputs for measured, outputs in simulated]
+        pairs = zip(dataset, one_step, strict=True)
+        predicted = [(trial.y[first:], trial.y[first:] - error) for trial, error in pairs]
     return Validation(
         simulation_percent=_percent(simulated),
         output_percent=tuple(
@@ -178,9 +152,7 @@ def validate(
             )
         ),
         clipped_percent=_clipped_percent(model, dataset),
-        prediction_percent={
-            k: prediction_percent(model, dataset, k, transient=transient) for k in horizons
-        },
+        one_step_percent=_percent(predicted) if learns(model) else None,
         one_step=residual_tests(one_step, inputs, lags),
         simulation=residual_tests(left, inputs, lags),
         samples=sum(len(trial) - first for trial in dataset),
@@ -229,23 +201,6 @@ def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) ->
     return _percent(_simulated(model, dataset, max(history(model), transient)))
 
 
-def prediction_percent(
-    model: Model, dataset: Dataset, horizon: int, *, transient: int = 0
-) -> float:
-    """The same error, over the same samples, of predictions `horizon` samples ahead.
-
-    The first samples are predicted from the start of the trial, which is less than that ahead.
-    """
-    n, first = history(model), max(history(model), transient)
-    pairs = []
-    with np.errstate(over="ignore", invalid="ignore"):
-        for trial in dataset:
-            start = simulate_trial(model, trial)[: n + horizon - 1]
-            predicted = np.concatenate([start, predict(model, trial, horizon)])
-            pairs.append((trial.y[first:], predicted[first:]))
-    return _percent(pairs)
-
-
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
@@ -268,7 +223,7 @@ def _clipped_percent(model: Model, dataset: Dataset) -> float:
     return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
-def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
+def _percent(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
     spread = np.maximum(centred.std(axis=0), np.finfo(float).tiny)
@@ -309,3 +264,29 @@ def cross_correlation(
             product = _correlation(e, e, horizon) * _correlation(u, u, horizon)
             variances[i, j] = max(float(product.sum()), 1.0)
     return cross, np.sqrt(variances / N)
+
+
+def compare(data: Dataset, models: Mapping[str, Model]) -> dict[str, float]:
+    """Simulate models on the same trials: the error of each in %, 100·‖y - ŷ‖/‖y - mean(y)‖."""
+    return {name: simulation_percent(model, data) for name, model in models.items()}
+
+
+def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
+    """Give the standard errors (2n+2,) of a, b and c, in this order, by trials they were fitted to.
+
+    They are right where the simulation's errors are white; `validate` says whether they are.
+    J = ∂ŷ/∂(a, b, c) is the row of the equation through the filter 1/(1 - Σ a_k z⁻ᵏ), and the
+    covariance σ² (J'J)⁻¹. Source: Ljung, System Identification, Section 9.3, of an output error.
+    """
+    n = len(model)
+    parts = []
+    for trial in data:
+        simulated, u = simulate_trial(model, trial)[:, 0], trial.u[:, 0]
+        past = [simulated[n - k : len(u) - k] for k in range(1, n + 1)]
+        driven = [u[n - j : len(u) - j] for j in range(n + 1)]
+        rows = np.column_stack([*past, *driven, np.ones(len(u) - n)])
+        moved = lfilter([1.0], np.append(1.0, -model.a), rows, axis=0)
+        parts.append(np.column_stack([moved, (trial.y[:, 0] - simulated)[n:]]))
+    J, e = np.split(np.concatenate(parts), [-1], axis=1)
+    covariance = np.linalg.inv(J.T @ J) * np.sum(e**2) / (len(e) - J.shape[1])
+    return np.asarray(np.sqrt(np.diag(covariance)))

@@ -59,7 +59,7 @@ CommandLevel = list[tuple[Fraction, Members]]  # weights, not negative, some pos
 
 SENTENCE = (
     "tube: the measured {names} within {widths} of what the model predicts from the inputs alone, "
-    "{where}, for {lasting}, as long as what is assumed is kept{remarks}{others}{plan}"
+    "{where}, for {lasting}, as long as its assumptions hold{remarks}{others}{plan}"
 )
 ALSO = "; also within {widths} for {lasting}{remarks}"
 PLAN = (

@@ -54,6 +54,13 @@ class DifferenceEquation(Recorded):
         """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n."""
         return np.roots(np.concatenate([[1.0], -self.a])).astype(np.complex128)
 
+    @property
+    def equation(self) -> str:
+        """The equation with its numbers, in four digits."""
+        past = [f"{a:+.4g} y(t-{k})" for k, a in enumerate(self.a.tolist(), 1)]
+        driven = [f"{b:+.4g} u(t-{j})" for j, b in enumerate(self.b.tolist())]
+        return f"y(t) = {' '.join((*past, *driven))} {self.c:+.4g}".replace("(t-0)", "(t)")
+
     # Observer form, the state of every later proof: x_i is the part of y(t+i-1) that is already
     # determined before sample t. With ŷ = x₁ + b₀u + c,
     #   x⁺ = a ŷ + shift(x) + b₁..ₙ u = A x + B u + f,   y = C x + D u + c.
@@ -106,10 +113,12 @@ class DifferenceEquation(Recorded):
 
         The first n outputs are y_start itself.
         """
-        inputs, start = np.asarray(u, dtype=np.float64), np.asarray(y_start, dtype=np.float64)
+        inputs, start = (np.atleast_1d(np.squeeze(np.array(x, float))) for x in (u, y_start))
         n = len(self)
         if inputs.ndim != 1 or len(inputs) < n or start.shape != (n,):
-            raise ShapeError(f"u should be (N,), N >= {n}, y_start ({n},)")
+            raise ShapeError(
+                f"u should be (N,), N >= {n}, y_start ({n},): {inputs.shape}, {start.shape}"
+            )
         forcing = np.convolve(inputs, self.b)[n : len(inputs)] + self.c
         outputs = np.concatenate([start, forcing])
         backwards = self.a[::-1]

@@ -1,4 +1,4 @@
-"""`nlsid identify --check`, and the page that lists every key of a configuration."""
+"""What a configuration may not say, and the page that lists every key of one."""
 
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -7,13 +7,14 @@ import pytest
 import yaml
 from pydantic import TypeAdapter
 
-from bags.chain.config import Config
+from bags.chain.config import Config, load_config
 from bags.chain.sections import Section, sections_in
 from bags.chain.shipped import config_file
 from bags.chain.templates import TEMPLATES, option_texts
 from bags.chain.tracking_config import TrackingConfig
 from bags.samples import f1tenth
 from docs.site import configuration
+from nlsid_core.errors import DataError
 from nlsid_core.identification import METHODS
 from tests.house.sources import ROOT
 from tests.verbs import nlsid
@@ -22,37 +23,11 @@ CONFIG = config_file("f1tenth.yaml")
 PAGE = ROOT / "docs" / "configuration.md"
 
 
-def check(*arguments: object, status: int = 0) -> str:
-    path, *bags = arguments
-    given = ("identify", "DIR", *(bags or f1tenth()), "--config", path, "--check")
-    return nlsid(*given, status=status)
-
-
 def edited(path: Path, **changes: Any) -> Path:
     """The shipped configuration with whole keys changed; None leaves one out."""
     content = yaml.safe_load(CONFIG.read_text()) | changes
     path.write_text(yaml.safe_dump({k: v for k, v in content.items() if v is not None}))
     return path
-
-
-def test_nothing_is_wrong_with_the_shipped_configurations() -> None:
-    assert "nothing is wrong with it for 41 bags" in check(CONFIG, *f1tenth())
-    for name in ("arm.yaml", "pendulum.yaml"):
-        assert "nothing is wrong" in check(config_file(name))
-
-
-def test_a_configuration_that_does_not_fit_its_bags_says_all_at_once(tmp_path: Path) -> None:
-    signals = {
-        "response": {"name": "speed", "path": "/odom:twist.twist.linear.v"},
-        "excitation": {"name": "command", "path": "/cmd:twist.linear.x"},
-    }
-    path = edited(tmp_path / "robot.yaml", signals=signals, split={"test": ["trial_05", "run_1"]})
-    output = check(path, *f1tenth(), status=1)
-    assert "Field 'v' does not exist on 'geometry_msgs/msg/Vector3'" in output
-    assert "/cmd" in output
-    assert "trial_01 and 40 more" in output
-    assert "split.test names run_1; the bags are " in output
-    assert len(output.splitlines()) == 3
 
 
 @pytest.mark.parametrize(
@@ -65,28 +40,24 @@ def test_a_configuration_that_does_not_fit_its_bags_says_all_at_once(tmp_path: P
 def test_a_plan_that_no_controller_could_drive_is_refused(
     tmp_path: Path, changes: dict[str, Any], said: str
 ) -> None:
-    output = check(edited(tmp_path / "robot.yaml", **changes), status=1)
-    assert "funnel.profile: a plan is driven by commands that carry the stamps" in output
-    assert said in output
-    unplanned = edited(tmp_path / "b.yaml", **changes, funnel={"safety_factor": 1.5})
-    assert "nothing is wrong" in check(unplanned)
+    with pytest.raises(DataError, match=f"funnel.profile: a plan is driven .*{said}"):
+        load_config(edited(tmp_path / "robot.yaml", **changes))
+    load_config(edited(tmp_path / "b.yaml", **changes, funnel={"safety_factor": 1.5}))
 
 
-def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(tmp_path: Path) -> None:
-    path = edited(tmp_path / "a.yaml", split=None)
-    assert "none of the bags is a test trial" in check(path, *f1tenth(), status=1)
-    path = edited(tmp_path / "b.yaml", split={"test": ["trial_05"]})
+@pytest.mark.parametrize(
+    ("split", "said"),
+    [
+        (None, "none of the bags is a test trial"),
+        ({"test": ["trial_05"]}, "all of the bags are test trials"),
+    ],
+)
+def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(
+    tmp_path: Path, split: dict[str, Any] | None, said: str
+) -> None:
+    path = edited(tmp_path / "robot.yaml", split=split)
     only = [bag for bag in f1tenth() if bag.name == "trial_05"]
-    assert "all of the bags are test trials" in check(path, *only, status=1)
-
-
-def test_wrong_keys_end_with_status_1(tmp_path: Path) -> None:
-    path = edited(tmp_path / "robot.yaml", grid={"perid": 0.025, "max_gap": -1})
-    output = check(path, status=1)
-    assert "grid.perid: there is no such key" in output
-    assert "did you mean 'period'?" in output
-    assert "grid.max_gap: Input should be greater than 0, in s (found -1)" in output
-    assert "grid.period: Field required" in output
+    assert said in nlsid("identify", tmp_path, *only, "--config", path, status=None)
 
 
 def test_the_page_of_every_key_is_up_to_date() -> None:

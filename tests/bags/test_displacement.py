@@ -63,7 +63,7 @@ def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path
     nlsid("identify", out, *bags, "--config", config)
     designed = nlsid("funnel", out, "--config", config)
     said = " ".join(re.sub(r"[│\n]", " ", designed).split())
-    found = re.search(r"half-width (\S+) m of position, for ever", said)
+    found = re.search(r"position stays within (\S+) m of the model's simulation", said)
     moves = re.search(r"moves in at most 1 s is within (\S+) m of what the simulation moves", said)
     assert found
     assert moves

@@ -255,7 +255,7 @@ def test_trials_of_different_sample_times_are_refused(tmp_path: Path) -> None:
     ("step", "n"), [(0.1, 100), (0.1, 391), (0.004, 936), (1 / 3, 7), (2e-10, 9)]
 )
 def test_the_period_of_whole_nanoseconds_is_that_number(step: float, n: int) -> None:
-    trajectory = Trajectory(step * np.arange(n), np.zeros((n, 1)), np.zeros((n, 1)))
+    trajectory = Trajectory(t=step * np.arange(n), y=np.zeros((n, 1)), u=np.zeros((n, 1)))
     assert trajectory.period == pytest.approx(step, rel=1e-12)
     if step in (0.1, 0.004):
         assert trajectory.period == step

@@ -170,7 +170,7 @@ def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
 ) -> None:
     section = {"model": "state_affine", "lags": 2, "right_degree": 2}
     config = write_config(tmp_path / "c.yaml", section, outputs=2, inputs=2)
-    made = nlsid("identify", tmp_path / "out", coupled, "--config", config)
+    made = nlsid("identify", tmp_path / "out", coupled, "--config", config, "--verbose")
     assert "simulation error of each output:" in made
     checked = nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
     assert checked.startswith("PROVED incremental stability")

@@ -50,8 +50,7 @@ YAW = "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"
 
 
 def whole_way(bags: Path, config: Path, out: Path) -> str:
-    """Check, identify, design, decide, replay: what the last of them says."""
-    assert "nothing is wrong" in nlsid("identify", out, bags, "--config", config, "--check")
+    """Identify, design, decide, replay: what the last of them says."""
     nlsid("identify", out, bags, "--config", config)
     nlsid("funnel", out, "--config", config)
     said = nlsid("check", out)

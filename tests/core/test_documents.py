@@ -79,15 +79,10 @@ def test_a_funnel_reads_back_bit_for_bit_with_every_promised_name(tmp_path: Path
         assert again.volume(t) == funnel.volume(t) > 0
 
 
-def test_value_and_gradient_agree_at_many_times_and_states() -> None:
-    funnel, rng, step = random_funnel(), np.random.default_rng(8), 1e-6
+def test_the_boundary_is_where_the_value_is_1_at_many_times() -> None:
+    funnel, rng = random_funnel(), np.random.default_rng(8)
     for t in rng.uniform(funnel.t0, funnel.tf, 10).tolist():
         X = rng.normal(size=(50, 3))
-        gradient = funnel.gradient(t, X)
-        for j in range(3):
-            ahead, behind = X + step * np.eye(3)[j], X - step * np.eye(3)[j]
-            slope = (funnel.value(t, ahead) - funnel.value(t, behind)) / (2 * step)
-            assert gradient[:, j] == pytest.approx(slope, rel=1e-5, abs=1e-5)
         inside = funnel.boundary(t, X / np.linalg.norm(X, axis=1)[:, None])
         assert funnel.value(t, inside) == pytest.approx(np.ones(50))
 

@@ -77,7 +77,7 @@ def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
     assert fit["rse"].error_percent(train) == pytest.approx(
         linear["rse"].error_percent(train), rel=1e-4
     )
-    assert set(fit.methods) >= {"least_squares", "rse_certified"}
+    assert set(fit.errors["train"]) >= {"least_squares", "rse_certified"}
     lagged = np.array([g.coefficients[0, 0, 0] for g in fit.model.G])
     np.testing.assert_allclose(-lagged[1:] / lagged[0], TRUE_A, atol=0.02)
 
@@ -106,7 +106,7 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
     stable = identify(data, Polynomial(1), method=Rse(certified=True))
     assert stable.proof.rate < 1.0
     scores = validate(stable.model, data)
-    assert not scores.white
+    assert not scores.simulation.white
     assert "NOT white" in str(scores)
     report = page(stable, {"training": data, "test": data}, robot="unstable")
     assert "simulation residual is NOT white (99 %)" in report

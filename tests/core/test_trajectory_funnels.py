@@ -272,7 +272,7 @@ def test_piecewise_polynomials_meet_their_samples() -> None:
         PiecewisePolynomial(np.array([0.0, 1.0, 1.0]), np.zeros((2, 2, 1)))
 
 
-def test_value_gradient_volume_and_outline_agree() -> None:
+def test_value_volume_and_outline_agree() -> None:
     x = constant_on([0.0, 1.0], [[1.0, 2.0]])
     funnel = ContinuousFunnel(x, np.array([np.diag([4.0, 1.0])] * 2), np.array([1.0, 4.0]), "", "")
     assert funnel.volume(0.0) == pytest.approx(np.pi / 2)
@@ -280,9 +280,6 @@ def test_value_gradient_volume_and_outline_agree() -> None:
     points = funnel.outline(0.5, (0, 1))
     assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
     assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
-    step = 1e-6
-    moved = (funnel.value(0.5, points + np.array([step, 0])) - funnel.value(0.5, points)) / step
-    assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
     assert ellipsoid_inside([1, 2], np.eye(2), funnel.nominal(1.0), funnel.shape(1.0)) is not None
     assert ellipsoid_inside(funnel.nominal(1.0), funnel.shape(1.0), [1, 2], np.eye(2)) is None
 

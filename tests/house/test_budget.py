@@ -11,8 +11,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_594,
-    ("bags",): 12_031,
+    ("nlsid_core",): 18_590,
+    ("bags",): 12_029,
     ("nlsid_ros",): 2_663,
     ("tests",): 23_001,
     ("benchmarks", "examples"): 3_805,

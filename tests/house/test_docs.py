@@ -116,7 +116,7 @@ def test_figures_that_are_alike_stand_side_by_side(tmp_path: Path) -> None:
         "result": result,
     }
     (tmp_path / "kernel.json").write_text(json.dumps(written))
-    tables = measured.page(tmp_path, ROOT / "benchmarks").partition("on one:")[2]
+    tables = measured.page(tmp_path, ROOT / "benchmarks").partition("on one, commit 00000000:")[2]
     rows = [line for line in tables.splitlines() if line and not line.startswith("|---")]
     assert rows == [
         "|  | value |",

@@ -80,7 +80,7 @@ def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) 
     wide = [up(tube["half_widths"][0]) for tube in (lasting, energy)]
     assert verdict.statement == (
         f"tube: the measured speed stays within {wide[0]} m/s of what the model predicts from the "
-        "inputs alone, for every input, for ever, as long as what is assumed is kept (tube 1); "
+        "inputs alone, for every input, for ever, as long as its assumptions hold (tube 1); "
         f"also within {wide[1]} m/s for 70 samples, which span {span} s (tube 2); and as near the "
         "policy's plan, which is the simulation from its start under its inputs, for at most its "
         f"70 samples, which span {span} s, whether those inputs are played, the policy is engaged "

@@ -1,0 +1,90 @@
+"""What people see and call in a notebook: short texts, pandas, python-control, standard errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nlsid import compare, identify, standard_errors, to_control
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import Fit, Polynomial
+from nlsid_core.models import DifferenceEquation
+
+LONGEST = 2000  # characters of what a cell's last line prints
+
+
+def test_what_a_cell_ends_with_is_short(
+    train: Dataset, fit: Fit[DifferenceEquation], design: OutputTubeDesign
+) -> None:
+    for shown in (train, train.trajectories[0], fit, fit.model, design):
+        assert 20 < len(repr(shown)) <= LONGEST
+    assert "<svg" in train._repr_html_()
+    assert len(train._repr_html_()) <= LONGEST
+
+
+def test_data_frames_are_trials(train: Dataset) -> None:
+    pandas = pytest.importorskip("pandas")
+    tables = {
+        trial.name: pandas.DataFrame(
+            {"speed": trial.y[:, 0], "command": trial.u[:, 0]},
+            pandas.Timestamp("2026-01-01") + pandas.to_timedelta(trial.t, "s"),
+        )
+        for trial in train
+    }
+    made = Dataset.from_pandas(tables, y=["speed"], u=["command"])
+    assert made.names == train.names
+    assert made.period == train.period
+    for one, other in zip(made, train, strict=True):
+        np.testing.assert_array_equal(np.hstack([one.y, one.u]), np.hstack([other.y, other.u]))
+    with pytest.raises(DataError, match="not on a uniform grid"):
+        Dataset.from_pandas(tables["run_0"].drop(index=tables["run_0"].index[3]), y=["speed"], u=[])
+    with pytest.raises(DataError, match=r"DataFrame.*from_pandas"):
+        identify(tables["run_0"], Polynomial(2))
+
+
+def test_a_trials_own_columns_are_simulated(train: Dataset, fit: Fit[DifferenceEquation]) -> None:
+    trial = train.trajectories[0]
+    outputs = fit.model.simulate(trial.u, trial.y[:2])
+    np.testing.assert_array_equal(outputs, fit.model.simulate(trial.u[:, 0], trial.y[:2, 0]))
+    with pytest.raises(ShapeError, match=r"\(80,\), \(3,\)"):
+        fit.model.simulate(trial.u, trial.y[:3])
+
+
+def test_models_are_compared_on_the_same_trials(
+    train: Dataset, fit: Fit[DifferenceEquation]
+) -> None:
+    worse = replace(fit.model, c=fit.model.c + 0.1)
+    found = compare(train, {"fitted": fit.model, "off": worse})
+    assert found["fitted"] == fit.errors["train"][fit.method.name] < found["off"]
+    assert fit.model.equation in str(fit)
+
+
+@pytest.mark.pictures  # python-control imports matplotlib
+def test_python_control_steps_like_the_model(fit: Fit[DifferenceEquation]) -> None:
+    control = pytest.importorskip("control")
+    model = replace(fit.model, c=0.0)
+    stepped = control.step_response(to_control(model), T=np.arange(50) * model.period)
+    inputs = np.concatenate([np.zeros(2), np.ones(50)])
+    simulated = model.simulate(inputs, np.zeros(2))[2:]
+    np.testing.assert_allclose(np.squeeze(stepped.outputs), simulated, atol=1e-9)
+
+
+def test_standard_errors_are_those_of_the_differences(
+    train: Dataset, fit: Fit[DifferenceEquation]
+) -> None:
+    """By how much the simulations change with each coefficient, by finite differences."""
+    model, step = fit.model, 1e-6
+    given = np.concatenate([model.a, model.b, [model.c]])
+
+    def simulated(moved: np.ndarray) -> np.ndarray:
+        other = replace(model, a=moved[:2], b=moved[2:5], c=float(moved[5]))
+        return np.concatenate([other.simulate(t.u, t.y[:2])[2:] for t in train])
+
+    rows = [simulated(given + d) - simulated(given - d) for d in step * np.eye(6)]
+    J = np.array(rows).T / (2.0 * step)
+    errors = np.concatenate([t.y[2:, 0] for t in train]) - simulated(given)
+    covariance = np.linalg.inv(J.T @ J) * (errors @ errors) / (len(errors) - 6)
+    found = standard_errors(model, train)
+    np.testing.assert_allclose(found, np.sqrt(np.diag(covariance)), rtol=1e-3)
