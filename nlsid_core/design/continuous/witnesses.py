@@ -66,7 +66,7 @@ def stated_multipliers(pieces: Pieces) -> Pieces:
 
 def _factors(S: FloatArray) -> Json:
     """S (2, n+1, n+1) at both ends as factors in 1 and x̄; what is not used is charged least."""
-    used = np.diagonal(S, axis1=1, axis2=2).any(axis=0)
+    used = np.asarray(np.diagonal(S, axis1=1, axis2=2).any(axis=0))
     if not used.any():
         return {"columns": [0] * len(used), "squares": {"unit": 0, "factors": [[]]}}
     found = multiplier(affine(len(used) - 1), S, bits=TAU_BITS)
