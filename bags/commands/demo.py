@@ -92,18 +92,18 @@ def _driven(out: Path, console: Console, shown: Shown) -> bool:
     bags = shown.bags[0].parent
     _step(console, "1  identify a model from recordings", f"identify {out} {bags}")
     result = models_cli.identify_here(shown.bags, settings, out)
-    _say(console, f"{len(result.train)} recordings made it. {show.worth(result)}")
-    _say(console, "The commands alone tell what will be measured, and no command upsets the model.")
+    show.say(console, f"{len(result.train)} recordings made it. {show.worth(result)}")
+    show.say(console, "Commands alone tell what will be measured, and none upsets the model.")
 
     _step(console, "2  prove a tube around it", f"funnel {out}")
     design = designs_cli.tube(out, settings)
-    _say(console, show.promise(design))
-    _say(console, "A robot that leaves the tube is not the robot that was recorded.")
+    show.say(console, show.promise(design))
+    show.say(console, "A robot that leaves the tube is not the robot that was recorded.")
 
     _step(console, "3  check both proofs", f"check {out}")
     for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
-        _say(details, str(check(out / name)))
-    _say(
+        show.say(details, str(check(out / name)))
+    show.say(
         console, "Both hold in exact arithmetic, with no solver: nobody needs to trust the search."
     )
 
@@ -114,9 +114,9 @@ def _driven(out: Path, console: Console, shown: Shown) -> bool:
     live = _live(console, shown, out)
 
     console.rule()
-    _say(console, f"{'; '.join(sentences)}.")
-    _say(console, f"Look at {out / OTHERS_PLOT} and {out / documents.REPORT}.")
-    _say(console, "Your own recordings: nlsid learn BAG... --out DIR")
+    show.say(console, f"{'; '.join(sentences)}.")
+    show.say(console, f"Look at {out / OTHERS_PLOT} and {out / documents.REPORT}.")
+    show.say(console, "Your own recordings: nlsid learn BAG... --out DIR")
     return right and live
 
 
@@ -152,7 +152,7 @@ def _monitor(console: Console, shown: Shown, settings: Config, out: Path) -> tup
     details.print(show.replay_table(replays))
     inside = sum(replay.verdict == Status.INSIDE.value for replay in replays)
     sentences = [f"{inside} of {len(replays)} healthy recordings inside"]
-    _say(console, sentences[0])
+    show.say(console, sentences[0])
 
     right, every = inside == len(replays), []
     with tempfile.TemporaryDirectory() as folder:
@@ -161,13 +161,12 @@ def _monitor(console: Console, shown: Shown, settings: Config, out: Path) -> tup
             details.print(show.replay_table(others))
             said, all_flagged = _flagged(what, others)
             sentences.append(said)
-            _say(console, said)
+            show.say(console, said)
             right = right and (shown.floors.get(what, False) or all_flagged)
             every += others
     if drawable(every):
         write_margins(out / OTHERS_PLOT, every)
-    if shown.said:
-        _say(console, shown.said)
+    show.say(console, shown.said)
     return right, sentences
 
 
@@ -202,9 +201,9 @@ def _others(
 def _live(console: Console, shown: Shown, out: Path) -> bool:
     """Run the live part in processes of its own; True where ROS is not there to run it."""
     if importlib.util.find_spec("rclpy") is None:
-        _say(console, "skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
+        show.say(console, "skipped: there is no rclpy (pip install 'nlsid[ros]', or a ROS shell)")
         return True
-    _say(console, "recorder, publisher, monitor and player as processes; two trials in real time")
+    show.say(console, "Recorder, publisher, monitor and player run; two trials are played.")
     recording = out / "live"
     shutil.rmtree(recording, ignore_errors=True)
     trial = next(bag for bag in shown.bags if bag.name == shown.live)
@@ -214,9 +213,9 @@ def _live(console: Console, shown: Shown, out: Path) -> bool:
     ]
     with progress_bar("playing"):
         done = subprocess.run(command, check=False, capture_output=True, text=True)
-    _say(console, (done.stdout + done.stderr).strip())
+    show.say(console, (done.stdout + done.stderr).strip())
     if done.returncode:
-        _say(console, f"to repeat this step alone: {shlex.join(['python', *command[1:]])}")
+        show.say(console, f"to repeat this step alone: {shlex.join(['python', *command[1:]])}")
     return done.returncode == 0
 
 
@@ -224,8 +223,4 @@ def _step(console: Console, title: str, command: str) -> None:
     """A heading, and the command that does the same."""
     console.print()
     console.rule(title, align="left")
-    _say(console, f"$ nlsid {command}")
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
+    show.say(console, f"$ nlsid {command}")

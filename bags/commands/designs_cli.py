@@ -242,8 +242,12 @@ def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False)
 
 
 def _proofs(path: Path) -> list[Path]:
-    """The proofs in a folder; the path itself if it is none, or has none."""
-    return (sorted(path.glob("*.proof.json")) if path.is_dir() else []) or [path]
+    """The proofs in a folder; the path itself if it is none."""
+    if path.is_dir() and not any(path.glob("*.proof.json")):
+        raise DocumentError(
+            f"{path} has no FILE.proof.json: `nlsid identify` and `nlsid funnel` write them"
+        )
+    return sorted(path.glob("*.proof.json")) if path.is_dir() else [path]
 
 
 def report(

@@ -21,6 +21,7 @@ from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, drawable, repo
 from bags.pictures.tables import html
 from bags.tools.info import BagInfo
 from nlsid_core import proofs
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DocumentError, NlsidError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
@@ -33,6 +34,7 @@ figure { margin: 1rem 0 } figure img { max-width: 100% }
 section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
 td code { white-space: normal }
 @media screen and (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem }
+  pre { font-size: 7.5px; overflow-x: auto }
   svg, figure img { max-width: 200% } }
 @page { size: A4; margin: 15mm }
 @media print { nav { display: none } h2, h3 { break-after: avoid }
@@ -68,9 +70,10 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
     if model and is_rejected:
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
-    drawn = "" if is_rejected else _drawn(folder)
+    design = None if is_rejected else _loaded(folder)
+    drawn = "" if design is None else _drawn(folder, design)
     chapters = {
-        "What is proved": decided,
+        "What is proved": _in_short(design) + decided,
         "The model": model,
         "Pictures": _pictures(folder, without=in_model) + drawn,
         **(held or {}),
@@ -167,18 +170,31 @@ def _pictures(folder: Path, *, without: set[str]) -> str:
     return "".join(figures)
 
 
-def _drawn(folder: Path) -> str:
+def _loaded(folder: Path) -> AnyDesign | None:
+    """The folder's design, if there is one that holds; the chapter on the proofs says why not."""
+    try:
+        return documents.load(folder)
+    except (NlsidError, OSError):
+        return None
+
+
+def _in_short(design: AnyDesign | None) -> str:
+    """What a tube promises, without its formulas."""
+    if design is None or not isinstance(design.funnel, TubeFunnel):
+        return ""
+    return f"<p>{escape(show.promise(design))}</p>"
+
+
+def _drawn(folder: Path, design: AnyDesign) -> str:
     """The tube around a motion, where no picture of it lies in the folder; empty without one.
 
     One around a simulation is as wide always, or as the commands move it: `catching.png` has it.
     """
-    if (folder / documents.FUNNEL_PLOT).is_file() or not report_available():
-        return ""
-    try:
-        design = documents.load(folder)
-    except (NlsidError, OSError):
-        return ""  # the chapter on the proofs says why
-    if isinstance(design.funnel, TubeFunnel):
+    if (
+        isinstance(design.funnel, TubeFunnel)
+        or (folder / documents.FUNNEL_PLOT).is_file()
+        or not report_available()
+    ):
         return ""
     from bags.pictures import plots, tubes  # matplotlib only where something is drawn
 

@@ -45,13 +45,12 @@ UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their num
 
 def say_identified(console: Console, result: Identified) -> None:
     """What the model is worth in a sentence, every method, what to know, and the files."""
-    fit = result.fit
-    _say(console, worth(result))
-    console.print(tables.methods_table(fit, result.test))
-    for line in (str(fit.history), fit.slowest, *_residuals(result)):
-        _say(details, line)
+    say(console, worth(result))
+    console.print(tables.methods_table(result.fit, result.test))
+    for line in (str(result.fit.history), result.fit.slowest, *_residuals(result)):
+        say(details, line)
     for line in notes(result):
-        _say(console, line)
+        say(console, line)
     say_written(console, result.files)
     if not report_available():
         console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
@@ -67,14 +66,15 @@ def worth(result: Identified) -> str:
     )
 
 
-def _say(console: Console, line: str) -> None:
+def say(console: Console, line: str) -> None:
+    """Print a line as it is, whatever is in it."""
     console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
 def say_written(console: Console, paths: Sequence[Path]) -> None:
     """The files by name, and their folder."""
     names = ", ".join(dict.fromkeys(path.name for path in paths))
-    _say(console, f"wrote {names} in {paths[0].parent}")
+    say(console, f"wrote {names} in {paths[0].parent}")
 
 
 def _residuals(result: Identified) -> list[str]:
@@ -106,10 +106,11 @@ def promise(design: OutputTubeDesign) -> str:
     )
     lasting = "for ever" if tube.samples is None else f"for {tube.samples} samples"
     measured, count = tube.measured, len(tube.measured.measured_on)
+    trials = f"{count}" if measured.rank == 1 else f"{count + 1 - measured.rank} of {count}"
     return (
         f"Proved: the measured {stays}{scaled} of the model's simulation, {lasting}. It holds "
         f"while the model's one-step errors are at most {measured.safety_factor:g} times as large "
-        f"as in {count + 1 - measured.rank} of {count} trials; the monitor watches that."
+        f"as in {trials} trials; the monitor watches that."
     )
 
 
@@ -121,23 +122,23 @@ def _plainest(design: OutputTubeDesign) -> Tube:
 
 def say_tube(console: Console, design: OutputTubeDesign) -> None:
     """What the tube promises, of positions and of a next trial too; its formulas are details."""
-    _say(console, promise(design))
+    say(console, promise(design))
     signals, tube = design.signals[0], _plainest(design)
     moving = zip(washouts_of(signals), tube.half_widths.tolist(), signals, strict=True)
     for time, width, signal in moving if tube.samples is None else ():
         if time is not None:
             moved = text.above(displacement_half_width(width, time, time))
             scaled = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
-            _say(
+            say(
                 console,
                 f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
                 f"{signal.unit}{scaled} of what the simulation moves",
             )
     provenance = of_funnel(design.model.document(), design.funnel.document())
     for line in dict.fromkeys(provenance.promised):
-        _say(console, line)
+        say(console, line)
     for line in (*str(design.verdict).splitlines(), *provenance.said):
-        _say(details, line)
+        say(details, line)
 
 
 def replayed(

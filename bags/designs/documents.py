@@ -42,9 +42,17 @@ def load(path: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:
 
 
 def funnel_of(folder: Path) -> Path:
-    """What `load` reads in a design folder: a proof of several funnels, or its funnel."""
-    several = folder / designs.COMPOSITION
-    return several if several.is_file() else folder / FUNNEL
+    """What `load` reads in a design folder: a proof of several funnels, or its funnel.
+
+    Raises DocumentError if it has neither.
+    """
+    for name in (designs.COMPOSITION, FUNNEL):
+        if (folder / name).is_file():
+            return folder / name
+    raise DocumentError(
+        f"{folder} has no {FUNNEL}: `nlsid funnel {folder}` writes it. A design's folder stands "
+        "before the bags"
+    )
 
 
 def load_unproved(folder: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:

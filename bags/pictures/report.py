@@ -102,6 +102,11 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     listed = "".join(_recordings(data, use) for use, data in parts.items())
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
     methods = tables.methods_table(fit, test, columns)
+    model, proved = chosen.model, tables.stability_sentence(chosen)
+    answers, drives = (
+        ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
+        for part in (model.y, model.u)
+    )
     left_out = f" and the first {chosen.transient}" if chosen.transient else ""
     calibrated = ", calibration trials for neither: they scale the tube"
     return f"""<!doctype html>
@@ -109,8 +114,8 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 <style>{STYLE}</style>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <h1>{escape(robot)}: identified model</h1>
-{MODEL_BEGINS}<p>{escape(_about(chosen.model))}</p>
-{_stability(chosen)}
+{MODEL_BEGINS}<p>{escape(f"{model}; y = {answers}, u = {drives}")}</p>
+<p class="{"not" if chosen.proof is None else "proved"}">{escape(proved)}</p>
 <h2>How well it simulates</h2>
 {tables.html(lambda console: console.print(methods))}
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
@@ -127,20 +132,6 @@ for this table and the pictures below{calibrated if "calibration" in parts else 
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """
-
-
-def _stability(chosen: Candidate[Model]) -> str:
-    shown = "not" if chosen.proof is None else "proved"
-    return f'<p class="{shown}">{escape(tables.stability_sentence(chosen))}</p>'
-
-
-def _about(model: Model) -> str:
-    """What it is, and of which signals."""
-    outputs, inputs = (
-        ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
-        for part in (model.y, model.u)
-    )
-    return f"{model}; y = {outputs}, u = {inputs}"
 
 
 def _residuals(chosen: Candidate[Model], test: Dataset) -> str:

@@ -141,14 +141,15 @@ class Fit(Generic[M]):
 
     def __str__(self) -> str:
         columns = list(self.errors)
-        header = f"  {'simulation error [%]':52s}" + "".join(f"{name:>12s}" for name in columns)
+        width = max(20, *(len(c.method.title) for c in self.candidates))
+        header = f"  {'simulation error [%]':{width}s}" + "".join(f"{n:>8s}" for n in columns)
         header += f"{'time':>11s}  proved rate a sample (time constant)"
         rows: list[str] = []
         for c in self.candidates:
-            scores = "".join(f"{self.errors[name][c.method.name]:12.2f}" for name in columns)
+            scores = "".join(f"{self.errors[name][c.method.name]:8.2f}" for name in columns)
             state = stated_rate(c.proof, c.model.period) if c.proof else c.unproved
             mark = "*" if c.method == self.method else " "
-            rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
+            rows.append(f"{mark} {c.method.title:{width}s}{scores}{c.seconds:9.3f} s  {state}")
         equation = [self.model.equation] if isinstance(self.model, DifferenceEquation) else []
         return "\n".join(
             [str(self.model), *equation, str(self.history), self.slowest, header, *rows]

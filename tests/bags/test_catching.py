@@ -1,6 +1,7 @@
 """What a tube catches: every count, delay, share and warning against an independent computation."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -245,12 +246,17 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
 
 
 @pytest.mark.pictures
-def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> None:
+def test_the_picture_has_a_bar_for_every_fault_that_is_seen_and_every_detector(
+    found: Catching,
+) -> None:
     figure = draw(found)
     (errors,), (caught,) = (part.axes for part in figure.subfigs)
     assert len(errors.lines) == found.trials + 2
-    assert len(caught.patches) == len(found.rows) * (4 + 3)
-    assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in found.rows]
+    seen = [row for row in found.rows[1:] if row.fault != "5 samples lost"]
+    assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in seen]
+    assert len(caught.patches) == len(seen) * (1 + 3)
+    bars: Any = zip(caught.patches, seen, strict=False)
+    assert all(bar.get_width() == row.funnel.after for bar, row in bars)
 
 
 @pytest.mark.pictures

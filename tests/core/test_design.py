@@ -129,7 +129,7 @@ def test_a_file_of_another_design_is_not_loaded(
     with pytest.raises(CertificateMismatch):
         load(tmp_path)
     (tmp_path / name).unlink()
-    with pytest.raises((CertificateRejected, FileNotFoundError)):
+    with pytest.raises((CertificateRejected, DocumentError)):
         load(tmp_path)
 
 

@@ -35,11 +35,8 @@ def test_data_frames_are_trials(train: Dataset) -> None:
     }
     made = Dataset.from_pandas(tables, y=["speed"], u=["command"])
     assert made.names == train.names
-    assert made.period == train.period
     for one, other in zip(made, train, strict=True):
         np.testing.assert_array_equal(np.hstack([one.y, one.u]), np.hstack([other.y, other.u]))
-    with pytest.raises(DataError, match="not on a uniform grid"):
-        Dataset.from_pandas(tables["run_0"].drop(index=tables["run_0"].index[3]), y=["speed"], u=[])
     with pytest.raises(DataError, match=r"DataFrame.*from_pandas"):
         identify(tables["run_0"], Polynomial(2))
 
@@ -55,8 +52,7 @@ def test_a_trials_own_columns_are_simulated(train: Dataset, fit: Fit[DifferenceE
 def test_models_are_compared_on_the_same_trials(
     train: Dataset, fit: Fit[DifferenceEquation]
 ) -> None:
-    worse = replace(fit.model, c=fit.model.c + 0.1)
-    found = compare(train, {"fitted": fit.model, "off": worse})
+    found = compare(train, {"fitted": fit.model, "off": replace(fit.model, c=0.5)})
     assert found["fitted"] == fit.errors["train"][fit.method.name] < found["off"]
     assert fit.model.equation in str(fit)
 

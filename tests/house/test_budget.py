@@ -11,8 +11,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_188,
-    ("bags",): 12_029,
+    ("nlsid_core",): 18_189,
+    ("bags",): 12_031,
     ("nlsid_ros",): 2_663,
     ("tests",): 22_838,
     ("benchmarks", "examples"): 3_801,
