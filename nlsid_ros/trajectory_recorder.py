@@ -23,8 +23,7 @@ from bags.recordings.definitions import Definition, read_definitions
 from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, LogClock, Recent
-from bags.signals.recording import Recording
+from bags.signals.recording import Arrival, LogClock, Recent, Recording
 from bags.tools.recover import repair, unfinished_bags
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError

@@ -10,7 +10,7 @@ from bags.chain.config import load_config
 from bags.chain.steps import identify_bags
 from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
-from bags.signals.arrivals import SNAPSHOT
+from bags.signals.recording import SNAPSHOT
 from nlsid_core.errors import BagError, NlsidError
 
 

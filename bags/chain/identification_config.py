@@ -11,19 +11,24 @@ of `model` opens of them is in `templates`.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Annotated, Any, get_type_hints
 
-from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import (
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    create_model,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from bags.chain.sections import UNKNOWN_KEY
+from bags.chain.sections import no_such_key
 from bags.chain.templates import TEMPLATES
 from bags.recordings.names import did_you_mean
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, OptionError
+from nlsid_core.errors import OptionError
 from nlsid_core.identification import (
     METHODS,
     Attempt,
@@ -38,16 +43,15 @@ from nlsid_core.identification.rates import rate_of_memory
 from nlsid_core.progress import Progress, silent
 
 DEFAULT = "linear"  # the model of a section that names none
-RANGES = (
-    "input_range",
-    "output_range",
-)  # options of which one [low, high] is the range of one signal
+RANGES = ("input_range", "output_range")  # options of which [low, high] is one signal's range
 ONE_BY_ONE = ("linear", "block_cascade", "follower")  # models of one response and one excitation
 OWN = {  # of every section
     "transient": Annotated[int, Field(ge=0)],
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
     "allow_unproved": bool,
 }
+
+Wrong = tuple[tuple[int | str, ...], object, str]  # where, what was found, what should be there
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,129 +115,99 @@ def _as_yaml(value: Any) -> Any:
 
 
 def _read(section: object) -> IdentificationConfig:
-    """The section as the dataclasses that it names; ValidationError says all that is wrong."""
+    """The section as the dataclasses that it names; ValidationError or ValueError if it is none."""
     if isinstance(section, IdentificationConfig):
         return section
     if not isinstance(section, dict):
-        raise _error(_wrong((), section, "should be keys and values, such as `lags: 4`"))
-    left = dict(section)
-    name = left.pop("model", DEFAULT)
+        raise ValueError("should be keys and values, such as `lags: 4`")
+    name = section.get("model", DEFAULT)
     template = TEMPLATES.get(name) if isinstance(name, str) else None
     if template is None:
         near = did_you_mean(str(name), TEMPLATES)
-        what = f"there is no such model; there are: {', '.join(TEMPLATES)}{near}"
-        raise _error(_wrong((), section, what))
-    wrong: list[InitErrorDetails] = []
-    own = _values(OWN, {key: left.pop(key) for key in OWN if key in left}, wrong)
-    word = left.pop("method", None)
-    options = {key: left.pop(key) for key in template.keys if key in left}
-    wrong.extend(
-        _wrong((k,), options, "Field required") for k in template.needed if k not in options
-    )
-    model_class = _made(template.make, template.hints(), options, template.keys, wrong)
-    methods = () if model_class is None else methods_of(model_class)
-    known = list(dict.fromkeys(one.word for one in methods)) or list(METHODS)
-    chosen = known[0] if word is None else word
-    if not isinstance(chosen, str) or chosen not in known:
-        what = "is not for this model class:" if chosen in [*METHODS] else "should be"
-        wrong.append(_wrong(("method",), chosen, f"{what} {_listed(known)}"))
-        raise _error(*wrong)
-    usual = next((one for one in methods if one.word == chosen), METHODS[chosen]())
-    names = _names(usual)
-    method = _made(
-        partial(_changed, usual),
-        get_type_hints(type(usual)),
-        {key: left.pop(key) for key in names if key in left},
-        {},
-        wrong,
-    )
-    if method is not None and methods and method.name not in [one.name for one in methods]:
+        raise ValueError(f"there is no such model; there are: {', '.join(TEMPLATES)}{near}")
+
+    options = {key: kind for method in METHODS.values() for key, kind in _options(method).items()}
+    hints = {"model": str, **template.hints(), "method": str, **options, **OWN}
+    given = _values(hints, section, template.needed)
+    model_class = _made(template.make, _of(given, template.keys), section, template.keys)
+
+    methods = methods_of(model_class)
+    words = list(dict.fromkeys(method.word for method in methods))
+    word = given.get("method", words[0])
+    if word not in words:
+        what = "is not for this model class:" if word in METHODS else "should be"
+        raise _error((("method",), word, f"{what} {_listed(words)}"))
+
+    usual = next(method for method in methods if method.word == word)
+    names = _options(type(usual))
+    _values({key: hints[key] for key in ("model", *template.keys, "method", *names, *OWN)}, section)
+    method = _made(lambda values: replace(usual, **values), _of(given, names), section, {})
+    if method.name not in [one.name for one in methods]:
         what = f"should be {str(not method.certified).lower()} for this model class"
-        wrong.append(_wrong(("certified",), method.certified, what))
-    if model_class is None and word is None:  # then the method, and its keys, are not known
-        left = {k: v for k, v in left.items() if not any(k in _names(m) for m in METHODS.values())}
-    keys = ", ".join(["model", *template.keys, "method", *names, *OWN])
-    for key in left:
-        details = {"key": str(key), "known": keys}
-        wrong.append(_wrong((), section, "there is no such key", UNKNOWN_KEY, details))
-    if wrong or model_class is None or method is None:
-        raise _error(*wrong)
-    return IdentificationConfig(model_class, method, section, **own)
-
-
-def _changed(method: Method, values: Mapping[str, Any]) -> Method:
-    return replace(method, **values)
+        raise _error((("certified",), method.certified, what))
+    return IdentificationConfig(model_class, method, section, **_of(given, OWN))
 
 
 Identification = Annotated[IdentificationConfig, PlainValidator(_read)]
 
 
-def _made(
-    make: Callable[[Mapping[str, Any]], Any],
-    hints: Mapping[str, Any],
-    given: dict[str, object],
-    names: Mapping[str, str],
-    wrong: list[InitErrorDetails],
-) -> Any:
-    """What is made of these options, each of the type that its field declares; None if wrong.
+def _options(kind: type[Any]) -> dict[str, Any]:
+    """The types of a dataclass's fields."""
+    hints = get_type_hints(kind)
+    return {option.name: hints[option.name] for option in fields(kind)}
 
-    names: what an option is called inside, by its key.
-    """
-    before = len(wrong)
-    values = _values(hints, given, wrong)
-    if len(wrong) > before:
-        return None
-    try:
-        return make(values)
-    except OptionError as error:
-        keys = {option: key for key, option in names.items()}
-        key = keys.get(error.key, error.key)
-        wrong.append(_wrong((key,), given.get(key), f"should be {error.allowed}"))
-    except DataError as error:
-        wrong.append(_wrong((), given, str(error)))
-    return None
+
+def _of(given: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    return {key: given[key] for key in keys if key in given}
 
 
 def _values(
-    hints: Mapping[str, Any], given: Mapping[str, object], wrong: list[InitErrorDetails]
+    hints: Mapping[str, Any], given: Mapping[str, object], needed: Sequence[str] = ()
 ) -> dict[str, Any]:
     """The values as the types say; a list is a tuple, and nothing else is converted."""
-    values = {}
-    for key, value in given.items():
-        if key in RANGES and isinstance(value, list) and not any(map(_is_list, value)):
-            value = [value]
-        try:
-            adapter: TypeAdapter[Any] = TypeAdapter(hints[key])
-            values[key] = adapter.validate_json(json.dumps(value, default=str), strict=True)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = [part for part in first["loc"] if isinstance(part, int)]
-            wrong.append(_wrong((key, *where), value, first["msg"]))
-    return values
+    kinds: dict[str, Any] = {key: (kind, None) for key, kind in hints.items()}
+    kinds |= {key: (hints[key], ...) for key in needed}
+    section = create_model("section", __config__=ConfigDict(strict=True, extra="forbid"), **kinds)
+    single = {key: [given[key]] for key in RANGES if _is_range(given.get(key))}
+    try:
+        found: Any = section.model_validate_json(json.dumps({**given, **single}, default=str))
+    except ValidationError as error:
+        raise _error(*(_said(details, hints) for details in error.errors())) from error
+    return dict(found.model_dump(exclude_unset=True))
 
 
-def _is_list(value: object) -> bool:
-    return isinstance(value, list | tuple)
+def _is_range(value: object) -> bool:
+    return isinstance(value, list) and not any(isinstance(part, list | tuple) for part in value)
 
 
-def _names(kind: Any) -> list[str]:
-    return [option.name for option in fields(kind)]
+def _said(details: ErrorDetails, known: Iterable[str]) -> Wrong:
+    where, message = details["loc"], details["msg"]
+    if details["type"] == "extra_forbidden":
+        message = no_such_key(str(where[0]), known)
+    return where, details["input"], message
+
+
+def _made(
+    make: Callable[[Any], Any],
+    values: Mapping[str, Any],
+    section: Mapping[str, object],
+    names: Mapping[str, str],
+) -> Any:
+    """What is made of these values of the section. names: options inside, by their keys."""
+    try:
+        return make(values)
+    except OptionError as error:
+        key = next((key for key, option in names.items() if option == error.key), error.key)
+        raise _error(((key,), section.get(key), f"should be {error.allowed}")) from error
 
 
 def _listed(known: Sequence[str]) -> str:
     return " or ".join(", ".join(f"'{name}'" for name in known).rsplit(", ", 1))
 
 
-def _wrong(
-    where: tuple[str | int, ...],
-    found: object,
-    message: str,
-    kind: str = "wrong_option",
-    details: dict[str, Any] | None = None,
-) -> InitErrorDetails:
-    error = PydanticCustomError(kind, message, details)
-    return InitErrorDetails(type=error, loc=where, input=found)
-
-
-def _error(*wrong: InitErrorDetails) -> ValidationError:
-    return ValidationError.from_exception_data("identification", list(wrong))
+def _error(*wrong: Wrong) -> ValidationError:
+    details = [
+        InitErrorDetails(type=PydanticCustomError("option", said), loc=where, input=found)
+        for where, found, said in wrong
+    ]
+    return ValidationError.from_exception_data("identification", details)

@@ -14,7 +14,6 @@ from nlsid_core.errors import DataError
 from nlsid_core.models import Signal
 
 MAX_CONFIG_BYTES = 2**20  # a configuration is a page of text
-UNKNOWN_KEY = "unknown_key"
 
 
 @dataclass(frozen=True)
@@ -98,14 +97,12 @@ def yaml_sections(path: Path | str) -> dict[str, Any]:
     return content
 
 
-def problems(
-    error: ValidationError, kind: type[Section] | None = None, *, prefix: Sequence[str] = ()
-) -> str:
+def problems(error: ValidationError, kind: type[Section]) -> str:
     """A line for each wrong key: where it stands, what is allowed there, what was found.
 
     kind: the section that the error is about, whose keys and units are then said.
     """
-    return "\n".join(f"  {_problem(details, kind, prefix)}" for details in error.errors())
+    return "\n".join(f"  {_problem(details, kind)}" for details in error.errors())
 
 
 def sections_in(annotation: Any) -> list[type[Section]]:
@@ -115,16 +112,12 @@ def sections_in(annotation: Any) -> list[type[Section]]:
     return [found for part in get_args(annotation) for found in sections_in(part)]
 
 
-def _problem(details: ErrorDetails, kind: type[Section] | None, prefix: Sequence[str]) -> str:
-    where = [str(part) for part in (*prefix, *details["loc"])]
+def _problem(details: ErrorDetails, kind: type[Section]) -> str:
+    where = [str(part) for part in details["loc"]]
     found, message = details["input"], details["msg"].removeprefix("Value error, ")
-    if details["type"] == UNKNOWN_KEY:
-        key, known = details["ctx"]["key"], details["ctx"]["known"]
-        where.append(key)
-        found, message = found[key], _no_such_key(key, known.split(", "))
-    elif details["type"] == "extra_forbidden":
+    if details["type"] == "extra_forbidden":
         section, _ = _stands_in(kind, details["loc"])
-        message = _no_such_key(where[-1], section.model_fields if section else ())
+        message = no_such_key(where[-1], section.model_fields if section else ())
     else:
         section, key = _stands_in(kind, details["loc"])
         if section is not None and (unit := _unit(section, key)):
@@ -133,7 +126,8 @@ def _problem(details: ErrorDetails, kind: type[Section] | None, prefix: Sequence
     return said if message == "Field required" else f"{said} (found {found!r:.60})"
 
 
-def _no_such_key(key: str, known: Iterable[str]) -> str:
+def no_such_key(key: str, known: Iterable[str]) -> str:
+    """Say that there is no such key, which there are, and which is nearest."""
     known = list(known)
     return f"there is no such key; there are: {', '.join(known)}{did_you_mean(key, known)}"
 

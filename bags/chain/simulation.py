@@ -49,8 +49,7 @@ def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]
         z = rng.standard_normal(len(model))
         radius = options.spread * norms.cap[0] * rng.uniform() / np.linalg.norm(z)
         start = policy.x[0] + np.linalg.solve(norms.S[0], radius * z)
-        seed = int(rng.integers(2**31))
-        run = run_policy(robot, model, policy, seed=seed, start=start)
+        run = run_policy(robot, model, policy, seed=int(rng.integers(2**31)), start=start)
         run = replace(run, name=f"{robot.name}_run_{index}")
         written.append(write_joint_bag(out, run, custom={"source": "MuJoCo"}))
     return written
@@ -97,8 +96,7 @@ def run_policy(
 
     The estimate starts at `start` (default: the nominal), the robot a measurement error from it.
     """
-    rng = np.random.default_rng(seed)
-    plant = Plant(robot, rng)
+    plant = Plant(robot, np.random.default_rng(seed))
     first = policy.x[0] if start is None else start
     plant.reset(first)
     plant.reset(2 * first - plant.measure())

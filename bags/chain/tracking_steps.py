@@ -64,8 +64,7 @@ def design_tracking_funnel(
         raise DataError("policy.json was made with other weights than this configuration's")
     recorded, factor = read_signals_of(runs, config), config.disturbance.safety_factor
     assumption = assume(model, policy, feedback, recorded, safety_factor=factor)
-    problem = SampledTracking(model, policy, feedback, assumption)
-    made = design(problem, progress=progress)
+    made = design(SampledTracking(model, policy, feedback, assumption), progress=progress)
     made.save(folder)
     return made
 
@@ -73,8 +72,7 @@ def design_tracking_funnel(
 def widest_start(made: TrackingDesign, runs: Dataset) -> float:
     """How far out of the inlet's boundary, 1, the runs started at most."""
     first = [trial.y[0] - made.policy.x[0] for trial in runs]
-    radius = float(made.funnel.inlet[0])
-    return max(made.funnel.norm(0, x_bar) / radius for x_bar in first)
+    return max(made.funnel.norm(0, x_bar) / float(made.funnel.inlet[0]) for x_bar in first)
 
 
 def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:

@@ -19,8 +19,8 @@ from bags.commands.options import (
     JsonOption,
     Signals,
     flat,
+    progress_bar,
 )
-from bags.commands.progress import progress_bar
 from bags.tools.copies import Into, Rows, What
 from nlsid_core.errors import DataError
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bags.commands import designs_cli, learn_cli, models_cli, running_cli
+from bags.commands import designs_cli, models_cli, running_cli
 from bags.commands.bag_cli import bag_app
 from bags.commands.fleet_cli import fleet_app
 from bags.commands.options import flat
@@ -19,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 GROUPS = {
-    "All steps": (learn_cli.learn,),
+    "All steps": (designs_cli.learn,),
     "The steps": (
         models_cli.init,
         models_cli.identify,

@@ -22,8 +22,7 @@ from bags.chain.shipped import config_file
 from bags.chain.simulation import simulate_excitations, simulate_runs
 from bags.chain.tracking_config import is_tracking, load_tracking_config
 from bags.commands import designs_cli, models_cli, show, states
-from bags.commands.options import CONFIG, details
-from bags.commands.progress import progress_bar
+from bags.commands.options import CONFIG, details, progress_bar
 from bags.designs import documents
 from bags.monitoring.replay import Replay
 from bags.pictures.report import drawable, write_margins

@@ -1,4 +1,5 @@
-"""From a model, or equations, to what is proved of it: `nlsid funnel`, `check`, `report`, `export`.
+"""From a model, or equations, to what is proved of it: `nlsid funnel`, `check`, `report`, `export`;
+and `nlsid learn`, all steps in one.
 
 A command imports what it runs when it is called.
 """
@@ -11,21 +12,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from bags.commands import models_cli
 from bags.commands.options import (
+    CONFIG,
+    BagsArgument,
     ConfigOption,
+    DefinitionsOption,
     DesignArgument,
     Sharing,
+    Signals,
     SomeBagsArgument,
     VerboseOption,
     Wired,
     config_of,
     out,
+    progress_bar,
     settings_if_any,
 )
-from bags.commands.progress import progress_bar
 from nlsid_core import deciding
 from nlsid_core import second as second_kernel
-from nlsid_core.errors import CertificateRejected, DocumentError
+from nlsid_core.errors import CertificateRejected, DataError, DocumentError
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
@@ -331,3 +337,33 @@ def export(
     for name, units in kinds:
         if target / name not in written:
             out.print(f"no {name}: no signal is in {' or '.join(units)}", soft_wrap=True)
+
+
+def learn(
+    bags: BagsArgument,
+    signals: Signals,
+    folder: Annotated[Path, typer.Option("--out", help="The design's folder.")] = Path("design"),
+    definitions: DefinitionsOption = None,
+    _verbose: VerboseOption = False,
+) -> None:
+    """Make a checked design from bags: init, identify, funnel, check and report, asking nothing.
+
+    The configuration that it uses is written too: robot.yaml. Where a person has to decide, it
+    ends with the reason and status 2. Status 1: nothing can be identified from these bags.
+    """
+    from bags.chain.config import load_config
+    from bags.recordings.folders import expand_bags
+
+    proposal = models_cli.proposed(folder, bags, signals, definitions, robot="robot", yes=True)
+    if proposal.doubts:
+        raise DataError(
+            f"{proposal.doubts[0]}. Name the signals with -y and -u; or, if they are right, go on "
+            f"with nlsid identify {folder}"
+        )
+    settings = load_config(folder / CONFIG)
+    models_cli.identify_here(expand_bags(bags), settings, folder)
+    tube(folder, settings)
+    status = decided([folder], deciding.USUAL)
+    report(folder)
+    out.print(f"next: nlsid monitor {folder} BAG...; nlsid run monitor {folder}", soft_wrap=True)
+    raise typer.Exit(status)

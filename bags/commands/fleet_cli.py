@@ -24,6 +24,7 @@ from bags.commands.options import (
     config_of,
     flat,
     out,
+    progress_bar,
     settings_if_any,
 )
 
@@ -74,7 +75,6 @@ def check(
     Status 1 if a bag is bad, 2 if none is and one was not read.
     """
     from bags.chain.config import load_config
-    from bags.commands.progress import progress_bar
     from bags.fleet.bags import UNREAD, named_bags
     from bags.fleet.check import BAD, GOOD, LOOK, SERIOUS, CheckBag
     from bags.fleet.rows import read_rows, write_parquet
@@ -156,7 +156,6 @@ def monitor(
     kept, 1 if one is not, 2 if one was not judged whole.
     """
     from bags.commands import show
-    from bags.commands.progress import progress_bar
     from bags.designs import documents
     from bags.fleet.bags import COPY, named_bags
     from bags.fleet.monitor import FleetVerdict, JudgeBag

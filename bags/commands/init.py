@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bags.commands.progress import progress_bar
+from bags.commands.options import progress_bar
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags

@@ -24,8 +24,8 @@ from bags.commands.options import (
     config_of,
     err,
     out,
+    progress_bar,
 )
-from bags.commands.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Arguments, options and consoles that the verbs of `nlsid` share: each is written here once.
+"""Arguments, options, consoles and the progress bar that the verbs of `nlsid` share.
 
 Options that belong together are a dataclass; `flat` gives a verb that takes one its fields as
 options of the command line.
@@ -6,7 +6,10 @@ options of the command line.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import wraps
@@ -18,6 +21,7 @@ import typer
 from rich.console import Console
 
 from nlsid_core.errors import DataError
+from nlsid_core.progress import Progress, silent
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
@@ -28,6 +32,7 @@ CONFIG = "robot.yaml"  # of a design's folder
 
 out = Console()
 err = Console(stderr=True)
+PATIENCE = 1.0  # s, before a progress bar is shown
 details = Console(quiet=True)  # the numbers behind a sentence; --verbose shows them
 
 
@@ -195,3 +200,33 @@ def settings_if_any(folder: Path, given: Path | None) -> Config | None:
     if (given is None and not path.is_file()) or is_tracking(path):
         return None
     return load_config(path)
+
+
+@contextmanager
+def progress_bar(task: str) -> Iterator[Progress]:
+    """Yield `progress(what, fraction)`; the bar disappears when the work is done.
+
+    It is shown only to a terminal, and only of work that takes longer than PATIENCE.
+    """
+    if not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    started = time.monotonic()
+    columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    console = Console(stderr=True)
+    bar = Bar(*columns, console=console, transient=True)
+    identifier = bar.add_task(task, total=1.0)
+
+    def show(what: str, fraction: float) -> None:
+        if time.monotonic() - started >= PATIENCE:
+            bar.start()
+            bar.update(identifier, description=what, completed=fraction)
+
+    try:
+        yield show
+    finally:
+        bar.stop()

@@ -13,8 +13,7 @@ from rich.text import Text
 
 from bags.chain.config import Config
 from bags.chain.steps import Identified
-from bags.commands.options import details
-from bags.commands.progress import progress_bar
+from bags.commands.options import details, progress_bar
 from bags.designs import documents
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.designs.provenance import of_funnel
@@ -228,8 +227,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     """
     table = Table(
         title="held against the funnel",
-        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
-        "assumed",
+        caption="margin: the worst; 1 in the middle of the tube, 0 on its edge. used: how much "
+        "of the assumption",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,

@@ -11,8 +11,7 @@ from bags.chain import tracking_steps
 from bags.chain.steps import read_signals_of
 from bags.chain.tracking_config import TrackingConfig
 from bags.commands import show
-from bags.commands.options import out
-from bags.commands.progress import progress_bar
+from bags.commands.options import out, progress_bar
 from bags.designs import documents
 from bags.pictures import tables
 from bags.pictures.report import report_available

@@ -132,11 +132,11 @@ def _judged(
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}{'s' if count != 1 else ''}"
     scale = f"{text.above(measured)} by the scale of {those}"
-    says = "breaks an assumption or sets off any other alarm of this funnel"
+    says = "raises an alarm of this funnel"
     if "rank" not in given:
         scale, says = f"largest of {those} {text.above(measured)}", "exceeds their largest"
     promise = _worthless(trials, fitted) or (
-        f"a next trial that is exchangeable with them {says} with probability at most "
+        f"a next trial like them (exchangeable with them) {says} with probability at most "
         f"{rank}/{count + 1}"
     )
     return f"{what}: {scale}, safety factor {text.below(factor)}", promise, wrong

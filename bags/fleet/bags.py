@@ -56,5 +56,4 @@ def _base(given: Path, bag: Path) -> int:
     """How many parts of the bag's path are not in its name."""
     if given == bag:
         return len(bag.parts) - 1
-    wild = (i for i, part in enumerate(given.parts) if WILD & set(part))
-    return next(wild, len(given.parts))
+    return next((i for i, part in enumerate(given.parts) if WILD & set(part)), len(given.parts))

@@ -48,7 +48,7 @@ class CheckBag:
         """
         definitions = read_definitions(self.config.definitions)
         with Bag(bag, definitions=definitions) as source:
-            start, custom = iso(source.storage.start_ns), source.custom
+            start, custom = iso(source.start_ns), source.custom
             marks = [bag_origin(source)["digest"]]
         refused, numbers = "", {}
         try:

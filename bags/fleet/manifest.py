@@ -84,8 +84,7 @@ def key_of(bag: Path, name: str, asked: str) -> str:
     """The key of what is asked of a bag: it changes when its files do. OSError if it is gone."""
     files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
     states: list[Any] = [(file.name, *_state(file)) for file in files]
-    text = json.dumps([asked, name, str(bag), states])
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(json.dumps([asked, name, str(bag), states]).encode()).hexdigest()
 
 
 def _state(file: Path) -> tuple[int, str]:

@@ -34,8 +34,7 @@ class JudgeBag:
         """The design and what it is around."""
         types = texts_of(self.definitions)
         wiring = hashlib.sha256(pickle.dumps(self.design.wiring)).hexdigest()
-        digest = self.design.digest
-        return f"judge {version('nlsid')} {digest} {self.centre} {wiring} {types}"
+        return f"judge {version('nlsid')} {self.design.digest} {self.centre} {wiring} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """A Row, as JSON."""

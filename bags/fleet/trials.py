@@ -45,8 +45,7 @@ class ReadTrials:
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """The trials, as `training.encoded` writes them."""
-        trials = read_signals_of({name: bag}, self.config)
-        return encoded({"": trials}, compressed=False)
+        return encoded({"": read_signals_of({name: bag}, self.config)}, compressed=False)
 
 
 @dataclass(frozen=True, eq=False)

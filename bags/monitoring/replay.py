@@ -164,8 +164,7 @@ class Replay:
     @property
     def said_filled(self) -> str:
         """The same in words, of how many; empty if there is none."""
-        count = sum(not reading.waits for reading in self.readings)
-        return said_filled(self.filled, count)
+        return said_filled(self.filled, sum(not reading.waits for reading in self.readings))
 
     @property
     def said_wide(self) -> str:
@@ -346,7 +345,7 @@ def replay_bag(
     `replay_messages`.
     """
     clock = Clock()
-    stamped = _replayed(design, bag, centre, definitions, clock)
+    stamped = replay_messages(design, bag, centre=centre, definitions=definitions, clock=clock)
     unit, half_width = "", 0.0
     if isinstance(design.funnel, TubeFunnel) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, float(design.funnel.half_widths[0])
@@ -368,6 +367,7 @@ def replay_messages(
     *,
     centre: Centre = Centre.PROFILE,
     definitions: Definitions | None = None,
+    clock: Clock | None = None,
 ) -> list[Stamped]:
     """What the live monitor says of the messages in `bag`, one by one as they were recorded.
 
@@ -375,25 +375,15 @@ def replay_messages(
     without an announcement the first complete sample is sample 0. Raises BagError if the bag cannot
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
+    clock: takes note of the stamps.
     """
-    return _replayed(design, bag, centre, definitions, Clock())
-
-
-def _replayed(
-    design: AnyDesign,
-    bag: Path | str,
-    centre: Centre,
-    definitions: Definitions | None,
-    clock: Clock,
-) -> list[Stamped]:
-    """The readings."""
     bag = place(bag)
     planned = centre is Centre.PROFILE or design.has_plan
     announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)
     stamped = [
         entry
-        for said in _fed(watch, bag, definitions, clock, announced=announced)
+        for said in _fed(watch, bag, definitions, clock or Clock(), announced=announced)
         for entry in said
     ]
     stamped += watch.end()
@@ -407,8 +397,7 @@ def announced_runs(
 ) -> list[Run]:
     """The runs of this funnel that a controller announced in `bag`, in the order it did."""
     with Bag(bag, definitions=definitions) as source:
-        messages = source.messages(_run_topics(source))
-        found = [_run(message, source) for message in messages]
+        found = [_run(message, source) for message in source.messages(_run_topics(source))]
     digest = design.digest
     return [run for run in found if run.funnel == digest and not run.ended]
 
@@ -425,7 +414,7 @@ def _fed(
     digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
-        clock.start_ns = source.storage.start_ns
+        clock.start_ns = source.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
         doubt = _doubt(watch.pairing, source)

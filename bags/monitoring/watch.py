@@ -153,8 +153,7 @@ class Watch:
         stamp_ns = self._newest_ns + int(silent_ns)
         t = seconds(stamp_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
         reason = f"no {self.design.name} in the last {silent_ns * 1e-9:.3g} s of the commands"
-        reading = self.monitor.missing(t, reason)
-        return [*said, self._stamped(stamp_ns, reading)]
+        return [*said, self._stamped(stamp_ns, self.monitor.missing(t, reason))]
 
     def missing(self, reason: str, *, doubted: bool = False) -> list[Stamped]:
         """The state is missing or stale, or its last sample is doubted: unknown from here on."""

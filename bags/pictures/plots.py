@@ -113,8 +113,7 @@ def _tube(axes: Axes, replay: Replay) -> None:
     judged = [r for r in replay.readings if r.status is not Status.UNKNOWN]
     t = np.array([r.t for r in judged])
     nominal = np.array([_output(r.nominal) for r in judged])
-    widths = [r.half_widths[0] if r.half_widths else replay.half_width for r in judged]
-    width = np.array(widths)
+    width = np.array([r.half_widths[0] if r.half_widths else replay.half_width for r in judged])
     axes.fill_between(
         t, nominal - width, nominal + width, color=BLUE, alpha=0.18, lw=0, label="proved tube"
     )

@@ -102,10 +102,10 @@ def catching_table(catching: Catching) -> Table:
 
 
 CATCHING_CAPTION = (
-    "outside, violated (what is assumed) and alarm (only the monitor's own CUSUM, of which nothing "
-    "is proved) are all caught; unknown: not judged to the end. "
-    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
-    "(untouched). Coloured: one of them catches more."
+    "Outside, violated (an assumption) and alarm (only the monitor's CUSUM, of which nothing is "
+    "proved) all count as caught. Unknown: not judged to the end. "
+    "CUSUM, 3σ and box have the same safety factor and calibration trials, and no more false "
+    "alarms (untouched). Coloured: one of them catches more."
 )
 
 

@@ -3,29 +3,54 @@
 Bags are untrusted. Whatever is wrong with one leaves here as a BagError that names the bag.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from mcap.records import Attachment, Metadata
 from rosbags.typesys.store import Typestore
 
-from bags.recordings.batch import Batch, LogOrder
+from bags.recordings.batch import Batch, LogOrder, joined
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import METADATA, BagFiles, bag_files, data_files, without_twins
-from bags.recordings.mcap_file import Whole
+from bags.recordings.mcap_file import McapFile, Whole
+from bags.recordings.mcap_records import CUSTOM_DATA, NEVER, ROSBAG2
 from bags.recordings.message_types import are_same, ros2_definition, types_in_bag
 from bags.recordings.names import did_you_mean, listed
-from bags.recordings.quality import Profile
+from bags.recordings.quality import KEY, Profile, offered
 from bags.recordings.remote import place
-from bags.recordings.storage import ALWAYS, Channel, Raw, Spans, Storage, Takes, defined
+from bags.recordings.storage import (
+    ALWAYS,
+    KINDS,
+    Channel,
+    DataFile,
+    Raw,
+    Spans,
+    Takes,
+    Translate,
+    defined,
+    first_ns,
+    in_cdr,
+    open_file,
+    packed,
+    reading,
+    runs,
+    type_name,
+    unpacked,
+)
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
 
 RECOVER: Final = "`nlsid bag recover`"
+UNCLOSED: Final = f"it has no {METADATA}: the recording was not closed"
+MAX_OVERLAP_BYTES: Final = 256 * 2**20  # chunks that overlap in time are sorted in memory
 
 
 class Message(NamedTuple):
@@ -49,6 +74,10 @@ class Bag:
     says why there may be more. With `salvage=True` damage is no error either: what cannot be read
     is listed in `lost`, and every data file in the folder is read, whatever its metadata say.
     definitions: of types that the bag itself does not define.
+    channels: the recorded streams; a topic has one, or several in a split bag. strands: for each,
+    which of its topic's channels in its file it is: those of one recording are counted on from file
+    to file. numbers: those that they have in their files. custom: the bag's own metadata,
+    `custom_data` of the MCAP files and, before it, metadata.yaml.
     """
 
     def __init__(
@@ -60,21 +89,77 @@ class Bag:
         definitions: Mapping[str, Definition] | None = None,
     ) -> None:
         self.path = place(path)
-        self._described, self._damaged = _described(self.path, salvage=salvage)
+        self._described, self._refused = _described(self.path, salvage=salvage)
         self.files: tuple[Path, ...] = self._described.files
-        self.ending: str | None = None
-        if not self._described.finished:
-            self.ending = f"it has no {METADATA}: the recording was not closed"
-        self.storage = Storage(self.files, salvage=salvage)
-        self.storage.channels = [
-            defined(self._encoded(channel), definitions or {}, self.release)
-            for channel in self.storage.channels
-        ]
-        if self.storage.ending is not None:  # of a bag that is one file that is said already
-            self.ending = self.storage.ending.removeprefix(f"{self.path}: ")
-        if self.ending is not None and not (unfinished or salvage):
-            self.close()
-            raise BagError(self._unfinished())
+        self.channels: list[Channel] = []
+        self.strands: list[int] = []
+        self.numbers: list[int] = []
+        self.custom: dict[str, str] = {}
+        self._records: list[Metadata] = []
+        self._data: list[DataFile] = []
+        self._keys: list[dict[int, int]] = []  # of each file: its channels' numbers -> keys
+        self._translated: dict[int, Translate] = {}
+        with ExitStack() as stack:
+            for file in self.files:
+                self._open(file, stack, salvage=salvage)
+            self._data.sort(key=first_ns)
+            for data in self._data:
+                with reading(data.path):
+                    self._add(data)
+            self.custom |= self._described.custom
+            self.channels = [
+                defined(self._encoded(channel), definitions or {}, self.release)
+                for channel in self.channels
+            ]
+            self.ending = self._why_unfinished()
+            if self.ending is not None and not (unfinished or salvage):
+                raise BagError(self._unfinished())
+            self._stack = stack.pop_all()
+
+    def _open(self, path: Path, stack: ExitStack, *, salvage: bool) -> None:
+        try:
+            with reading(path):
+                file = open_file(path, stack, self._refused, salvage=salvage)
+                file.path = path  # also of one that is unpacked elsewhere
+                self._data.append(file)
+        except BagError as error:
+            if not salvage:
+                raise
+            self._refused.append(str(error))
+
+    def _add(self, file: DataFile) -> None:
+        found = file.contents
+        for record in found.metadata:
+            if record.name == CUSTOM_DATA:
+                self.custom.update(record.metadata)
+            elif record not in self._records:
+                self._records.append(record)
+        keys: dict[int, int] = {}
+        strands: dict[str, int] = {}
+        for number, recorded in found.declared.channels.items():
+            schema = found.declared.schemas.get(recorded.schema_id)
+            if schema is None and recorded.schema_id:
+                raise BagError(f"channel {number} has schema {recorded.schema_id}, not declared")
+            keys[number] = len(self.channels)
+            strand = strands[recorded.topic] = strands.get(recorded.topic, -1) + 1
+            self.strands.append(strand)
+            self.numbers.append(number)
+            channel, translate = in_cdr(
+                Channel(
+                    key=keys[number],
+                    topic=recorded.topic,
+                    msgtype=type_name(schema.name if schema else ""),
+                    encoding=recorded.message_encoding,
+                    schema=(schema.encoding, schema.data) if schema else ("", b""),
+                    count=found.counts.get(number, 0),
+                    metadata=recorded.metadata,
+                    offered=offered(recorded.metadata.get(KEY, "")),
+                )
+            )
+            self.channels.append(channel)
+            if translate is not None:
+                self._translated[channel.key] = translate
+        self._keys.append(keys)
 
     def _encoded(self, channel: Channel) -> Channel:
         """The channel, with the encoding that the metadata state where its file says CDR."""
@@ -85,18 +170,13 @@ class Bag:
 
     def close(self) -> None:
         """Close the bag's files."""
-        self.storage.close()
+        self._stack.close()
 
     def __enter__(self) -> "Bag":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """The recorded streams; a topic has one, or several in a split bag."""
-        return self.storage.channels
 
     @cached_property
     def topics(self) -> dict[str, str]:
@@ -109,32 +189,64 @@ class Bag:
         return {topic: " and ".join(names) for topic, names in types.items()}
 
     @property
-    def custom(self) -> dict[str, str]:
-        """The bag's own metadata: `custom_data` of the MCAP files and, before it, metadata.yaml."""
-        return {**self.storage.custom, **self._described.custom}
-
-    @property
     def release(self) -> str:
         """The release of ROS 2 that recorded it, as it says; empty if it does not."""
-        return self._described.release or self.storage.release
+        named = [r.metadata.get("ROS_DISTRO", "") for r in self._records if r.name == ROSBAG2]
+        return next(filter(None, (self._described.release, *named)), "")
 
     @property
     def lost(self) -> tuple[str, ...]:
         """What cannot be read, as far as it was found by now, and why."""
-        return (*self._damaged, *self.storage.lost)
+        found = [*self._refused]
+        for file in self._data:
+            ending = filter(None, [file.contents.ending])
+            found += [f"{file.path.name}: {what}" for what in (*file.contents.lost, *ending)]
+        return tuple(found)
 
     @property
     def kept_beside(self) -> Iterator[Metadata | Attachment]:
-        """The bag's records that are no messages, but for `custom`."""
-        yield from self.storage.records
-        yield from self.storage.attachments()
+        """The bag's records that are no messages, but for `custom`; attachments with their data."""
+        yield from self._records
+        for file in self._data:
+            if isinstance(file, McapFile):
+                yield from file.attachments()
+
+    @property
+    def kinds(self) -> dict[str, list[str]]:
+        """What the files are, and how what is in them is compressed."""
+        return {
+            "storage": sorted({KINDS[type(file)] for file in self._data}),
+            "compression": sorted(
+                {block.compression for file in self._data for block in file.contents.blocks}
+                - {"", "none"}
+            ),
+        }
+
+    @property
+    def start_ns(self) -> int:
+        """The first log time in ns; 0 if there are no messages."""
+        first = min(map(first_ns, self._data), default=NEVER)
+        return 0 if first == NEVER else first
+
+    @property
+    def stated(self) -> dict[str, int] | None:
+        """Topic -> messages, as the files' statistics and indexes say; None if one says nothing."""
+        found: dict[str, int] = {}
+        for file, keys in zip(self._data, self._keys, strict=True):
+            if file.contents.stated is None:
+                return None
+            for number, count in file.contents.stated.items():
+                if number in keys:
+                    topic = self.channels[keys[number]].topic
+                    found[topic] = found.get(topic, 0) + count
+        return found
 
     @property
     def statements(self) -> tuple[str, ...]:
         """What in the bag says how many messages there should be."""
         said = {
             METADATA: self._described.topics is not None,
-            "the files' statistics and indexes": self.storage.stated is not None,
+            "the files' statistics and indexes": self.stated is not None,
         }
         return tuple(name for name, there in said.items() if there)
 
@@ -142,7 +254,7 @@ class Bag:
     def disagreements(self) -> tuple[str, ...]:
         """Where what the bag states and what is there differ, in words."""
         found = [*self._described.notes]
-        said = {METADATA: self._counts, "the file": self.storage.stated}
+        said = {METADATA: self._counts, "the file": self.stated}
         for name, counts in said.items():
             for topic in {**counts, **self.topics} if counts is not None else ():
                 stated, there = (counts or {}).get(topic, 0), self._there(topic)
@@ -223,18 +335,40 @@ class Bag:
     def parts(
         self, topics: Sequence[str] | None = None, *, progress: Progress = silent
     ) -> Iterator[tuple[Channel, Batch, int]]:
-        """As `batches`, with the log time in ns that no message from here on goes below."""
-        keys = self._keys(topics)
+        """As `batches`, with the log time in ns that no message from here on goes below, as the
+        chunks state it.
+        """
+        keys = self._keys_on(topics)
         total, done = max(sum(self.channels[key].count for key in keys), 1), 0
-        for key, batch, later_ns in self.storage.parts(keys):
-            yield self.channels[key], batch, later_ns
-            done += len(batch)
-            progress("reading", done / total)
+        later: dict[tuple[int, int], int] = {}
+        earliest = NEVER
+        for n in reversed(range(len(self._data))):
+            for block in reversed(self._data[n].contents.blocks):
+                later[n, block.offset] = earliest
+                earliest = min(earliest, block.start_ns)
+        for n, file in enumerate(self._data):
+            wanted = self._wanted(n, keys)
+            with reading(file.path):
+                for block, batches in runs(file, wanted):
+                    for number, batch in batches:
+                        channel = self.channels[wanted[number]]
+                        yield channel, self._plain(channel.key, batch), earliest
+                        done += len(batch)
+                        progress("reading", done / total)
+                    earliest = later[n, block.offset]
 
     def log_times(self, topics: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
         """(topic, log times in ns) part by part; of MCAP from its indexes, without a message."""
-        for key, log_ns in self.storage.log_times(self._keys(topics)):
-            yield self.channels[key].topic, log_ns
+        keys = self._keys_on(topics)
+        for n, file in enumerate(self._data):
+            wanted = self._wanted(n, keys)
+            with reading(file.path):
+                if isinstance(file, McapFile):
+                    times = file.log_times(wanted)
+                else:
+                    read = (found for _, batches in runs(file, wanted) for found in batches)
+                    times = ((number, batch.log_ns) for number, batch in read)
+                yield from ((self.channels[wanted[c]].topic, log_ns) for c, log_ns in times)
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:
         """Where the log times of `topics` go back inside a file."""
@@ -250,9 +384,7 @@ class Bag:
 
         as_recorded: in the order of the files instead.
         """
-        keys = self._keys(topics)
-        recorded = self.storage.recorded(keys) if as_recorded else self.storage.messages(keys)
-        for raw in recorded:
+        for raw in self._recorded(topics) if as_recorded else self.raws(topics):
             assert isinstance(raw, Raw)  # no chunk is taken as a whole
             channel = self.channels[raw.key]
             if raw.error:
@@ -269,18 +401,118 @@ class Bag:
     ) -> Iterator[Raw | Whole]:
         """As `messages`, with all that is recorded of them, and those that cannot be unpacked.
 
-        nearly: where more chunks overlap in time than memory is meant for, do not refuse. spans:
-        only what was logged in one of them; nothing else is read. takes: which chunks come whole.
+        spans: only what was logged in one of them; no chunk outside is read. takes: which chunks
+        come as they are, when their first message is due, if all of them is wanted.
+        Raises BagError if so many chunks overlap in time that sorting needs MAX_OVERLAP_BYTES; with
+        `nearly` they are sorted as far as that goes.
         """
-        keys = self._keys(topics)
-        return self.storage.messages(keys, nearly=nearly, spans=spans, takes=takes)
+        keys = self._keys_on(topics)
+        order = sorted(
+            (block.start_ns, n, i)
+            for n, file in enumerate(self._data)
+            for i, block in enumerate(file.contents.blocks)
+            if any(block.start_ns < end and start <= block.end_ns for start, end in spans)
+        )
+        waiting: list[Raw] = []
+        for (_, n, i), (later_ns, *_) in pairwise([*order, (NEVER,)]):
+            whole = self._whole(n, i, keys, spans, takes) if takes else None
+            if whole is not None:
+                yield whole
+            else:
+                waiting += self._raws(n, i, keys)
+                waiting.sort()
+            ready = bisect_left(waiting, later_ns, key=attrgetter("log_ns"))
+            if sum(len(raw.data) for raw in waiting[ready:]) > MAX_OVERLAP_BYTES:
+                if not nearly:
+                    raise BagError(
+                        f"{self._data[n].path}: chunks of more than {MAX_OVERLAP_BYTES} bytes "
+                        "overlap in time; sort the file first (`mcap sort`)"
+                    )
+                ready = len(waiting)
+            for raw in waiting[:ready]:
+                if any(start <= raw.log_ns < end for start, end in spans):
+                    yield raw
+            waiting = waiting[ready:]
 
-    def _keys(self, topics: Sequence[str] | None) -> list[int]:
+    def _recorded(self, topics: Sequence[str] | None) -> Iterator[Raw]:
+        """The messages in the order of the files."""
+        keys = self._keys_on(topics)
+        for n, file in enumerate(self._data):
+            for i in range(len(file.contents.blocks)):
+                yield from sorted(self._raws(n, i, keys), key=attrgetter("place"))
+
+    def _whole(
+        self, n: int, i: int, keys: Collection[int], spans: Spans, takes: Takes
+    ) -> Whole | None:
+        """The block, if all of it is wanted and taken, and nothing in it has to be translated."""
+        file, known = self._data[n], self._keys[n]
+        block = file.contents.blocks[i]
+        inside = any(start <= block.start_ns and block.end_ns < end for start, end in spans)
+        numbers = {number: known[number] for number in block.index or ()}
+        wanted = inside and set(numbers.values()) <= set(keys) - self._translated.keys()
+        if not isinstance(file, McapFile) or not wanted or not takes(block, numbers):
+            return None
+        with reading(file.path):
+            found = file.whole(block)
+        if found is None or any(packed(batch).any() for batch in found.messages.values()):
+            return None
+        return found
+
+    def _raws(self, n: int, i: int, keys: Collection[int]) -> Iterator[Raw]:
+        file = self._data[n]
+        wanted = self._wanted(n, keys)
+        with reading(file.path):
+            for number, batch in file.block_batches(file.contents.blocks[i], wanted):
+                plain = self._plain(wanted[number], batch)
+                columns = (batch.log_ns, batch.start, batch.publish_ns, batch.sequence)
+                rows = zip(*(column.tolist() for column in columns), strict=True)
+                for k, (log_ns, at, publish_ns, sequence) in enumerate(rows):
+                    error = plain.unreadable.get(k, "")
+                    data = b"" if error else plain.data(k)
+                    place = n, i, at
+                    yield Raw(log_ns, place, wanted[number], publish_ns, sequence, data, error)
+
+    def _plain(self, key: int, batch: Batch) -> Batch:
+        """The messages in CDR."""
+        translate = self._translated.get(key)
+        if translate is None:
+            if self.channels[key].encoding != "cdr" or not packed(batch).any():
+                return batch
+            translate = unpacked
+        parts: list[bytes] = []
+        unreadable: dict[int, str] = {}
+        for i in range(len(batch)):
+            data = batch.data(i)
+            try:
+                parts.append(translate(data))
+            except BagError as error:
+                parts.append(data)
+                unreadable[i] = str(error)
+        found = joined(parts, batch.log_ns)
+        return replace(
+            found,
+            publish_ns=batch.publish_ns,
+            sequence=batch.sequence,
+            unreadable=unreadable,
+        )
+
+    def _keys_on(self, topics: Sequence[str] | None) -> list[int]:
         wanted = None if topics is None else set(topics)
         return [c.key for c in self.channels if wanted is None or c.topic in wanted]
 
+    def _wanted(self, n: int, keys: Collection[int]) -> dict[int, int]:
+        """The key of each channel that is wanted of a file, by its number there."""
+        return {number: key for number, key in self._keys[n].items() if key in keys}
+
+    def _why_unfinished(self) -> str | None:
+        """Why the recording stops early; None if all of it is finished."""
+        ends = [f"{f.path}: {f.contents.ending}" for f in self._data if f.contents.ending]
+        if ends:  # of a bag that is one file that is said already
+            return ends[-1].removeprefix(f"{self.path}: ")
+        return None if self._described.finished else UNCLOSED
+
     def _unfinished(self) -> str:
-        if self.path.is_dir() and self.storage.ending is None:
+        if self.ending == UNCLOSED:
             return (
                 f"{self.path} has no metadata.yaml: the recording was not closed; "
                 f"read {self.files[0].name} itself, or make a whole bag of it with {RECOVER}"

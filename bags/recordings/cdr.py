@@ -268,8 +268,7 @@ class _Walk:
         self._steps = 0
 
     def layout(self) -> Layout:
-        wanted = [(i, 0) for i in range(len(self._of.targets))]
-        whole = self._struct(self._of.msgtype, wanted)
+        whole = self._struct(self._of.msgtype, [(i, 0) for i in range(len(self._of.targets))])
         if whole and len(self._data) > self._at + PADDING:
             raise BagError(
                 f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
@@ -338,8 +337,7 @@ class _Walk:
             if not self._missing and not self._of.is_static(element):
                 return False
             if element[0] == Nodetype.NAME:
-                deeper = [(i, depth + 1) for i, depth in inside]
-                if not self._struct(str(element[1]), deeper):
+                if not self._struct(str(element[1]), [(i, depth + 1) for i, depth in inside]):
                     return False
             else:
                 self._base(str(element[1][0]), [i for i, _ in inside])

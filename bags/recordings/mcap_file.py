@@ -237,8 +237,7 @@ class McapFile:
             indexes = self._read(block.end, block.last - block.end)
             for channel in block.index.keys() & set(channels):
                 at, length = block.index[channel]
-                record = indexes[at - block.end :][:length]
-                yield channel, index_times(record, channel, where)
+                yield channel, index_times(indexes[at - block.end :][:length], channel, where)
 
     def whole(self, block: Block) -> Whole | None:
         """A chunk that can be copied as it is: its checksum is right, and it holds messages only,
@@ -339,8 +338,7 @@ class McapFile:
         before = RECORD.size + _CHUNK.size - 4  # from there to the length of the compression's name
         keep = before + 16
         for at in range(start, self._size, SEARCH_BYTES):
-            window = self._read(at, SEARCH_BYTES + keep)
-            for match in _COMPRESSION.finditer(window, before):
+            for match in _COMPRESSION.finditer(self._read(at, SEARCH_BYTES + keep), before):
                 place = at + match.start() - before
                 opcode, length = RECORD.unpack(self._read(place, RECORD.size))
                 if opcode == Opcode.CHUNK and place + RECORD.size + length <= self._size:
@@ -386,8 +384,7 @@ class McapFile:
         offset = content + _CHUNK.size + letters + 8
         if offset + size > content + length:
             raise BagError(f"the chunk at byte {content} is longer than its record")
-        compression = rest[:letters].decode("utf-8", "replace")
-        return Block(offset, size, compression, uncompressed, crc)
+        return Block(offset, size, rest[:letters].decode("utf-8", "replace"), uncompressed, crc)
 
     def _check_data(self, found: Contents, content: int) -> None:
         """Hold all before the end of the data against its checksum, where chunks have none."""
@@ -499,16 +496,14 @@ def summarised(read: Read, size: int) -> Contents | None:
     if not len(MAGIC) <= start <= end or end - start > MAX_SUMMARY_BYTES:
         raise BagError("the footer's summary offset is damaged")
     summary = read(start, end - start)
-    if footer.summary_crc:
-        signed = summary + read(end, RECORD.size + 16)
-        if zlib.crc32(signed) != footer.summary_crc:
-            raise BagError("the summary is damaged: its checksum differs")
+    crc = zlib.crc32(summary + read(end, RECORD.size + 16))
+    if footer.summary_crc not in (0, crc):
+        raise BagError("the summary is damaged: its checksum differs")
     found = Contents()
     records: dict[int, list[Any]] = {opcode: [] for opcode in READS}
     for opcode, at, record_end in walk_records(summary):
         if opcode in READS:
-            content = summary[at + RECORD.size : record_end]
-            records[opcode].append(_declared(opcode, content))
+            records[opcode].append(_declared(opcode, summary[at + RECORD.size : record_end]))
     for declared in (*records[Opcode.SCHEMA], *records[Opcode.CHANNEL]):
         found.declared.add(declared)
     metadata: list[MetadataIndex] = records[Opcode.METADATA_INDEX]
@@ -530,8 +525,7 @@ def summarised(read: Read, size: int) -> Contents | None:
     if any(not len(MAGIC) <= offset <= offset + length <= start for offset, length in places):
         raise BagError("the summary names metadata or attachments outside the file")
     for m in metadata:
-        record = read(m.offset, m.length)
-        found.metadata.append(parse(Metadata.read, record[RECORD.size :]))
+        found.metadata.append(parse(Metadata.read, read(m.offset, m.length)[RECORD.size :]))
     return found
 
 

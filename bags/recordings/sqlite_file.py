@@ -154,8 +154,7 @@ class SqliteFile:
             if counts:
                 index = {topic: (0, good) for topic, good in counts.items()}
                 start_ns = min(log_ns for _, good, log_ns, _ in found if good)
-                block = Block(begin, count, start_ns=start_ns, index=index)
-                self.contents.blocks.append(block)
+                self.contents.blocks.append(Block(begin, count, start_ns=start_ns, index=index))
                 self.contents.counts = dict(Counter(self.contents.counts) + counts)
         if left_out:
             self._lose(f"{left_out} messages have no time or no data")

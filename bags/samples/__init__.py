@@ -11,8 +11,7 @@ def dart(floor: str = "*") -> list[Path]:
 
     floor: those of one. See the README beside them.
     """
-    folder = Path(str(files("bags.samples"))) / "dart"
-    return sorted(folder.glob(f"{floor}_20*"))
+    return sorted((Path(str(files("bags.samples"))) / "dart").glob(f"{floor}_20*"))
 
 
 def dart_tables() -> Path:
@@ -22,17 +21,14 @@ def dart_tables() -> Path:
 
 def f1tenth() -> list[Path]:
     """The 41 bags of a F1TENTH car, trial_01 to trial_41; see the README beside them."""
-    folder = Path(str(files("bags.samples"))) / "f1tenth"
-    return sorted(folder.glob("trial_*"))
+    return sorted((Path(str(files("bags.samples"))) / "f1tenth").glob("trial_*"))
 
 
 def kuka() -> list[Path]:
     """Three bags of a KUKA arm's tracked motions, motion_a to motion_c; see the README there."""
-    folder = Path(str(files("bags.samples"))) / "kuka"
-    return sorted(folder.glob("motion_*"))
+    return sorted((Path(str(files("bags.samples"))) / "kuka").glob("motion_*"))
 
 
 def schunk() -> list[Path]:
     """Six bags of a Schunk robot arm, trial_001 to trial_100; see the README beside them."""
-    folder = Path(str(files("bags.samples"))) / "schunk"
-    return sorted(folder.glob("trial_*"))
+    return sorted((Path(str(files("bags.samples"))) / "schunk").glob("trial_*"))

@@ -56,8 +56,7 @@ def choose(
             if all(row.attempt != attempt for row in seen):
                 progress(str(attempt), number / len(stages))
                 seen.append(held_out.glance(attempt))
-        glances = seen[begun:]
-        for place, row in enumerate(sorted(glances, key=lambda row: row.percent)):
+        for place, row in enumerate(sorted(seen[begun:], key=lambda row: row.percent)):
             best = least(rows)
             limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
@@ -68,6 +67,14 @@ def choose(
             else:
                 rows.append(replace(row, refusal=f"{row.percent:.3g} % on one fold"))
     return Choice(held_out, tuple(rows))
+
+
+def tried(train: Dataset, stages: "Stages", *, progress: Progress) -> Choice | None:
+    """Everything that was tried for these trials; None if they are too few to hold some out."""
+    try:
+        return choose(HeldOut.of(train), stages, progress=progress)
+    except DataError:
+        return None
 
 
 def least(rows: Iterable[Row]) -> Row | None:

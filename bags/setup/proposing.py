@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from bags.chain.identification_config import section_of
 from bags.chain.steps import Trials, read_trials
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup import ladder
-from bags.setup.attempts import say_model, tried
 from bags.setup.candidates import Found, Pair, slope_window
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
@@ -29,7 +29,8 @@ from bags.signals.signal import SignalPath
 from bags.signals.timing import RELATED
 from nlsid_core.data.repeats import same_excitation
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import BagError, DataError
+from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.identification import Choice
 from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
@@ -39,6 +40,7 @@ SAFETY: Final = 1.2  # on the disturbance's amplitude, the funnel's own default
 ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, rounded
 WASHOUT: Final = 2.0  # s
 OTHERS: Final = 3  # commands that are named besides
+SHOWN: Final = 6  # of the models that were tried
 
 
 def choose(
@@ -154,8 +156,8 @@ def propose(
     proposal.walls += trials.apart
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
-    choice = tried(trials.train, ladder.LINEAR, progress=progress)
-    say_model(proposal, choice, trials.train)
+    choice = ladder.tried(trials.train, ladder.LINEAR, progress=progress)
+    _say_model(proposal, choice, trials.train)
     if linear and _may_add_up(proposal, found):
         washed = f"{responses[0]}|washout({WASHOUT:g} s)"
         moved = propose(bags, found, replace(chosen, responses=(washed,)), progress=progress)
@@ -175,7 +177,7 @@ def propose(
             return wider
     if choice is not None and not is_swapped:  # who swapped them has to say so first
         more = ladder.choose(choice.held_out, ladder.BEYOND, choice.rows, progress=progress)
-        say_model(proposal, more, trials.train)
+        _say_model(proposal, more, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)
     proposal.walls += _beside(proposal, found) if alone else []
@@ -477,3 +479,40 @@ def _say_funnel(proposal: Proposal) -> None:
         f"; {SAFETY:g} times {times:.2g}, as no trial is left for calibration, and errors are so "
         "many times larger on what was held out than where models were fitted"
     ) * (times > 1.0)
+
+
+def _say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> None:
+    """Take what the rule takes, say what else was tried, and what to expect."""
+    if choice is None or not choice.found:
+        _say_untried(proposal, train)
+        return
+
+    known = proposal.content["identification"]
+    section: dict[str, Any] = section_of(choice.best.attempt, choice.held_out.data)
+    if section["model"] == "state_affine" and "input_range" in known:
+        section["input_range"] = known["input_range"]
+    proposal.content["identification"] = section
+    proposal.choice = choice
+    said = "; ".join(f"{row.attempt}: {row.percent:.3g} %" for row in choice.ranked[:SHOWN])
+    proposal.why["model"] = (
+        f"{len(choice.rows)} were tried on {choice.held_out.on} that were held out, and the "
+        f"simplest that is as good as the best is taken: {said}"
+    )
+
+
+def _say_untried(proposal: Proposal, train: Dataset) -> None:
+    """What identification does with the first guess, where nothing could be held out."""
+    proposal.why["model"] = "a first guess"
+    try:
+        proposal.config().identification.identify(train)
+    except NlsidError as reason:
+        wall = (
+            f"identification will refuse ({reason}); a response that adds up its command for ever "
+            "needs |derivative or |washout behind its path"
+        )
+    else:
+        wall = (
+            "no class has a proved model of a part of these trials: the model is a first guess, "
+            "and nothing says how well it simulates other data"
+        )
+    proposal.walls.append(wall)

@@ -370,8 +370,7 @@ def skipped_samples(dataset: Dataset) -> int:
     """How many samples `split_gaps` left out of the bags of `dataset`."""
     bags = {}
     for trial in dataset:
-        origin = json.loads(trial.provenance or "{}")
-        bags[trial.digest] = int(origin.get("skipped", 0))
+        bags[trial.digest] = int(json.loads(trial.provenance or "{}").get("skipped", 0))
     return sum(bags.values())
 
 

@@ -129,8 +129,7 @@ def clock_relation(stamp_ns: IntArray, log_ns: IntArray) -> ClockRelation:
     slope = _drift(t, ahead)
     level = ahead - slope * t
     offset = float(level.max())
-    late = offset - level
-    latency, spread = np.quantile(late, (0.5, 0.95))
+    latency, spread = np.quantile(offset - level, (0.5, 0.95))
     return ClockRelation(origin / 1e9 + offset, slope, float(latency), float(spread))
 
 
@@ -155,8 +154,7 @@ def missing(sequence: IntArray) -> int | None:
     and then for itself.
     """
     anew = np.flatnonzero(np.diff(sequence) < -SOON) + 1
-    counts = [np.diff(np.sort(part)) for part in np.split(sequence, anew)]
-    steps = np.concatenate(counts)
+    steps = np.concatenate([np.diff(np.sort(part)) for part in np.split(sequence, anew)])
     if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
         return None
     return int(np.maximum(steps - 1, 0).sum())

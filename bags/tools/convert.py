@@ -189,8 +189,8 @@ def _refuse_another_type(topic: str, first: Bag, second: Bag) -> None:
 
 def _spans(bags: Sequence[Bag], what: What) -> Spans:
     """When messages are copied."""
-    filled = [bag.storage for bag in bags if any(channel.count for channel in bag.channels)]
-    origin_ns = min((storage.start_ns for storage in filled), default=0)
+    starts = [bag.start_ns for bag in bags if any(channel.count for channel in bag.channels)]
+    origin_ns = min(starts, default=0)
     start_ns = _moment(what.start, origin_ns) if what.start else 0
     end_ns = _moment(what.end, origin_ns) if what.end else NEVER
     if not what.around:
@@ -273,7 +273,7 @@ class _Parts:
         self.paths: list[Path] = []
         self._out, self._into, self._bags = out, into, bags
         self.sources = {
-            (n, key): (channel, (n, bag.storage.strands[key]), bag.storage.numbers[key])
+            (n, key): (channel, (n, bag.strands[key]), bag.numbers[key])
             for n, (bag, known) in enumerate(zip(bags, channels, strict=True))
             for key, channel in known.items()
         }

@@ -145,8 +145,7 @@ def _samples(
     responses: Sequence[Samples], excitations: Sequence[Samples], commands: dict[str, FloatArray]
 ) -> Iterator[Finding]:
     """What identification would make of the signals; `commands` become those of its samples."""
-    clocks = {samples.clock for samples in (*responses, *excitations)}
-    if len(clocks) > 1:
+    if len({samples.clock for samples in (*responses, *excitations)}) > 1:
         yield Finding(
             Level.BAD,
             "samples",
@@ -313,8 +312,7 @@ def _excitation(samples: Samples) -> Iterator[Finding]:
         return
     period = max(float(np.median(np.diff(samples.stamp_ns))) / 1e9, 1e-9)
     f, power = _spectrum(x - x.mean(), period)
-    share = np.cumsum(power) / power.sum()
-    band = float(f[np.searchsorted(share, 0.95)])
+    band = float(f[np.searchsorted(np.cumsum(power) / power.sum(), 0.95)])
     lines = int((power > 1e-3 * power.max()).sum())
     level = Level.LOOK if lines < LINES_FEW or band * period > BAND_LOOK else Level.GOOD
     yield Finding(

@@ -152,7 +152,7 @@ def bag_info(
         if messages:
             looked = {topic: _Collector(bag, topic) for topic in wanted}
             for channel, batch in bag.batches(wanted, progress=progress):
-                looked[channel.topic].add(batch, bag.storage.strands[channel.key])
+                looked[channel.topic].add(batch, bag.strands[channel.key])
                 times[channel.topic].append(batch.log_ns)
         else:
             for topic, log_ns in bag.log_times(wanted):
@@ -179,7 +179,7 @@ def bag_info(
             size=sum(file.stat().st_size for file in bag.files),
             ending=bag.ending,
             made={
-                **{name: ", ".join(found_in) for name, found_in in bag.storage.kinds.items()},
+                **{name: ", ".join(found_in) for name, found_in in bag.kinds.items()},
                 "ros_distro": bag.release,
             },
             custom=bag.custom,

@@ -335,8 +335,7 @@ class _Csv:
     def write(self, table: Table) -> None:
         if not self._stream.tell():
             self._writer.writerow(table)
-        columns = [_cells(column) for column in table.values()]
-        self._writer.writerows(zip(*columns, strict=True))
+        self._writer.writerows(zip(*[_cells(column) for column in table.values()], strict=True))
 
     def close(self) -> None:
         self._stream.close()

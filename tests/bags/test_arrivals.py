@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bags.recordings.bag import Bag
-from bags.signals.arrivals import Arrival, Recent
 from bags.signals.publishers import counted_in_turn
+from bags.signals.recording import Arrival, Recent
 from bags.signals.timing import Sequence
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 

@@ -9,8 +9,7 @@ import pytest
 
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter, Output
-from bags.signals.arrivals import Arrival
-from bags.signals.recording import Recording
+from bags.signals.recording import Arrival, Recording
 from bags.tools.recover import repair, unfinished_bags
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
@@ -20,8 +19,7 @@ SCRIPT = f"""
 import resource, sys
 from bags.recordings.definitions import standard_definition
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival
-from bags.signals.recording import Recording
+from bags.signals.recording import Arrival, Recording
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
 recording = Recording(BagWriter(sys.argv[1], in_place=True), least_free=0.0)

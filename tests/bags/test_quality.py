@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from bags.recordings.bag import Bag
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Recent
+from bags.signals.recording import Arrival, Recent
 from bags.tools.copies import Into
 from bags.tools.recover import recover, repair
 from nlsid_core.errors import BagError

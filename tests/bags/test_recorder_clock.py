@@ -1,6 +1,6 @@
 """Log times in simulated time, between two looks at the simulation's clock."""
 
-from bags.signals.arrivals import LogClock
+from bags.signals.recording import LogClock
 
 
 def test_without_a_simulation_it_is_the_walls_time() -> None:

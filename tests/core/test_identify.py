@@ -65,7 +65,7 @@ def test_a_fit_says_what_was_found(train: Dataset) -> None:
     test = synthetic_dataset(0.01, trials=2)
     fit = identify(train, Polynomial(2), test=test)
     text = str(fit)
-    assert "train        test" in text
+    assert "train    test" in text
     assert f"* {Rse().title}" in text
     assert fit.errors["test"]["rse"] == fit.chosen.error_percent(test)
 

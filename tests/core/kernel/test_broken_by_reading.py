@@ -168,7 +168,7 @@ def test_a_unit_cannot_change_the_number_before_it(unit: str) -> None:
     assert said == (
         f"tube: the measured speed stays within 9.537e-07 {json.dumps(unit)} of what the model "
         "predicts from the inputs alone, for every input, for 2 samples, which span 0.1 s, as long "
-        "as what is assumed is kept; and as near the policy's plan, which is the simulation from "
+        "as its assumptions hold; and as near the policy's plan, which is the simulation from "
         "its start under its inputs, for at most its 2 samples, which span 0.1 s, whether those "
         "inputs are played, the policy is engaged around them, or anything between the two acts, "
         "such as the policy's input clipped to a range that holds the plan's, as [0.123456, 1] m/s "

@@ -47,8 +47,8 @@ def test_the_sentences_are_those_of_the_page() -> None:
     said = str(decide(model, funnel, proof)).splitlines()
     assert said[0].startswith(
         f"PROVED tube: the measured speed stays within {headline['half_widths'][0]:.3g} m/s of "
-        "what the model predicts from the inputs alone, for every input, for ever, as long as what "
-        f"is assumed is kept (tube 1, inferred share speed {int(100 * share) / 100}); also within "
+        "what the model predicts from the inputs alone, for every input, for ever, as long as its "
+        f"assumptions hold (tube 1, inferred share speed {int(100 * share) / 100}); also within "
         f"{energy['half_widths'][0]:.3g} m/s for 40 samples, which span 0.975 s (tube 2), margin "
     )
     assert (
