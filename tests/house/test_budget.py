@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_189,
-    ("bags",): 12_031,
-    ("nlsid_ros",): 2_663,
-    ("tests",): 22_838,
+    ("bags",): 11_916,
+    ("nlsid_ros",): 2_662,
+    ("tests",): 22_792,
     ("benchmarks", "examples"): 3_801,
 }
 ARGUMENTS, FIELDS = 6, 8
