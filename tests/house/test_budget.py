@@ -15,10 +15,10 @@ STATEMENTS = {
     ("bags",): 11_916,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_792,
-    ("benchmarks", "examples"): 3_801,
+    ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 7, 12  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 1, 12  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
