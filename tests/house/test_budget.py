@@ -12,7 +12,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_591,
-    ("bags",): 11_916,
+    ("bags",): 11_906,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_955,
     ("benchmarks", "examples"): 3_805,
