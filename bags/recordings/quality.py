@@ -19,6 +19,7 @@ MAX_TEXT: Final = 2**16  # characters; a topic with a hundred publishers has 30 
 KEY: Final = "offered_qos_profiles"  # in metadata.yaml, and of a channel's metadata
 TYPE_HASH: Final = "topic_type_hash"  # of a channel's metadata, as rosbag2 writes it
 
+# The C loader where PyYAML has it: ten thousand topics are seconds in Python.
 LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
