@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.polynomial import Polynomial, compose_affine, trace
+from nlsid_core.polynomial import Polynomial, trace, variables
 
 INERTIA = np.array([5.0, 3.0, 2.0])  # kg m², principal axes
 FINAL_TIME = 5.0  # s
@@ -63,7 +63,6 @@ class LStep:
     """
 
     time: float
-    field: tuple[Polynomial, ...]
     P: FloatArray
     P_rate: FloatArray
     rho: float
@@ -76,16 +75,8 @@ class LStep:
 
     def polynomial(self) -> Polynomial:
         """g as a polynomial in z0..z5."""
-        names = [f"z{i}" for i in range(6)]
-        closed = np.vstack([self.T, -self.K @ self.T])
-        moved = (
-            compose_affine(self.field, closed, np.r_[self.offset, self.u], names=names)
-            - self.x_rate
-        )
-        z = np.array(
-            [Polynomial(row[None], np.ones(1), tuple(names)) for row in np.eye(6, dtype=int)]
-        )
-        x_bar = self.T @ z
+        x_bar = self.T @ np.array(variables([f"z{i}" for i in range(6)]))
+        moved = dynamics(self.offset + x_bar, self.u - self.K @ x_bar) - self.x_rate
         W_rate = 2 * (self.P @ x_bar) @ moved + x_bar @ (self.P_rate @ x_bar)
         g: Polynomial = (self.rho_rate - W_rate) / self.rho
         return g
@@ -136,7 +127,6 @@ def nominal() -> Nominal:
 
 def l_steps(motion: Nominal) -> list[LStep]:
     """The 192 L-steps of the first iteration: 4 samples, ends included, in each of 48 intervals."""
-    field = tuple(f.rounded() for f in trace(dynamics, {"x": 6, "u": 3}))
     steps = []
     for k, (start, end) in enumerate(zip(motion.t[:-1], motion.t[1:], strict=True)):
         rate = (motion.S[k + 1] - motion.S[k]) / (end - start)
@@ -148,7 +138,6 @@ def l_steps(motion: Nominal) -> list[LStep]:
             steps.append(
                 LStep(
                     time=t,
-                    field=field,
                     P=P,
                     P_rate=rate,
                     rho=rho,

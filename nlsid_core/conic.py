@@ -2,18 +2,14 @@
 
     minimise ½x'Px + q'x   subject to   Ax + s = b,  s in a product of cones
 
-Clarabel is called directly; every other solver by name through cvxpy. A solver's status is a
-rumour: what is returned is judged by the residuals computed here, and a caller that needs a proof
-takes the solution to the kernel.
+Clarabel is called with a ladder of settings. Its status is a rumour: what is returned is judged by
+the residuals computed here, and a caller that needs a proof takes the solution to the kernel.
 """
 
-import importlib
 import time
-import warnings
-from collections.abc import Iterable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from threading import Lock
+from functools import partial
 from typing import Any, Final, Literal, TypeAlias
 
 import clarabel
@@ -31,11 +27,8 @@ ACCEPTED_RESIDUAL = 1e-5
 # Clarabel's own default; tighter stalls on problems whose optimum is not strictly feasible.
 TOLERANCE = 1e-8
 MAX_ITERATIONS = 200
-# SCS is a first-order method: asked for more digits it does not return in useful time.
-SCS_TOLERANCE = 1e-7
 SQRT2 = float(np.sqrt(2.0))
 _STDERR: Final = NativeStderr()
-_WARNING: Final = Lock()  # Python's filters of warnings are one for all threads
 
 
 @dataclass(frozen=True)
@@ -105,20 +98,19 @@ class ConeSolution:
 
 
 def solve(
-    program: ConeProgram, solver: str = "clarabel", *, tolerance: float = TOLERANCE
+    program: ConeProgram, *, tolerance: float = TOLERANCE, refined: bool = False
 ) -> ConeSolution:
     """Solve one cone program.
 
-    "clarabel" climbs a ladder until the residuals are acceptable: fast settings, iterative
-    refinement on, data rescaled, SCS. Another name is given to cvxpy as it is. Raises Infeasible
-    if a solver certifies that there is no solution, SolverError if none finds one.
+    Climbs a ladder until the residuals are acceptable: fast settings, iterative refinement on, data
+    rescaled. refined: whether it starts with refinement on. Raises Infeasible if Clarabel certifies
+    that there is no solution, SolverError if no rung finds one.
     """
     started = time.perf_counter()
     attempts: list[str] = []
     best: ConeSolution | None = None
-    ladder = _LADDER if solver.lower() == "clarabel" else (solver,)
-    for rung in ladder:
-        outcome = _attempt(program, rung, tolerance)
+    for rung, attempt in _LADDER[int(refined) :]:
+        outcome = attempt(program, tolerance)
         attempts.append(f"{rung}: {outcome.status}")
         if "infeasible" in outcome.status.lower() or "unbounded" in outcome.status.lower():
             raise Infeasible(
@@ -143,17 +135,6 @@ def solve(
             return replace(best, attempts=tuple(attempts), seconds=time.perf_counter() - started)
     found = f" (best residual {best.residual:.1e})" if best else ""
     raise SolverError(f"no acceptable solution{found}: {'; '.join(attempts)}")
-
-
-def solve_all(
-    programs: Iterable[ConeProgram], *, executor: Executor | None = None, solver: str = "clarabel"
-) -> list[ConeSolution]:
-    """Solve independent programs, in order; threads by default, as Clarabel releases the GIL."""
-    programs = list(programs)
-    if executor is not None:
-        return list(executor.map(solve, programs, [solver] * len(programs)))
-    with ThreadPoolExecutor() as threads:
-        return list(threads.map(solve, programs, [solver] * len(programs)))
 
 
 def svec(matrix: FloatArray) -> FloatArray:
@@ -182,8 +163,6 @@ def triangle(n: int) -> tuple[Any, Any]:
 
 # -- the ladder ------------------------------------------------------------------------------
 
-_LADDER = ("clarabel", "clarabel refined", "clarabel rescaled", "SCS")
-
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
@@ -191,16 +170,6 @@ class _Outcome:
     x: Any = None
     s: Any = None
     z: Any = None
-
-
-def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
-    if rung == "clarabel":
-        return _clarabel_dual(program, tolerance)
-    if rung == "clarabel refined":
-        return _clarabel(program, tolerance, refine=True)
-    if rung == "clarabel rescaled":
-        return _rescaled(program, tolerance)
-    return _through_cvxpy(program, rung)
 
 
 def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outcome:
@@ -325,58 +294,11 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, z)
 
 
-def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
-    """Any solver cvxpy has, by its name."""
-    cp: Any = importlib.import_module("cvxpy")  # slow to import, and rarely needed
-
-    if name.upper() not in cp.installed_solvers():
-        raise SolverError(
-            f"solver '{name}' is not installed; there are: {', '.join(cp.installed_solvers())}"
-        )
-    x = cp.Variable(len(program.q))
-    constraints, duals, start = [], [], 0
-    slack = program.b - program.A @ x
-    for cone in program.cones:
-        block = slack[start : start + cone.rows]
-        start += cone.rows
-        if cone.kind == "psd":
-            i, j = triangle(cone.size)
-            rows = np.r_[i + cone.size * j, j + cone.size * i][np.r_[[True] * len(i), i != j]]
-            columns = np.r_[np.arange(len(i)), np.arange(len(i))][np.r_[[True] * len(i), i != j]]
-            weight = np.where(i == j, 1.0, 1 / SQRT2)[columns]
-            spread = sp.csc_matrix((weight, (rows, columns)), (cone.size**2, cone.rows))
-            matrix = cp.reshape(spread @ block, (cone.size, cone.size), order="F")
-            constraints.append(matrix >> 0)
-        elif cone.kind == "second_order":
-            constraints.append(cp.SOC(block[0], block[1:]))
-        else:
-            constraints.append(block == 0 if cone.kind == "zero" else block >= 0)
-        duals.append((cone, constraints[-1]))
-    objective = program.q @ x
-    if program.P.nnz:
-        objective = objective + cp.quad_form(x, cp.psd_wrap(program.P)) / 2
-    options = {"eps_abs": SCS_TOLERANCE, "eps_rel": SCS_TOLERANCE, "max_iters": 100_000}
-    problem = cp.Problem(cp.Minimize(objective), constraints)
-    try:
-        with _WARNING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it is inaccurate: the residual judges that
-            problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
-    except (cp.SolverError, ValueError) as error:  # SCS raises the second where it cannot begin
-        return _Outcome(f"failed ({error})")
-    if x.value is None:
-        return _Outcome(str(problem.status))
-    z = np.concatenate([_dual(cone, constraint) for cone, constraint in duals] or [np.zeros(0)])
-    return _Outcome(str(problem.status), np.array(x.value), program.b - program.A @ x.value, z)
-
-
-def _dual(cone: Cone, constraint: Any) -> FloatArray:
-    value = constraint.dual_value
-    if cone.kind == "psd":
-        return svec(np.asarray(value))
-    if cone.kind == "second_order":
-        return np.concatenate([np.atleast_1d(part).ravel() for part in value])
-    flat = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
-    return -flat if cone.kind == "zero" else flat  # cvxpy adds equalities to its Lagrangian
+_LADDER: tuple[tuple[str, Callable[[ConeProgram, float], _Outcome]], ...] = (
+    ("clarabel", _clarabel_dual),
+    ("clarabel refined", partial(_clarabel, refine=True)),
+    ("clarabel rescaled", _rescaled),
+)
 
 
 def _residual(program: ConeProgram, x: FloatArray, s: FloatArray, z: FloatArray) -> float:

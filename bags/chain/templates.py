@@ -127,7 +127,7 @@ TEMPLATES: Mapping[str, Template] = MappingProxyType(
             _same("lags", "delays", "set")
             | {"left_degree": "left", "right_degree": "past", "input_degree": "inputs"}
             | {"lagged_degree": "lagged"}
-            | _same("output_range", "input_range", "continuous"),
+            | _same("output_range", "input_range"),
             {"left": 3, "set": "2.11"},
         ),
         "linear_states": Template(

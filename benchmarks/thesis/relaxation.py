@@ -5,16 +5,18 @@ Between the instants anything may happen, so what is found is at least as large 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike
 from nlsid_core.design import ContinuousTracking
-from nlsid_core.design.continuous.lstep import sections
+from nlsid_core.design.continuous.expanded_sweep import swept
 from nlsid_core.design.continuous.problem import Goal
 from nlsid_core.design.continuous.setting import prepare
-from nlsid_core.design.continuous.sweep import Wanted, sweep_rho
+from nlsid_core.design.continuous.sweep import Wanted
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -55,10 +57,10 @@ def sample_funnel(
     if samples < 2:
         raise DataError(f"{samples} samples an interval: its two ends are the least")
     setting = prepare(ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R))
-    steps, policy = setting.steps, setting.policy
-    instants = sections(steps, policy, setting.P, count=samples)
-    margin = setting.margin(setting.rho_final)
-    rho, _ = sweep_rho(steps, instants, Wanted(margin, setting.rho_final), progress)
+    policy = setting.policy
+    wanted = Wanted(setting.margin(setting.rho_final), setting.rho_final)
+    shares = np.linspace(0, 1, samples).tolist()
+    rho = swept(replace(setting, expansion=None), wanted, progress, shares=shares).rho
     digest = files.digest(policy.document())
     funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
     return Sampled(funnel, (funnel.volume_integral(),))

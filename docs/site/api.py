@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import nlsid
+
 ROOMS = (
     "identification",
     "design",
@@ -97,8 +99,26 @@ def write(folder: Path) -> set[str]:
                         if not member.startswith("_") and inspect.getdoc(vars(thing)[member])
                     )
         _update(folder / f"{room}.md", "\n".join(page))
-    _update(folder / "index.md", INDEX + "\n".join(ROOMS) + "\n```\n")
+    _update(folder / "nlsid.md", _face(documented))
+    _update(folder / "index.md", INDEX + "\n".join(("nlsid", *ROOMS)) + "\n```\n")
     return documented
+
+
+def _face(documented: set[str]) -> str:
+    """The page of what `import nlsid` gives: a table, and what no room of the core documents."""
+    rows, others = [], []
+    for name in nlsid.__all__:
+        thing = getattr(nlsid, name)
+        full = f"{thing.__module__}.{thing.__name__}"
+        kind = "class" if inspect.isclass(thing) else "function"
+        role = "class" if kind == "class" else "func"
+        first = (inspect.getdoc(thing) or "").partition("\n\n")[0].replace("\n", " ")
+        rows.append(f"| {{py:{role}}}`{name} <{full}>` | {first.replace('|', chr(92) + '|')} |")
+        if full not in documented:
+            others.append(f"```{{eval-rst}}\n.. auto{kind}:: {full}\n```\n")
+    head = "# nlsid\n\nWhat `import nlsid` gives. A name is imported when it is first used.\n"
+    table = "\n".join(["| name | what |", "|---|---|", *rows])
+    return "\n".join([head, table, "\n## Bags and pictures\n", *others])
 
 
 def short(signature: str) -> str:

@@ -15,8 +15,6 @@ SMOOTHING = 0.1  # weight of a change of input between samples against an output
 
 def lqr_gain(model: DifferenceEquation, *, output_weight: float, input_weight: float) -> FloatArray:
     """K (n,) minimising Σ output_weight·(C x̄)² + input_weight·ū², x̄⁺ = A x̄ + B ū, ū = -K x̄."""
-    if output_weight <= 0 or input_weight <= 0:
-        raise DataError(f"LQR weights should be positive; {output_weight} and {input_weight}")
     A, B, C = model.A, model.B, model.C
     S = solve_riccati(A, B, output_weight * C.T @ C, np.array([[input_weight]]))
     gain: FloatArray = (B.T @ S @ A)[0] / (input_weight + (B.T @ S @ B)[0, 0])

@@ -1,6 +1,5 @@
 """Continuous time: polynomial dynamics, motions, and functions of time in pieces."""
 
-from nlsid_core.dynamics.identified import identified_field
 from nlsid_core.dynamics.measured import MeasuredPush, measured_push
 from nlsid_core.dynamics.nominal import Nominal
 from nlsid_core.dynamics.piecewise import (
@@ -22,7 +21,6 @@ __all__ = [
     "VectorField",
     "constant_on",
     "cubic_through",
-    "identified_field",
     "linear_through",
     "measured_push",
     "solve",

@@ -25,11 +25,11 @@ from nlsid_core.dynamics.vector_field import (
     Plan,
     VectorField,
     arguments,
+    box_of,
     no_entry,
     variable_names,
 )
 from nlsid_core.errors import DataError, NlsidError, NotPolynomial, ShapeError
-from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.polynomial.algebra import as_polynomial, constant, variables
 
@@ -79,12 +79,7 @@ class Rates:
         affine: bool = False,
     ) -> "Rates":
         """Look at the function once, with symbols."""
-        box = box_of(uncertain)
-        given = arguments(function)
-        if len(box) and "w" not in given:
-            raise DataError("uncertain has rows, but the dynamics have no argument w")
-        if "w" in given and not len(box):
-            raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
+        box = box_of(function, uncertain)
         names = ("t", *variable_names(n, m, len(box)))
         blank = cls(function, n, m, box, (), ())
         symbols = [_Symbol(p.exact(), frozenset([j])) for j, p in enumerate(variables(names))]
@@ -96,14 +91,9 @@ class Rates:
         return cls(function, n, m, box, tuple(exact), tuple(row.uses for row in traced), affine)
 
     @classmethod
-    def numeric(
-        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None
-    ) -> "Rates":
+    def numeric(cls, function: Callable[..., Any], n: int, m: int) -> "Rates":
         """Only for values at points: nothing is asked of the function but numbers."""
-        box = box_of(uncertain)
-        if "w" in arguments(function) and not len(box):
-            raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
-        return cls(function, n, m, box, (), ())
+        return cls(function, n, m, box_of(function, None), (), ())
 
     @property
     def depends_on_time(self) -> bool:
@@ -431,16 +421,6 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
         tuple(pieces), n, m, t[1:-1], uncertain, np.array(valid).reshape(-1, 4), EXPANSION
     )
     return made.within(rates.valid[~np.isin(rates.valid[:, 0], rates.expanded)])
-
-
-def box_of(uncertain: ArrayLike | None) -> FloatArray:
-    """(n_w, 2) bounds of w; DataError unless they are rows (low, high)."""
-    box = np.zeros((0, 2)) if uncertain is None else numbers(uncertain, "uncertain")
-    if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
-        raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
-    if not np.isfinite(box).all():
-        raise DataError(f"uncertain should be finite bounds of w, is {box.tolist()}")
-    return box
 
 
 def _once(

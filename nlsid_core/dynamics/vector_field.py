@@ -16,6 +16,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial, trace, variables
+from nlsid_core.polynomial.documents import write_number
 from nlsid_core.polynomial.maps import coefficient_table
 
 FORMAT = "nlsid/vector_field"
@@ -29,7 +30,9 @@ _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{0,3999})?", re.ASCII)
 
 @dataclass(frozen=True, eq=False)
 class VectorField:
-    """ẋ_i = pieces[j][i](t, x, u, w) on the j-th of the time spans that `breaks` separate.
+    """Equations of motion, ẋ_i = pieces[j][i](t, x, u, w).
+
+    The j-th pieces hold on the j-th of the time spans that `breaks` separate.
 
     pieces: exact polynomials in `names` = t, x0.., u0.., w0... n, m: numbers of states and inputs.
     breaks: (J-1,) s, increasing, where the equations change. uncertain: (n_w, 2) lower and upper
@@ -119,14 +122,9 @@ class VectorField:
     ) -> "VectorField":
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
-        Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
+        Raises NotPolynomial naming the operation; where a function is taken, it is then expanded.
         """
-        bounds = np.zeros((0, 2)) if uncertain is None else numbers(uncertain, "uncertain")
-        if bounds.ndim != 2 or bounds.shape[1] != 2:
-            raise DataError(f"uncertain should be rows (low, high) of w, is {bounds.tolist()}")
-        given = arguments(function)
-        if len(bounds) and "w" not in given:
-            raise DataError("uncertain has rows, but the dynamics have no argument w")
+        given, bounds = arguments(function), box_of(function, uncertain)
         sizes = {"t": 1, "x": n, "u": m, "w": len(bounds)}
 
         def called(*vectors: Any) -> Any:
@@ -142,8 +140,8 @@ class VectorField:
             raise DataError(f"the dynamics divide by zero ({error})") from error
         except NotPolynomial as error:
             raise NotPolynomial(
-                f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
-                "leave out; or give a polynomial, and what it leaves out as a bounded w"
+                f"{error}. Design a funnel with the function itself, which is then expanded along "
+                "the motion; or give a polynomial, and what it leaves out as a bounded w"
             ) from error
         except NlsidError:
             raise
@@ -426,6 +424,21 @@ def arguments(function: Callable[..., Any]) -> tuple[str, ...]:
     return names
 
 
+def box_of(function: Callable[..., Any], uncertain: ArrayLike | None) -> FloatArray:
+    """(n_w, 2) bounds of w; DataError unless they are rows (low, high), for a function of w."""
+    box = np.zeros((0, 2)) if uncertain is None else numbers(uncertain, "uncertain")
+    if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
+        raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
+    if not np.isfinite(box).all():
+        raise DataError(f"uncertain should be finite bounds of w, is {box.tolist()}")
+    takes = "w" in arguments(function)
+    if len(box) and not takes:
+        raise DataError("uncertain has rows, but the dynamics have no argument w")
+    if takes and not len(box):
+        raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
+    return box
+
+
 def no_entry(error: IndexError, n: int, m: int, uncertain: int) -> DataError:
     """What is said of dynamics that ask for an entry beyond the last."""
     return DataError(
@@ -457,10 +470,7 @@ def equation_document(p: Polynomial) -> Json:
     exact = [Fraction(p.coefficients[k]) for k in order]
     return {
         "exponents": p.exponents[order].tolist(),
-        "coefficients": [
-            float(value) if _is_float(value) else f"{value.numerator}/{value.denominator}"
-            for value in exact
-        ],
+        "coefficients": [write_number(value) for value in exact],
     }
 
 
@@ -495,10 +505,3 @@ def _number(value: Any, source: str) -> Fraction:
     if type(value) is str and _RATIONAL.fullmatch(value):
         return Fraction(value)
     raise DocumentError(f"{source}: {value!r:.40} is neither a number nor a text p/q")
-
-
-def _is_float(value: Fraction) -> bool:
-    try:
-        return Fraction(float(value)) == value
-    except OverflowError:
-        return False

@@ -1,7 +1,6 @@
-"""Vectors and matrices of polynomials: from a Python function, values, Jacobian, affine maps."""
+"""Vectors and matrices of polynomials: from a Python function, Jacobian, sums."""
 
 from collections.abc import Callable, Mapping, Sequence
-from fractions import Fraction
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -16,7 +15,6 @@ from nlsid_core.polynomial.algebra import (
     as_polynomial,
     variables,
 )
-from nlsid_core.polynomial.values import monomial_values
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray[Any]:
@@ -55,20 +53,6 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray
     return traced
 
 
-def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
-    """Values (..., *shape) of an array of polynomials at points (..., n).
-
-    All are in the same variables; monomials they share are evaluated once.
-    """
-    array: Any = np.asarray(polynomials, dtype=object)
-    points = np.asarray(points, dtype=np.float64)
-    exponents, table = coefficient_table(array.ravel().tolist())
-    if points.shape[-1:] != (exponents.shape[1],):
-        raise ShapeError(f"points should have shape (..., {exponents.shape[1]})")
-    values = monomial_values(exponents, points.reshape(-1, exponents.shape[1])) @ table
-    return values.reshape(points.shape[:-1] + array.shape)
-
-
 def jacobian(polynomials: ArrayLike | Sequence[Polynomial], names: Sequence[str]) -> NDArray[Any]:
     """∂p_i/∂names_j as an object array (..., len(names))."""
     array: Any = np.asarray(polynomials, dtype=object)
@@ -76,41 +60,6 @@ def jacobian(polynomials: ArrayLike | Sequence[Polynomial], names: Sequence[str]
     for index in np.ndindex(array.shape):
         for j, name in enumerate(names):
             result[(*index, j)] = array[index].derivative(name)
-    return result
-
-
-def compose_affine(
-    polynomials: ArrayLike | Sequence[Polynomial],
-    A: ArrayLike,
-    b: ArrayLike,
-    *,
-    names: Sequence[str],
-) -> NDArray[Any]:
-    """q_i(z) = p_i(A z + b), z called `names`: a shift to a trajectory, normalised coordinates.
-
-    A: (n, k) and b: (n,) of floats or Fractions, n the variables of the p_i in their order.
-    Returns an object array of the shape of `polynomials`. Exact if A and b are Fractions.
-    """
-    array: Any = np.asarray(polynomials, dtype=object)
-    A, b = np.asarray(A), np.asarray(b)
-    n = len(array.flat[0].names) if array.size else 0
-    if A.shape != (n, len(names)) or b.shape != (n,):
-        raise ShapeError(
-            f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}"
-        )
-    z = _object_array(variables(names))
-    rational = A.dtype == object or b.dtype == object
-    inner = [
-        (row @ z if row.any() else z[0] * 0) + (Fraction(shift) if rational else shift)
-        for row, shift in zip(A, b, strict=True)
-    ]
-    result = np.empty(array.shape, dtype=object)
-    for index in np.ndindex(array.shape):
-        p = array[index]
-        # Fresh names first: z may be called as the old variables are.
-        old = [f"\0{i}" for i in range(n)]
-        renamed = Polynomial(p.exponents, p.coefficients, tuple(old))
-        result[index] = renamed.substitute(dict(zip(old, inner, strict=True))).over(names)
     return result
 
 

@@ -1,6 +1,6 @@
 """Sums of squares: programs as data, compiled to cones, and a fast path on the sphere."""
 
-from nlsid_core.sos.compiled import Compiled, compile_program, solve
+from nlsid_core.sos.builder import Builder, solve
 from nlsid_core.sos.program import (
     Identity,
     NonNegative,
@@ -8,7 +8,6 @@ from nlsid_core.sos.program import (
     Program,
     Solution,
     SumOfSquares,
-    Zero,
     forms_of,
     matrix_sum_of_squares,
     symmetric_template,
@@ -17,7 +16,7 @@ from nlsid_core.sos.program import (
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
 __all__ = [
-    "Compiled",
+    "Builder",
     "Identity",
     "NonNegative",
     "NormBound",
@@ -26,8 +25,6 @@ __all__ = [
     "SphereProgram",
     "SphereSolution",
     "SumOfSquares",
-    "Zero",
-    "compile_program",
     "forms_of",
     "matrix_sum_of_squares",
     "solve",

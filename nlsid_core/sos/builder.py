@@ -1,19 +1,18 @@
 """Rows, columns and cones of a sums-of-squares program.
 
-Unknowns are x = [decisions; free multipliers; svec of every Gram block]; each monomial of each
-identity is one equality row, each Gram block one semidefinite cone.
+Unknowns are x = [decisions; svec of every Gram block]; each monomial of each identity is one
+equality row, each Gram block one semidefinite cone.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.conic import Cone, ConeSolution
+from nlsid_core.conic import Cone, ConeProgram, ConeSolution
 from nlsid_core.errors import DataError
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.sos.basis import drop_inconsistent, gram_basis, sign_blocks
@@ -25,34 +24,9 @@ from nlsid_core.sos.program import (
     Program,
     Solution,
     SumOfSquares,
-    Zero,
     scaling,
 )
-from nlsid_core.sos.terms import (
-    Block,
-    candidates,
-    free_candidates,
-    free_terms,
-    gram_terms,
-    inner_degree,
-)
-
-Values: TypeAlias = Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Entries of A (in the order of `pattern`) and of b, as maps from parameter monomials.
-
-    features: (k, number of parameters) exponents of those monomials. q, cones: as in `conic`.
-    """
-
-    features: IntArray
-    pattern: sp.csc_matrix
-    A_map: sp.csr_matrix
-    b_map: sp.csr_matrix
-    q: FloatArray
-    cones: tuple[Cone, ...]
+from nlsid_core.sos.terms import Block, candidates, gram_terms, inner_degree
 
 
 @dataclass(eq=False)
@@ -62,37 +36,32 @@ class _Solved:
     constraint: SumOfSquares
     main: Block
     multipliers: list[Block]
-    free: list[tuple[IntArray, int]]
 
 
 @dataclass(eq=False)
 class _Entries:
-    """Values at (row, column, parameter monomial); column -1 is the right-hand side."""
+    """Values at (row, column); column -1 is the right-hand side."""
 
     row: list[IntArray] = field(default_factory=list)
     column: list[IntArray] = field(default_factory=list)
-    feature: list[IntArray] = field(default_factory=list)
     value: list[FloatArray] = field(default_factory=list)
 
-    def append(self, row: Any, column: Any, feature: Any, value: FloatArray) -> None:
-        for store, part in (
-            (self.row, row),
-            (self.column, column),
-            (self.feature, feature),
-        ):
+    def append(self, row: Any, column: Any, value: FloatArray) -> None:
+        for store, part in ((self.row, row), (self.column, column)):
             store.append(np.broadcast_to(np.asarray(part, dtype=np.int64), value.shape))
         self.value.append(value)
 
 
 class Builder:
-    """Reads the constraints of a program one by one and lays out rows, columns and cones."""
+    """Reads the constraints of a program one by one and lays out rows, columns and cones.
+
+    Raises DataError if an unknown occurs nonlinearly.
+    """
 
     def __init__(self, program: Program) -> None:
         self.program = program
         self.size = scaling(program)
         self.decisions: dict[str, int] = {}
-        self._features: dict[tuple[int, ...], int] = {(0,) * len(program.parameters): 0}
-        self.columns = 0
         self.equality, self.cone = _Entries(), _Entries()
         self.equality_rows = self.cone_rows = 0
         self.cones: list[Cone] = []
@@ -100,60 +69,41 @@ class Builder:
         for constraint in program.constraints:
             for p in _polynomials(constraint):
                 self._register(p)
-        for objective in (program.maximise, program.minimise):
-            if objective is not None:
-                self._register(objective)
+        if program.minimise is not None:
+            self._register(program.minimise)
         self.columns = len(self.decisions)
-
-    def features(self) -> IntArray:
-        """(k, number of parameters) exponents of the parameter monomials in use."""
-        rows = np.array(list(self._features), dtype=np.int64)
-        return rows.reshape(len(self._features), len(self.program.parameters))
+        for constraint in program.constraints:
+            self._add(constraint)
 
     # -- reading polynomials -----------------------------------------------------------------
 
     def _register(self, p: Polynomial) -> None:
-        known = {*self.program.indeterminates, *self.program.parameters}
         for j, name in enumerate(p.names):
-            if name not in known and p.exponents[:, j].any():
+            if name not in self.program.indeterminates and p.exponents[:, j].any():
                 self.decisions.setdefault(name, len(self.decisions))
 
-    def _split(self, p: Polynomial) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-        """Per term: exponents in the indeterminates, decision (-1: none), parameters, value."""
-        program = self.program
-        at = {name: j for j, name in enumerate(p.names)}
-        zero = np.zeros(len(p), dtype=np.int64)
-
-        def columns(names: tuple[str, ...]) -> IntArray:
-            picked = [p.exponents[:, at[name]] if name in at else zero for name in names]
-            return np.array(picked, dtype=np.int64).reshape(len(names), len(p)).T
-
+    def _split(self, p: Polynomial) -> tuple[IntArray, IntArray, FloatArray]:
+        """Per term: exponents in the indeterminates, decision (-1: none), value."""
+        names = self.program.indeterminates
         decision = np.full(len(p), -1, dtype=np.int64)
-        degree = zero.copy()
-        for name, j in at.items():
+        degree = np.zeros(len(p), dtype=np.int64)
+        exponents = np.zeros((len(p), len(names)), dtype=np.int64)
+        for name, column in zip(p.names, p.exponents.T, strict=True):
             if name in self.decisions:
-                used = p.exponents[:, j] > 0
-                decision[used] = self.decisions[name]
-                degree += p.exponents[:, j]
+                decision[column > 0] = self.decisions[name]
+                degree += column
+            elif name in names:
+                exponents[:, names.index(name)] = column
         if (degree > 1).any():
             bad = Polynomial(p.exponents[degree > 1], p.coefficients[degree > 1], p.names)
             raise DataError(f"decisions should occur linearly; found {bad}")
-        keys = map(tuple, columns(program.parameters).tolist())
-        feature = np.array(
-            [self._features.setdefault(key, len(self._features)) for key in keys], dtype=np.int64
-        )
-        coefficients = np.asarray(p.coefficients, dtype=np.float64)
-        return columns(program.indeterminates), decision, feature, coefficients
+        return exponents, decision, np.asarray(p.coefficients, dtype=np.float64)
 
     # -- constraints -------------------------------------------------------------------------
 
-    def add(self, constraint: Constraint) -> None:
-        """Append one constraint."""
+    def _add(self, constraint: Constraint) -> None:
         if isinstance(constraint, SumOfSquares):
             self._add_squares(constraint)
-        elif isinstance(constraint, Zero):
-            exponents, decision, feature, value = self._split(constraint.p)
-            self._rows(exponents, decision, feature, value)
         elif isinstance(constraint, NonNegative):
             self._affine_rows((constraint.p,), Cone("nonnegative", 1))
         else:
@@ -161,54 +111,36 @@ class Builder:
             self._affine_rows(entries, Cone("second_order", len(entries)))
 
     def _add_squares(self, constraint: SumOfSquares) -> None:
-        names = self.program.indeterminates
-        exponents, decision, feature, value = self._split(constraint.p)
+        names, forms = self.program.indeterminates, constraint.forms
+        exponents, decision, value = self._split(constraint.p)
         domain = [g.over(names) for g in constraint.domain]
-        equalities = [h.over(names) for h in constraint.equalities]
-        inner = np.array([name not in constraint.forms for name in names])
-        given = [exponents, *(g.exponents for g in domain + equalities)]
+        inner = np.array([name not in forms for name in names])
+        given = [exponents, *(g.exponents for g in domain)]
         least = max(inner_degree(rows, inner) for rows in given)
-        degree = least + least % 2 if constraint.degree is None else constraint.degree
+        degree = least + least % 2
 
-        parts = [g.exponents for g in domain + equalities]
-        symmetry = np.concatenate([exponents, *parts])
-        pieces = [(exponents, decision, feature, value)]
-        support = [exponents]
-        blocks, free = [], []
+        symmetry = np.concatenate(given)
+        pieces = [(exponents, decision, value)]
+        blocks = []
         for g in domain:
             room = max(degree - inner_degree(g.exponents, inner), 0)
-            basis = candidates(names, constraint.forms, room // 2)
-            if constraint.vanishing:
-                basis = basis[
-                    basis[:, [name in constraint.vanishing for name in names]].any(axis=1)
-                ]
-            block = self._block(basis, symmetry)
+            block = self._block(candidates(names, forms, room // 2), symmetry)
             blocks.append(block)
             pieces.append(gram_terms(block, g))
-            support.append(pieces[-1][0])
-        for h in equalities:
-            room = max(degree - inner_degree(h.exponents, inner), 0)
-            basis = free_candidates(names, constraint.forms, room, symmetry)
-            start, self.columns = self.columns, self.columns + len(basis)
-            free.append((basis, start))
-            pieces.append(free_terms(basis, start, h))
-            support.append(pieces[-1][0])
-        everything = np.unique(np.concatenate(support), axis=0)
-        main = self._block(self._main_basis(constraint, everything, degree), symmetry)
+        support = np.unique(np.concatenate([piece[0] for piece in pieces]), axis=0)
+        basis = gram_basis(support)
+        if forms:
+            basis = drop_inconsistent(candidates(names, forms, degree // 2), support)
+        main = self._block(basis, symmetry)
         unit = Polynomial(np.zeros((1, len(names)), dtype=np.int64), np.ones(1), names)
         pieces.append(gram_terms(main, unit))
-        columns = [np.concatenate([piece[k] for piece in pieces]) for k in range(4)]
-        columns[3] = np.concatenate([pieces[0][3], *(-piece[3] for piece in pieces[1:])])
-        self._rows(columns[0], columns[1], columns[2], columns[3])
-        self.solved.append(_Solved(constraint, main, blocks, free))
-
-    def _main_basis(self, constraint: SumOfSquares, support: IntArray, degree: int) -> IntArray:
-        if constraint.basis is not None:
-            return np.asarray(constraint.basis, dtype=np.int64)
-        if not constraint.forms:
-            return gram_basis(support)
-        everything = candidates(self.program.indeterminates, constraint.forms, degree // 2)
-        return drop_inconsistent(everything, support)
+        rows, columns, values = zip(*pieces, strict=True)
+        self._rows(
+            np.concatenate(rows),
+            np.concatenate(columns),
+            np.concatenate([values[0], *(-part for part in values[1:])]),
+        )
+        self.solved.append(_Solved(constraint, main, blocks))
 
     def _block(self, basis: IntArray, symmetry: IntArray) -> Block:
         parts = [part for part in sign_blocks(basis, symmetry) if len(part)]
@@ -218,82 +150,61 @@ class Builder:
             cone = Cone("psd", len(part)) if len(part) > 1 else Cone("nonnegative", 1)
             rows = np.arange(cone.rows)
             # s = svec(X) ⪰ 0, as -x + s = 0.
-            self.cone.append(
-                self.cone_rows + rows, self.columns + rows, 0, np.full(cone.rows, -1.0)
-            )
+            self.cone.append(self.cone_rows + rows, self.columns + rows, np.full(cone.rows, -1.0))
             self.cone_rows += cone.rows
             self.columns += cone.rows
             self.cones.append(cone)
         return Block(basis, tuple(parts), tuple(starts))
 
-    def _rows(
-        self,
-        exponents: IntArray,
-        column: IntArray,
-        feature: IntArray,
-        value: FloatArray,
-    ) -> None:
+    def _rows(self, exponents: IntArray, column: IntArray, value: FloatArray) -> None:
         """One equality row per monomial: Σ value·x[column] = 0, constants to the right."""
         monomials_used, row = np.unique(exponents, axis=0, return_inverse=True)
         # Row of x^α in variables of size 1: times size^α.
         value = value * np.prod(self.size**exponents, axis=1)
-        self.equality.append(self.equality_rows + row.ravel(), column, feature, value)
+        self.equality.append(self.equality_rows + row.ravel(), column, value)
         self.equality_rows += len(monomials_used)
 
     def _affine_rows(self, entries: tuple[Polynomial, ...], cone: Cone) -> None:
         """s = entries, as -entries(x) + s = constant."""
         for k, p in enumerate(entries):
-            exponents, decision, feature, value = self._split(p)
+            exponents, decision, value = self._split(p)
             if exponents.any():
                 raise DataError(
                     f"{p} should not depend on {', '.join(self.program.indeterminates)}"
                 )
-            self.cone.append(self.cone_rows + k, decision, feature, -value)
+            self.cone.append(self.cone_rows + k, decision, -value)
         self.cone_rows += cone.rows
         self.cones.append(cone)
 
     # -- assembly ----------------------------------------------------------------------------
 
-    def finish(self) -> "Layout":
-        """The cone data as a function of the parameters."""
+    def cone_program(self) -> ConeProgram:
+        """The cone data."""
         sizes = self._column_sizes()
-        self.equality.value = [
-            v * sizes[c] for v, c in zip(self.equality.value, self.equality.column, strict=True)
+        value: list[FloatArray] = [
+            np.asarray(values * sizes[column])
+            for values, column in zip(self.equality.value, self.equality.column, strict=True)
         ]
-        shift = _Entries(
-            [row + self.equality_rows for row in self.cone.row],
-            self.cone.column,
-            self.cone.feature,
-            self.cone.value,
+        value += self.cone.value
+        shifted = [row + self.equality_rows for row in self.cone.row]
+        row = np.concatenate([*self.equality.row, *shifted])
+        column = np.concatenate([*self.equality.column, *self.cone.column])
+        values, known = np.concatenate(value), column < 0
+        rows = self.equality_rows + self.cone_rows
+        A = sp.csc_matrix(
+            (values[~known], (row[~known], column[~known])), shape=(rows, self.columns)
         )
-        row, column, feature, value = (
-            np.concatenate([np.zeros(0), *getattr(self.equality, k), *getattr(shift, k)])
-            for k in ("row", "column", "feature", "value")
-        )
-        row, column, feature = (part.astype(np.int64) for part in (row, column, feature))
-        rows, features = self.equality_rows + self.cone_rows, len(self._features)
-        constant = column < 0
-        b_map = sp.csr_matrix(
-            (-value[constant], (row[constant], feature[constant])), (rows, features)
-        )
-        key = column[~constant] * rows + row[~constant]
-        place, slot = np.unique(key, return_inverse=True)
-        A_map = sp.csr_matrix(
-            (value[~constant], (slot.ravel(), feature[~constant])), (len(place), features)
-        )
-        indptr = np.searchsorted(place, np.arange(self.columns + 1) * rows)
-        pattern = sp.csc_matrix((np.ones(len(place)), place % rows, indptr), (rows, self.columns))
+        b = np.zeros(rows)
+        np.subtract.at(b, row[known], values[known])
         q = np.zeros(self.columns)
         objective = self.program.minimise
-        if self.program.maximise is not None:
-            objective = -self.program.maximise
         if objective is not None:
-            exponents, decision, feature, weight = self._split(objective)
-            if exponents.any() or feature.any():
+            exponents, decision, weight = self._split(objective)
+            if exponents.any():
                 raise DataError(f"the objective {objective} should be affine in the decisions")
             np.add.at(q, decision[decision >= 0], weight[decision >= 0])
         cones = (Cone("zero", self.equality_rows), *self.cones)
-        return Layout(self.features(), pattern, A_map, b_map, q, cones)
+        return ConeProgram(sp.csc_matrix((self.columns, self.columns)), q, A, b, cones)
 
     def _column_sizes(self) -> FloatArray:
         """What each unknown is when the solver's is 1; the last entry is the right-hand side."""
@@ -306,34 +217,32 @@ class Builder:
                     sizes[start : start + len(i)] = 1 / (power[part][i] * power[part][j])
         return sizes
 
-    def solution(self, cone: ConeSolution, parameters: Values) -> Solution:
+    def solution(self, cone: ConeSolution) -> Solution:
         """Decisions, Gram matrices and multipliers out of a cone solution."""
         x = cone.x * self._column_sizes()[:-1]
         values = {name: float(x[k]) for name, k in self.decisions.items()}
-        given = {name: float(parameters[name]) for name in self.program.parameters}
-        names = self.program.indeterminates
-        identities = []
-        for solved in self.solved:
-            p = solved.constraint.p
-            known = {k: v for k, v in (values | given).items() if k in p.names}
-            identities.append(
-                Identity(
-                    p=p.substitute(known).over(names),
-                    gram=solved.main.gram(x, names),
-                    multipliers=tuple(block.gram(x, names) for block in solved.multipliers),
-                    equality_multipliers=tuple(
-                        Polynomial(basis, x[start : start + len(basis)], names)
-                        for basis, start in solved.free
-                    ),
-                    name=solved.constraint.name,
-                )
+        found = Solution(values, (), 0.0, cone)
+        names, goal = self.program.indeterminates, self.program.minimise
+        identities = tuple(
+            Identity(
+                p=found.value(solved.constraint.p).over(names),
+                gram=solved.main.gram(x, names),
+                multipliers=tuple(block.gram(x, names) for block in solved.multipliers),
+                name=solved.constraint.name,
             )
-        maximise, minimise = self.program.maximise, self.program.minimise
-        goal = minimise if maximise is None else maximise
-        reached = 0.0
-        if goal is not None:
-            reached = float(goal.substitute({k: v for k, v in values.items() if k in goal.names}))
-        return Solution(values, tuple(identities), reached, cone)
+            for solved in self.solved
+        )
+        reached = 0.0 if goal is None else float(found.value(goal))
+        return Solution(values, identities, reached, cone)
+
+
+def solve(program: Program) -> Solution:
+    """Choose bases and multipliers, lay out the cone data and solve it.
+
+    Raises DataError if an unknown occurs nonlinearly, Infeasible or SolverError as `conic.solve`.
+    """
+    builder = Builder(program)
+    return builder.solution(conic.solve(builder.cone_program()))
 
 
 def _polynomials(constraint: Constraint) -> tuple[Polynomial, ...]:

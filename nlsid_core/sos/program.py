@@ -1,7 +1,7 @@
 """Sum-of-squares programs as data: what is unknown, what has to be a sum of squares.
 
-Unknowns are ordinary variables of ordinary polynomials: every variable that is neither an
-indeterminate nor a parameter of the program is a decision, and may occur linearly.
+Unknowns are ordinary variables of ordinary polynomials: every variable that is not
+an indeterminate of the program is a decision, and may occur linearly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.conic import ConeSolution
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial import Gram, Polynomial
@@ -20,31 +20,18 @@ from nlsid_core.polynomial.maps import added
 
 @dataclass(frozen=True)
 class SumOfSquares:
-    """p = v'Qv + Σ σ_i g_i + Σ μ_j h_j with Q ⪰ 0 and σ_i sums of squares: p ≥ 0 on a domain.
+    """p = v'Qv + Σ σ_i g_i with Q ⪰ 0 and σ_i sums of squares: p ≥ 0 on a domain.
 
-    p: polynomial, affine in the decisions. domain: the g_i ≥ 0. equalities: the h_j = 0, with free
-    multipliers. degree: of each summand, in the indeterminates; default: the least even degree
-    that fits p and the domain. basis: (k, n) monomials v; default: chosen from the support.
-    vanishing: variables at whose common zero p vanishes to second order; every monomial of the
-    multipliers then holds one, or no Gram matrix could be definite.
-    forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
+    Each summand has the least even degree in the indeterminates that fits p and the domain.
+
+    p: polynomial, affine in the decisions. domain: the g_i ≥ 0. forms: indeterminates in which p is
+    a quadratic form, as `matrix_sum_of_squares` makes it.
     """
 
     p: Polynomial
     domain: tuple[Polynomial, ...] = ()
-    equalities: tuple[Polynomial, ...] = ()
-    degree: int | None = None
-    basis: IntArray | None = None
-    vanishing: tuple[str, ...] = ()
     forms: tuple[str, ...] = ()
     name: str = ""
-
-
-@dataclass(frozen=True)
-class Zero:
-    """Every coefficient of p in the indeterminates is zero."""
-
-    p: Polynomial
 
 
 @dataclass(frozen=True)
@@ -62,32 +49,24 @@ class NormBound:
     bound: Polynomial
 
 
-Constraint: TypeAlias = SumOfSquares | Zero | NonNegative | NormBound
+Constraint: TypeAlias = SumOfSquares | NonNegative | NormBound
 
 
 @dataclass(frozen=True)
 class Program:
-    """Find decisions that satisfy the constraints and maximise (or minimise) an affine objective.
+    """Find decisions that satisfy the constraints and minimise an affine objective.
 
-    indeterminates: the variables the inequalities hold for. parameters: variables whose values are
-    given to each solve; they may occur in any power. scale: the size of an indeterminate in its
-    unit (default 1); the program is solved in variables of size 1. Powers of two are used, so that
-    scaling rounds nothing.
+    indeterminates: the variables the inequalities hold for. scale: the size of an indeterminate in
+    its unit (default 1); the program is solved in variables of size 1. Powers of two are used, so
+    that scaling rounds nothing.
     """
 
     indeterminates: tuple[str, ...]
     constraints: tuple[Constraint, ...]
-    maximise: Polynomial | None = None
     minimise: Polynomial | None = None
-    parameters: tuple[str, ...] = ()
     scale: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        both = set(self.indeterminates) & set(self.parameters)
-        if both:
-            raise DataError(f"{', '.join(sorted(both))}: both indeterminate and parameter")
-        if self.maximise is not None and self.minimise is not None:
-            raise DataError("state one objective: maximise or minimise")
         for name, size in self.scale.items():
             if name not in self.indeterminates or not (np.isfinite(size) and size > 0):
                 raise DataError(
@@ -97,7 +76,7 @@ class Program:
 
 @dataclass(frozen=True, eq=False)
 class Identity:
-    """What a solved `SumOfSquares` says: p = gram + Σ multipliers·domain + Σ free·equalities.
+    """What a solved `SumOfSquares` says: p = gram + Σ multipliers·domain.
 
     Up to solver tolerance: the kernel decides whether it proves anything.
     """
@@ -105,7 +84,6 @@ class Identity:
     p: Polynomial
     gram: Gram
     multipliers: tuple[Gram, ...]
-    equality_multipliers: tuple[Polynomial, ...]
     name: str
 
 
@@ -156,12 +134,7 @@ def symmetric_template(name: str, size: int) -> NDArray[Any]:
 
 
 def matrix_sum_of_squares(
-    M: ArrayLike,
-    *,
-    domain: tuple[Polynomial, ...] = (),
-    equalities: tuple[Polynomial, ...] = (),
-    degree: int | None = None,
-    name: str = "",
+    M: ArrayLike, *, domain: tuple[Polynomial, ...] = (), name: str = ""
 ) -> SumOfSquares:
     """M(x) ⪰ 0 on the domain, for a symmetric matrix of polynomials: y'M(x)y is a sum of squares.
 
@@ -178,9 +151,7 @@ def matrix_sum_of_squares(
         for i in range(len(M))
         for j in range(i, len(M))
     ]
-    return SumOfSquares(
-        added(parts), domain=domain, equalities=equalities, degree=degree, forms=names, name=name
-    )
+    return SumOfSquares(added(parts), domain=domain, forms=names, name=name)
 
 
 def forms_of(size: int) -> tuple[str, ...]:

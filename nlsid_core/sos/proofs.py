@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nlsid_core.arrays import Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial import Gram, Polynomial
-from nlsid_core.sos.witness import MULTIPLIER_BITS, expanded, multiplier, witness
+from nlsid_core.sos.witness import expanded, multiplier, witness
 
 Terms = dict[tuple[int, ...], Fraction]
 
@@ -26,10 +26,18 @@ def inequality(
     *,
     domain: Sequence[Polynomial] = (),
     multipliers: Sequence[Gram] = (),
-    bits: int = MULTIPLIER_BITS,
 ) -> Json:
     """The witness that c ≥ 0 on the domain: `{basis, columns, squares[, multipliers]}`."""
-    return _on_domain(_terms(c), gram, domain, multipliers, bits)
+    target, written = _terms(c), []
+    for k, (part, g) in enumerate(zip(multipliers, domain, strict=True)):
+        if not len(part) or not _floats(part.Q).any():
+            continue
+        sigma = multiplier(part.basis, _floats(part.Q))
+        exact = {key: control[0] for key, control in expanded(sigma).items()}
+        target = _minus(target, _times(exact, _terms(g)))
+        written.append({"of": k, **sigma})
+    found = _main(target, gram)
+    return found | ({"multipliers": written} if written else {})
 
 
 def quadratic_form(matrix: NDArray[np.object_]) -> Polynomial:
@@ -51,25 +59,6 @@ def quadratic_form(matrix: NDArray[np.object_]) -> Polynomial:
     )
 
 
-def _on_domain(
-    target: Terms,
-    gram: Gram,
-    domain: Sequence[Polynomial],
-    multipliers: Sequence[Gram],
-    bits: int,
-) -> Json:
-    written = []
-    for k, (part, g) in enumerate(zip(multipliers, domain, strict=True)):
-        if not len(part) or not _floats(part.Q).any():
-            continue
-        sigma = multiplier(part.basis, _floats(part.Q), bits=bits)
-        target_k = _times(_of(sigma), _terms(g))
-        target = _minus(target, target_k)
-        written.append({"of": k, **sigma})
-    found = _main(target, gram)
-    return found | ({"multipliers": written} if written else {})
-
-
 def _main(target: Terms, gram: Gram) -> Json:
     """The witness of a Gram matrix, corrected to be that of `target`."""
     exact = Gram(gram.basis, np.vectorize(Fraction, otypes=[object])(gram.Q), gram.names)
@@ -77,10 +66,6 @@ def _main(target: Terms, gram: Gram) -> Json:
     left = {key: value for key, value in rest.items() if value}
     residual = {key: [_float(value)] for key, value in left.items()}
     return witness(gram.basis, _floats(gram.Q), residual=residual)
-
-
-def _of(squares: Json) -> Terms:
-    return {key: control[0] for key, control in expanded(squares).items()}
 
 
 def _terms(p: Polynomial) -> Terms:

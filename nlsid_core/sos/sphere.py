@@ -1,8 +1,7 @@
 """The fast path: the largest m with g(z) - m = v(z)'Xv(z) on |z| = 1, X ⪰ 0.
 
-v holds monomials of degree half - 1 and half, half = 2 unless said otherwise, g is any function in
-the span of their products (on the sphere every polynomial of degree ≤ 2·half), known only by its
-values at N unisolvent points:
+v holds monomials of degree 1 and 2, g is any function in the span of their products (on the sphere
+every polynomial of degree ≤ 4), known only by its values at N unisolvent points:
 
     maximise m      subject to  v_i'Xv_i + m = g_i  (i = 1..N),  X ⪰ 0
     minimise g'y    subject to  Σ y_i v_i v_i' = Z ⪰ 0,  Σ y_i = 1
@@ -107,19 +106,17 @@ class SphereProgram:
     """Everything that depends on the number of variables only; build it once and solve often.
 
     n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
-    are kept only if they contain one of them (default: all). half: of the degree of g, 2 or 3; 3
-    takes all variables as nonlinear. constant: whether v has the 1, with which g may have terms of
-    degree 1 in the others; where all are nonlinear, the sphere has it as the sum of squares.
-    basis: (k, n) exponents of v, lower degree first; weight:
-    (k,), Σ (weight·monomial)² = 1 on the sphere.
+    are kept only if they contain one of them (default: all). constant: whether v has the 1, with
+    which g may have terms of degree 1 in the others; where all are nonlinear, the sphere has it as
+    the sum of squares. basis: (k, n) exponents of v, lower degree first; weight: (k,), the sum of
+    (weight·monomial)² is 1 on the sphere.
     points: (N, n) where g has to be evaluated.
 
-    Raises DataError if there is no nonlinear variable, n < 2, or half is neither 2 nor 3.
+    Raises DataError if there is no nonlinear variable.
     """
 
     n: int
     nonlinear: tuple[int, ...] | None = None
-    half: int = 2
     constant: bool = False
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
@@ -128,16 +125,12 @@ class SphereProgram:
 
     def __post_init__(self) -> None:
         chosen = self.chosen
-        if self.n < 2 or not chosen or not set(chosen) <= set(range(self.n)):
-            raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n, n >= 2")
-        if self.half not in (2, 3) or (self.half == 3 and len(chosen) < self.n):
-            raise DataError(
-                f"half = {self.half} with {len(chosen)} of {self.n} variables nonlinear"
-            )
+        if not chosen or not set(chosen) <= set(range(self.n)):
+            raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n")
         if self.constant and len(chosen) == self.n:
             raise DataError("1 is |z|² on the sphere, which a program of all variables has")
-        high = monomials(self.n, [self.half])
-        low = monomials(self.n, [self.half - 1])
+        high = monomials(self.n, [2])
+        low = monomials(self.n, [1])
         one = np.zeros((int(self.constant), self.n), dtype=np.int64)
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis)
@@ -406,8 +399,8 @@ def weights_of(basis: IntArray, chosen: BoolArray) -> FloatArray:
 
 
 def multinomials(rows: IntArray) -> FloatArray:
-    """The coefficient of each squared monomial, of degree ≤ 3, in its power of |z|²."""
-    factorials = np.array([1.0, 1.0, 2.0, 6.0])
+    """The coefficient of each squared monomial, of degree ≤ 2, in its power of |z|²."""
+    factorials = np.array([1.0, 1.0, 2.0])
     return np.asarray(factorials[rows.sum(axis=1)] / factorials[rows].prod(axis=1))
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.polynomial import Gram, Polynomial, monomials
-from nlsid_core.sos.basis import parity_kernel
 
-# Exponents in the indeterminates, column of the unknown, parameter monomial, value.
-TermColumns: TypeAlias = tuple[IntArray, IntArray, IntArray, FloatArray]
+# Exponents in the indeterminates, column of the unknown, value.
+TermColumns: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,24 +33,11 @@ class Block:
 
 def candidates(names: Sequence[str], forms: Sequence[str], degree: int) -> IntArray:
     """Monomials up to `degree`; with forms y: those in the other variables, times each y_i."""
-    return _with_forms(names, forms, degree, 1)
-
-
-def free_candidates(
-    names: Sequence[str], forms: Sequence[str], degree: int, symmetry: IntArray
-) -> IntArray:
-    """Monomials of a free multiplier, quadratic in the forms, that the sign symmetry keeps."""
-    basis = _with_forms(names, forms, degree, 2)
-    odd = (basis @ parity_kernel(symmetry % 2).T) % 2
-    return np.asarray(basis[(odd == 0).all(axis=1)])
-
-
-def _with_forms(names: Sequence[str], forms: Sequence[str], degree: int, power: int) -> IntArray:
     if not forms:
         return monomials(len(names), range(degree + 1))
     outer = np.array([name in forms for name in names])
     x = monomials(int((~outer).sum()), range(degree + 1))
-    y = monomials(int(outer.sum()), [power])
+    y = np.eye(int(outer.sum()), dtype=np.int64)
     basis = np.zeros((len(x) * len(y), len(names)), dtype=np.int64)
     basis[:, ~outer] = np.repeat(x, len(y), axis=0)
     basis[:, outer] = np.tile(y, (len(x), 1))
@@ -74,21 +60,8 @@ def gram_terms(block: Block, g: Polynomial) -> TermColumns:
         columns.append(np.repeat(start + np.arange(len(i)), len(g)))
         values.append(np.multiply.outer(weight, g.coefficients.astype(np.float64)).ravel())
     empty = np.zeros((0, block.basis.shape[1]), dtype=np.int64)
-    column = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
     return (
         np.concatenate([empty, *exponents]),
-        column,
-        np.zeros_like(column),
+        np.concatenate([np.zeros(0, dtype=np.int64), *columns]),
         np.concatenate([np.zeros(0), *values]),
-    )
-
-
-def free_terms(basis: IntArray, start: int, h: Polynomial) -> TermColumns:
-    """Σ_k x[start + k]·monomial_k·h."""
-    column = np.repeat(start + np.arange(len(basis)), len(h))
-    return (
-        (basis[:, None] + h.exponents[None]).reshape(-1, basis.shape[1]),
-        column,
-        np.zeros_like(column),
-        np.tile(h.coefficients.astype(np.float64), len(basis)),
     )

@@ -136,7 +136,7 @@ CASES: list[tuple[Callable[[Json], Json], str]] = [
     (weight_not_symmetric, "Q should be a symmetric 2x2 matrix"),
     (negative_power, "exponents"),
     (broken_power, "exponents"),
-    (degree_too_high, "degree 7; .* take a Taylor polynomial of lower degree, and its remainder"),
+    (degree_too_high, "degree 7; .* give the dynamics as a function, which is then expanded"),
     (
         pushed_out,
         r"no funnel at t = .* the disturbance w takes .* Because of the disturbance w",
@@ -215,7 +215,7 @@ def test_a_nominal_that_disobeys_is_told_by_how_much_where_and_in_which_state() 
 def test_dynamics_that_are_not_polynomial_name_the_operation_and_offer_taylor(
     function: Callable[[Any], Any], operation: str
 ) -> None:
-    told = f"{operation} .*taylor_field makes cubics along a motion, .* as a bounded w"
+    told = f"{operation} .*with the function itself, .* as a bounded w"
     with pytest.raises(NotPolynomial, match=told):
         VectorField.from_function(function, 1, 0)
 

@@ -55,7 +55,6 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
 }
 FREE = {  # true or false, or options of their own
     (Rie, "accept_untested_repeats"),
-    (Polynomial, "continuous"),
     (Polynomial, "degrees"),
     (Network, "structure"),
     (Rse, "certified"),
@@ -72,8 +71,6 @@ OTHER_COMBINATIONS: tuple[tuple[Degrees, dict[str, Any], str], ...] = (
     (Degrees(left=3), {"set": "2.19"}, "set 2.19 is linear"),
     (Degrees(left=3), {"set": "2.11", "input_range": ((0.0, 1.0),)}, "or neither"),
     (Degrees(left=3, leading=1), {}, "no factor of y"),
-    (Degrees(left=3), {"continuous": True}, "continuous models have measured states"),
-    (Degrees(left=3), {"continuous": True, "delays": (1,)}, "left and past the same"),
 )
 
 

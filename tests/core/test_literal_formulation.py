@@ -12,8 +12,8 @@ from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, i
 from nlsid_core.design.continuous.closed_loop import closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.polynomial import variables
-from nlsid_core.sos import Program, SumOfSquares, solve
+from nlsid_core.polynomial import monomials, variables
+from nlsid_core.sos import Program, SumOfSquares, solve, template
 
 
 @cache
@@ -62,8 +62,10 @@ def literal_margin(design: FunnelDesign, piece: int, degree: int) -> tuple[float
             a, b = float(start[i, j]), float(end[i, j])
             boundary = boundary - ((1 - s) * a + s * b) * z[i] * z[j]
     (gamma,) = variables("gamma")
-    squares = SumOfSquares(p - gamma, (s * (1 - s),), (boundary,), degree=degree)
-    best = solve(Program(names, (squares,), maximise=gamma)).objective
+    on_time = template("a", monomials(1 + n, range(degree - 1)), names)
+    free = template("f", monomials(1 + n, range(degree - 2)), names)
+    squares = SumOfSquares(p - gamma - on_time * s * (1 - s) - free * boundary)
+    best = -solve(Program(names, (SumOfSquares(on_time), squares), minimise=-gamma)).objective
     scale = float(design.funnel.t[k + 1] - design.funnel.t[k]) * max(rho)
     directions = np.random.default_rng(1).normal(size=(400, n))
     lowest = np.inf

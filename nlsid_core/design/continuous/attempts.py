@@ -25,7 +25,7 @@ from nlsid_core.design.continuous.setting import (
     prepare,
     valid_rows,
 )
-from nlsid_core.design.continuous.shape import validity_caps
+from nlsid_core.design.continuous.validity import validity_caps
 from nlsid_core.dynamics import Nominal
 from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import Infeasible

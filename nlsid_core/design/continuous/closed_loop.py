@@ -79,12 +79,23 @@ class InputRates:
     """How fast the policy changes input entry (B,), with a sign (B,), on pieces, at w (B, n_w).
 
     Pieces that differ in entry and sign only follow each other, in the same frame T.
+
+    taken: (B,) what entries of w that only push add to the rate, in input units per s; shoved:
+    (B, m) what a unit of every δ that only pushes adds.
     """
 
     pieces: Pieces
     w: FloatArray
     entry: IntArray
     sign: IntArray
+    taken: FloatArray
+    shoved: FloatArray
+
+    def room(self, rates: FloatArray, widths: FloatArray) -> FloatArray:
+        """(B,) what R and W (intervals, m) leave to the rest, in input units per s."""
+        k = self.pieces.interval
+        pushed = self.taken + (self.shoved * widths[k]).sum(axis=1)
+        return np.asarray(rates[k, self.entry] - pushed)
 
 
 def batches(pieces: Pieces) -> Iterator[IntArray]:

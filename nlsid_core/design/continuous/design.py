@@ -11,7 +11,7 @@ from nlsid_core.design.continuous.attempts import attempts, first_found, widened
 from nlsid_core.design.continuous.pieces import Proved, proof_of
 from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
+from nlsid_core.design.continuous.shape import enlarge_shape
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
@@ -60,10 +60,8 @@ def design_funnel(
     """
     started = time.perf_counter()
     setting = with_knots(problem)
-    if problem.shape == "P":
-        refuse_shape(setting.steps)
-        if setting.hold is not None:
-            raise DataError("V-steps search without hold or error: take shape rho")
+    if problem.shape == "P" and setting.hold is not None:
+        raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     try:
@@ -77,8 +75,7 @@ def design_funnel(
         started = time.perf_counter()
         try:
             funnel, proved, steps_taken = enlarge_shape(
-                setting.steps,
-                setting.policy,
+                setting,
                 funnel,
                 margin=margin,
                 executor=executor,

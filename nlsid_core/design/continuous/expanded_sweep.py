@@ -1,9 +1,10 @@
-"""ρ(t) by one backward sweep that expands the dynamics around what it finds.
+"""ρ(t) by one backward sweep, which expands dynamics around what it finds if need be.
 
 The box on which a Taylor model is bounded has to hold the funnel, and what the model leaves out
 makes the funnel smaller: so ρ and the box of every interval are chosen together.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,17 +14,16 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import BACK, NoExpansion
-from nlsid_core.design.continuous.lstep import section_at, sections
+from nlsid_core.design.continuous.lstep import section_at
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.shape import validity_caps
 from nlsid_core.design.continuous.sweep import (
     Again,
     Ends,
     Wanted,
     estimated_before,
     largest_before,
-    sweep_rho,
 )
+from nlsid_core.design.continuous.validity import validity_caps
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress, silent
@@ -62,35 +62,21 @@ def swept(
     wanted: Wanted,
     progress: Progress = silent,
     *,
+    shares: Sequence[float] = (0.0, 1.0),
     most_back: int = MAX_BACK,
     again: Again | None = None,
 ) -> Swept:
-    """The largest ρ(t), and what it was found with; see `sweep_rho` and `sweep_expanded`."""
-    steps, policy = setting.steps, setting.policy
-    if setting.expansion is not None:
-        return sweep_expanded(setting, wanted, progress, most_back=most_back, again=again)
-    instants = sections(steps, policy, setting.P)
-    found = sweep_rho(steps, instants, wanted, progress, again)
-    return Swept(replace(setting, steps=steps.as_it_is()), *found)
+    """The largest ρ(t) backward from the end, and what it was found with.
 
+    Where the dynamics are expanded, they are on each interval around what it gives; the setting
+    that is returned has their field.
 
-def sweep_expanded(
-    setting: Setting,
-    wanted: Wanted,
-    progress: Progress = silent,
-    *,
-    most_back: int = MAX_BACK,
-    again: Again | None = None,
-) -> Swept:
-    """The largest ρ(t) backward from the end, each interval expanded around what it gives.
-
-    The setting that is returned has their field.
-
-    most_back: how often ρ at an interval's end is lowered for its start. Raises Infeasible naming
-    the earliest time that was reached, and why it was not passed where least was missing.
+    shares: the instants of every interval where ρ has to hold, of dynamics that are not expanded.
+    most_back: how often ρ at an interval's end is lowered for its start, where they are. Raises
+    Infeasible naming the earliest time that was reached, and why it was not passed where least was
+    missing.
     """
-    policy, P, expansion = setting.policy, setting.P, setting.expansion
-    assert expansion is not None  # else there is one field for the whole motion
+    steps, policy, P, expansion = setting.steps, setting.policy, setting.P, setting.expansion
     K = len(P)
     rho, k, back = np.full(K, wanted.final), K - 2, 0
     caps = np.array([wanted.cap(k) for k in range(K)])
@@ -99,23 +85,27 @@ def sweep_expanded(
         rho, ends, k = again.rho.copy(), dict(enumerate(again.ends)), again.last
     farthest, refusal, left = K, Infeasible(""), -np.inf
     while k >= 0:
-        after = float(rho[k + 1])
-        guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
+        after, cap = float(rho[k + 1]), float(caps[k])
         duals = ends[k + 1].start if k + 2 < K else None
         try:
-            levels = (min(guess, float(caps[k])), after, float(caps[k]))
-            rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
+            if expansion is None:
+                instants = [section_at(steps, policy, P, k, s) for s in shares]
+                rho[k], ends[k] = largest_before(steps, instants, after, cap, wanted.on(k), duals)
+            else:
+                guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
+                levels = (min(guess, cap), after, cap)
+                rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
             progress(f"rho at {policy.t[k]:.3g} s", 1 - k / (K - 1))
             k -= 1
             continue
-        except NoExpansion:
-            share = expansion.room(policy, P, k, after)
+        except NoExpansion as found:
+            share = found.expansion.room(policy, P, k, after)
         except NoFunnel as found:
             if k < farthest or (k == farthest and found.left > left):
                 farthest, refusal, left = k, found, found.left
             share = BACK
         back += 1
-        if back > most_back:
+        if back > most_back or expansion is None:
             raise refusal from None
         # What ρ_{k+1} leaves at the end of this interval is too much for its box or its feedback.
         caps[k + 1] = share * after
@@ -123,7 +113,8 @@ def sweep_expanded(
             rho[-1] = caps[-1]
         else:
             k += 1
-    return Swept(with_field(setting), rho, [ends[k] for k in range(K - 1)])
+    made = replace(setting, steps=steps.as_it_is()) if expansion is None else with_field(setting)
+    return Swept(made, rho, [ends[k] for k in range(K - 1)])
 
 
 def _expanded(
@@ -139,7 +130,7 @@ def _expanded(
     after. They estimate ρ in boxes that come closer to it; it is then found in the last.
     """
     steps, policy, P, expansion = setting.steps, setting.policy, setting.P, setting.expansion
-    assert expansion is not None  # as in `sweep_expanded`
+    assert expansion is not None  # as in `swept`
     guess, after, cap = levels
     held = None if steps.widths is None else steps.widths[k]
     # Of a held input the middle counts too: else few knots do, for a narrow funnel.

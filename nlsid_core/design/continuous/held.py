@@ -23,12 +23,7 @@ from nlsid_core.design.continuous.pieces import (
     substitution,
     unsolved,
 )
-from nlsid_core.design.continuous.rates import (
-    Frames,
-    curving_states,
-    least_rates,
-    used_of,
-)
+from nlsid_core.design.continuous.rates import curving_states, frames_of, least_rates, used_of
 from nlsid_core.design.continuous.witnesses import rate_documents, stated_multipliers
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible, OptionError
@@ -36,7 +31,6 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.options import is_number
 from nlsid_core.policies.continuous import ContinuousPolicy
 
-MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
 ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
 LONGEST, SHORTEST = 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
@@ -99,11 +93,6 @@ class Hold:
                 "a hold needs dynamics that are affine in each input: give them as a function, "
                 "then what is not affine is bounded"
             )
-        if self.period and field.degree > MAX_DEGREE:
-            raise DataError(
-                f"a hold is searched for dynamics of degree up to {MAX_DEGREE}, not "
-                f"{field.degree}: take a Taylor polynomial of degree {MAX_DEGREE}"
-            )
         if self.period and not (policy.u.is_continuous() and policy.K.is_continuous()):
             raise DataError(
                 "a hold needs a policy that does not jump at knots: neither its gain nor its "
@@ -123,36 +112,13 @@ class Hold:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rates:
-    """Rates of inputs in one time span, of pieces of time at vertices, corners and modes.
-
-    taken: (B,) what entries of w that only push add to the rate, in input units per s; shoved:
-    (B, m) what a unit of every δ that only pushes adds.
-    """
-
-    of: InputRates
-    taken: FloatArray
-    shoved: FloatArray
-
-    def room(self, rates: FloatArray, widths: FloatArray) -> FloatArray:
-        """(B,) what R and W (intervals, m) leave to the rest, in input units per s."""
-        k = self.of.pieces.interval
-        pushed = self.taken + (self.shoved * widths[k]).sum(axis=1)
-        return np.asarray(rates[k, self.of.entry] - pushed)
-
-    def with_pieces(self, pieces: Pieces) -> "_Rates":
-        """The same rates on pieces that state more."""
-        return replace(self, of=replace(self.of, pieces=pieces))
-
-
-@dataclass(frozen=True, eq=False)
 class Changes:
     """dũ/dt in a funnel at both ends of every interval, whatever the widths of δ.
 
     It has degree at most 1 in each δ_i, so the corners of |δ_i| ≤ 1 give it for all others; those
     that only push are at 0. A row is an input in an interval, in a mode at a vertex of w.
 
-    interval, entry, taken, shoved: see `_Rates`. products: per end, by degree in z, (B, corners,
+    interval, entry, taken, shoved: see `InputRates`. products: per end, by degree in z (B, corners,
     M_q) coefficients of the products of δ, of -h dũ_i/dt. chosen: (corners, m) 1 where a product
     has δ_i. h: (intervals,) s.
     """
@@ -178,14 +144,14 @@ class Changes:
         rows = []
         intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
         for batch in _batches(steps, policy, intervals, no_basis, unit, signs=(1,)):
-            pieces, entry = batch.of.pieces, batch.of.entry
+            pieces, entry = batch.pieces, batch.entry
             corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
             order = np.lexsort((corner, entry, vertex, *pieces.mode.T, pieces.interval))
             first = order[::count]
             stated = pieces.interval, entry, batch.taken, batch.shoved
             rows.append(tuple(part[first] for part in stated))
             for end in (0, 1):
-                c, _ = _at_end(steps, policy, funnel, batch, curving, end)
+                c, *_ = _at_end(steps, policy, funnel, batch, end)
                 at_corners = [part[order].reshape(len(first), count, -1) for part in c]
                 found[end].append([signs.T @ part / count for part in at_corners])
         together = [
@@ -263,16 +229,14 @@ def prove_rates(
     Raises Infeasible if a rate is not shown on some part of time.
     """
     waiting = [Part(k, 0, 0) for k in range(len(rates))]
-    curving = curving_states(steps.field)
-    used, widths = used_of(basis, curving), steps.widths
+    used, widths = used_of(basis, curving_states(steps.field)), steps.widths
     assert widths is not None  # a search for a hold sets them first
     found: list[Json] = []
     while waiting:
         written: dict[Part, list[Json | None]] = {}
         for batch in _batches(steps, policy, waiting, basis[used], widths):
-            batch = _witnessed(steps, policy, funnel, batch, curving, rates)
-            of, room = batch.of, batch.room(rates, widths)
-            c = rate_polynomial(steps.field, policy, funnel, of, room)
+            of = _witnessed(steps, policy, funnel, batch, rates)
+            c = rate_polynomial(steps.field, policy, funnel, of, of.room(rates, widths))
             rows = rate_documents(funnel, of.pieces, c, basis, used)
             places = zip(of.entry.tolist(), of.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
@@ -303,7 +267,7 @@ def _batches(
     widths: FloatArray,
     *,
     signs: tuple[int, ...] = (-1, 1),
-) -> Iterator[_Rates]:
+) -> Iterator[InputRates]:
     """Every rate on these parts of time, as many as fit at once."""
     field, n = steps.field, steps.program.n
     own = _pushing(field, 1 + n + field.m, len(field.uncertain))
@@ -352,8 +316,7 @@ def _batches(
             np.abs(gains @ _pushes(field, first, found)[spans]).max(axis=1)
             for first, found in ((1 + n, _pushing(field, 1 + n, field.m)), (1 + n + field.m, own))
         )
-        of = InputRates(pieces, values[v % len(values)], i, side)
-        yield _Rates(of, own_shoved @ halves, shoved)
+        yield InputRates(pieces, values[v % len(values)], i, side, own_shoved @ halves, shoved)
 
 
 def _grid(sides: Sequence[tuple[float, ...]]) -> FloatArray:
@@ -382,51 +345,44 @@ def _pushes(field: VectorField, first: int, pushing: list[bool]) -> FloatArray:
 
 
 def _at_end(
-    steps: LSteps,
-    policy: ContinuousPolicy,
-    funnel: ContinuousFunnel,
-    batch: _Rates,
-    curving: tuple[int, ...],
-    end: int,
-) -> tuple[list[FloatArray], Frames]:
-    """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and the frames of z."""
-    pieces, n = batch.of.pieces, funnel.n
-    k, at = pieces.interval, _ends(pieces)[end]
-    frames = Frames.of(funnel, k, at, curving)
-    framed = batch.with_pieces(replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)))
-    c = rate_polynomial(steps.field, policy, funnel, framed.of, np.zeros(len(pieces)), end)
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, of: InputRates, end: int
+) -> tuple[list[FloatArray], FloatArray]:
+    """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and z by x̄, (B, n, n)."""
+    pieces, n, curving = of.pieces, funnel.n, curving_states(steps.field)
+    T, inverse = frames_of(funnel, pieces.interval, _ends(pieces)[end], curving)
+    framed = replace(of, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)))
+    c = rate_polynomial(steps.field, policy, funnel, framed, np.zeros(len(pieces)), end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
     none = [np.zeros((len(pieces), size)) for size in sizes]
-    return [c[q][:, 0] if q in c else none[q] for q in range(4)], frames
+    return [c[q][:, 0] if q in c else none[q] for q in range(4)], inverse
 
 
 def _witnessed(
     steps: LSteps,
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
-    batch: _Rates,
-    curving: tuple[int, ...],
+    of: InputRates,
     rates: FloatArray,
-) -> _Rates:
-    """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
-    pieces, k = batch.of.pieces, batch.of.pieces.interval
+) -> InputRates:
+    """The rates with τ as a proof states it, and Gram matrices in x̄ at both ends."""
+    pieces, k, curving = of.pieces, of.pieces.interval, curving_states(steps.field)
     tau, gram = pieces.tau.copy(), pieces.gram.copy()
     assert steps.widths is not None  # as in `prove_rates`
-    room = np.diff(funnel.t)[k] * batch.room(rates, steps.widths)
+    room = np.diff(funnel.t)[k] * of.room(rates, steps.widths)
     one = int(np.flatnonzero(~pieces.basis.any(axis=1))[0])
     for end in (0, 1):
-        c, frames = _at_end(steps, policy, funnel, batch, curving, end)
+        c, inverse = _at_end(steps, policy, funnel, of, end)
         shown = least_rates([-part for part in c], curving)
         found = shown.gram(pieces.basis)
         found[:, one, one] += room
         constant, quartic = shown.multipliers.T
-        bent = frames.inverse[:, list(curving)]
+        bent = inverse[:, list(curving)]
         rho = funnel.rho[k] + _ends(pieces)[end] * (funnel.rho[k + 1] - funnel.rho[k])
         tau[:, end, 0, 0, 0] = constant / rho
         tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * (bent.swapaxes(1, 2) @ bent)
-        M = substitution(pieces.basis, frames.inverse)
+        M = substitution(pieces.basis, inverse)
         gram[:, end] = M.swapaxes(1, 2) @ found @ M
-    return batch.with_pieces(stated_multipliers(replace(pieces, tau=tau, gram=gram)))
+    return replace(of, pieces=stated_multipliers(replace(pieces, tau=tau, gram=gram)))
 
 
 def _ends(pieces: Pieces) -> tuple[FloatArray, FloatArray]:

@@ -13,16 +13,15 @@ from itertools import product
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.design.continuous.modes import multipliers
 from nlsid_core.dynamics import VectorField
 from nlsid_core.dynamics.piecewise import bernstein
 from nlsid_core.dynamics.taylor import Cubic
+from nlsid_core.dynamics.taylor_model import DEGREE
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
-MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
 TOLERANCE = 1e-5  # of the spread of -Ẇ/ρ: margins are 50 times as much
 NO_PUSH = 1e-12  # of |x̄'Pg|: less moves nothing, and κ stays finite
 FINENESS = 64.0  # of κ's digits: few, for the kernel
@@ -75,16 +74,6 @@ def section_at(
     )
 
 
-def sections(
-    steps: "LSteps", policy: ContinuousPolicy, P: FloatArray, *, count: int = 2
-) -> list[list[Section]]:
-    """`count` equally spaced instants of every interval, its ends included, seen from inside it."""
-    return [
-        [section_at(steps, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
-        for k in range(len(policy.t) - 1)
-    ]
-
-
 def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
     """T (n, n) with T'PT = I, in which the nonlinear states are functions of the last z only."""
     n = len(P)
@@ -97,11 +86,10 @@ def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
 
 def refuse_degree(field: VectorField) -> None:
     """Raise DataError for dynamics of a degree that no program here is for."""
-    if field.degree > MAX_DEGREE:
+    if field.degree > DEGREE:
         raise DataError(
-            f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
-            "take a Taylor polynomial of lower degree, and its remainder as an uncertain w "
-            "with bounds"
+            f"the vector field has degree {field.degree}; funnels are found up to {DEGREE}: give "
+            "the dynamics as a function, which is then expanded, its remainder bounded"
         )
 
 
@@ -168,11 +156,17 @@ class LSteps:
         return kept
 
     @cached_property
-    def program(self) -> SphereProgram | LineProgram:
+    def program(self) -> SphereProgram:
         """Made when it is asked for: of many states it takes seconds."""
-        return sphere_program(  # what the input is off is a term of degree 1 in Ẇ
-            self.field, self.nonlinear, reduced=self._reduced, constant=self.widths is not None
-        )
+        n, count = self.field.n, len(self.multiplied)
+        # What the input is off is a term of degree 1 in Ẇ.
+        return sphere_program(n, count, constant=self.widths is not None and count < n)
+
+    @property
+    def multiplied(self) -> tuple[int, ...]:
+        """The states with which the program's basis has all products; they come last."""
+        n, some = self.field.n, 0 < len(self.nonlinear) < self.field.n
+        return self.nonlinear if some and self._reduced else tuple(range(n))
 
     def pushes(self, section: Section) -> FloatArray:
         """(n, n_w) what each w adds to ẋ there; only where w does nothing else."""
@@ -332,28 +326,11 @@ class LSteps:
         return found
 
 
-def sphere_program(
-    field: VectorField,
-    nonlinear: tuple[int, ...] | None = None,
-    *,
-    reduced: bool = True,
-    constant: bool = False,
-) -> SphereProgram | LineProgram:
-    """The program for this field: squares of half the degree of Ẇ.
-
-    Up to degree 3, nonlinear states come last, and degree 2 only where they occur. reduced: False
-    keeps every product, for multipliers in all states. constant: Ẇ may have terms of degree 1.
-    """
-    n, count = field.n, len(field.nonlinear_states if nonlinear is None else nonlinear)
-    half = max(2, (field.degree + 2) // 2)
-    if half > 2 or count in (0, n) or not reduced:
-        return _program(n, n, half, constant=False)
-    return _program(n, count, half, constant=constant)
-
-
 @lru_cache(maxsize=16)
-def _program(n: int, nonlinear: int, half: int, *, constant: bool) -> SphereProgram | LineProgram:
-    if n == 1:
-        return LineProgram(half=half)
-    last = None if nonlinear == n else tuple(range(n - nonlinear, n))
-    return SphereProgram(n, last, half, constant)
+def sphere_program(n: int, multiplied: int, *, constant: bool) -> SphereProgram:
+    """The program for Ẇ of n states: degree 2 only with the last ones, which are `multiplied`.
+
+    constant: Ẇ may have terms of degree 1.
+    """
+    last = None if multiplied == n else tuple(range(n - multiplied, n))
+    return SphereProgram(n, last, constant)

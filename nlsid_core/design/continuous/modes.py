@@ -10,7 +10,6 @@ import scipy.sparse as sp
 from nlsid_core import conic
 from nlsid_core.arrays import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.sos.sphere import SphereProgram
 
@@ -22,7 +21,7 @@ ROUNDING = 1e-9  # of q: what is as near to affine is
 
 
 def multipliers(
-    program: SphereProgram | LineProgram, g: FloatArray, q: FloatArray
+    program: SphereProgram, g: FloatArray, q: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """S (L, n+1, n+1) and Σ τ_l q_l (N,) at the program's points, for g (N,) and q (L, N) there."""
     n, count = program.n, len(q)
@@ -42,7 +41,7 @@ def multipliers(
     return S, np.asarray(np.einsum("ln,na,lab,nb->n", q, y, S, y))
 
 
-def _largest(program: SphereProgram | LineProgram, q: FloatArray) -> FloatArray:
+def _largest(program: SphereProgram, q: FloatArray) -> FloatArray:
     """(L,) of each q on the whole sphere, where it is affine; else at the points."""
     y = np.hstack([np.ones((q.shape[1], 1)), program.points])
     affine = np.linalg.lstsq(y, q.T, rcond=None)[0]
@@ -51,7 +50,7 @@ def _largest(program: SphereProgram | LineProgram, q: FloatArray) -> FloatArray:
     return np.asarray(np.where(exact, whole, q.max(axis=1)))
 
 
-def _solved(program: SphereProgram | LineProgram, g: FloatArray, q: FloatArray) -> FloatArray:
+def _solved(program: SphereProgram, g: FloatArray, q: FloatArray) -> FloatArray:
     """(L, n+1, n+1) for g and q of size 1; x = [m, svec X, svec S_1, ...], m ≤ max g."""
     n, count, points = program.n, len(q), len(g)
     k = len(program.basis)

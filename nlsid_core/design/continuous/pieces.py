@@ -14,15 +14,20 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.design.continuous.closed_loop import SHARED, Pieces, batches, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
-from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.design.continuous.lstep import LSteps, section_at
 from nlsid_core.design.continuous.sweep import Ends
-from nlsid_core.design.continuous.witnesses import documents, piece_margins, rounded, stated_margin
+from nlsid_core.design.continuous.witnesses import (
+    affine,
+    documents,
+    piece_margins,
+    rounded,
+    stated_margin,
+)
 from nlsid_core.errors import SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.sphere import ONE, SphereProgram, SphereSolution, multinomials
+from nlsid_core.sos.sphere import ONE, SphereProgram, SphereSolution
 
 MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
 
@@ -194,24 +199,18 @@ def _pieces(
     )
 
 
-def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
-    """1 and the rest of the program's basis; with half = 3 every monomial up to degree 3.
-
-    Off the sphere degrees 0 to 2·half have to be products of the basis, each of them.
-    """
-    if program.half > 2:
-        return np.vstack([monomials_of(program.n, q) for q in range(program.half + 1)])
+def proof_basis(program: SphereProgram) -> IntArray:
+    """1 and the rest of the program's basis."""
     if program.constant:
         return program.basis
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
-def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
+def _spread(program: SphereProgram) -> FloatArray:
     """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
     if program.constant:
         return program.weight**2
-    squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
-    return np.concatenate([[ONE], (1 - ONE) * squares])
+    return np.concatenate([[ONE], (1 - ONE) * program.weight**2])
 
 
 def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
@@ -243,7 +242,7 @@ def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
 
 
 def end_proof(
-    program: SphereProgram | LineProgram,
+    program: SphereProgram,
     solution: SphereSolution,
     target: dict[int, FloatArray],
     scale: float,
@@ -260,7 +259,7 @@ def end_proof(
     Q = np.zeros((len(basis), len(basis)))
     home = positions(program.basis, basis)
     Q[np.ix_(home, home)] = program.gram(solution) * scale
-    spread = (1 - constant) * _spread(program, basis)
+    spread = (1 - constant) * _spread(program)
     spread[0] += constant
     Q[np.diag_indices(len(basis))] += scale * m * spread
     linear = np.array([j not in program.chosen for j in range(n)])
@@ -269,7 +268,7 @@ def end_proof(
         place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
         Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
     # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below: μ_q = d_q + |z|²μ_(q-2).
-    degrees = range(2 * program.half + 1)
+    degrees = range(5)
     offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in degrees])
     rows = np.concatenate([monomials_of(n, q) for q in degrees])
     pairs = positions((basis[:, None] + basis[None]).reshape(-1, n), rows)
@@ -370,11 +369,6 @@ def proof_of(
     if pieces.kappa is not None:
         proof["kappa"] = pieces.kappa.tolist()
     return proof
-
-
-def affine(n: int) -> IntArray:
-    """(n + 1, n) the monomials 1, x0, x1, ..."""
-    return np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
 
 
 def unsolved(policy: ContinuousPolicy, parts: tuple[Part, ...]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design.continuous.graded import monomials_of, positions
+from nlsid_core.design.continuous.lstep import coordinates
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
@@ -41,36 +42,25 @@ def used_of(basis: IntArray, curving: tuple[int, ...]) -> IntArray:
     return np.flatnonzero((basis.sum(axis=1) < 2) | basis[:, list(curving)].any(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """Of instants: T and inverse (B, n, n), x̄ = Tz with W = ρ|z|²; curving z of these states only.
+def frames_of(
+    funnel: ContinuousFunnel, interval: IntArray, share: FloatArray, curving: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """T and its inverse (B, n, n), x̄ = Tz with W = ρ|z|², at shares (B,) of intervals (B,).
 
-    The same state has the same place in x̄ and z.
+    Curving z are functions of these states only. The same state has the same place in x̄ and z.
     """
-
-    T: FloatArray
-    inverse: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        funnel: ContinuousFunnel,
-        interval: IntArray,
-        share: FloatArray,
-        curving: tuple[int, ...],
-    ) -> "Frames":
-        """At these shares (B,) in [0, 1] of intervals (B,)."""
-        n = funnel.n
-        order = np.array([j for j in range(n) if j not in curving] + list(curving))
-        instants, which = np.unique(np.column_stack([interval, share]), axis=0, return_inverse=True)
-        k, s = instants[:, 0].astype(int), instants[:, 1][:, None, None]
+    instants, which = np.unique(np.column_stack([interval, share]), axis=0, return_inverse=True)
+    frames = []
+    for k, s in zip(instants[:, 0].astype(int).tolist(), instants[:, 1].tolist(), strict=True):
         P = (1 - s) * funnel.P[k] + s * funnel.P[k + 1]
-        rho = (1 - s) * funnel.rho[k, None, None] + s * funnel.rho[k + 1, None, None]
-        L = np.linalg.cholesky(P[:, order[:, None], order] / rho)
-        T, inverse = np.zeros_like(L), np.zeros_like(L)
-        T[:, order[:, None], order] = np.triu(np.linalg.inv(L).swapaxes(1, 2))
-        inverse[:, order[:, None], order] = L.swapaxes(1, 2)
-        return cls(T[which.ravel()], inverse[which.ravel()])
+        rho = (1 - s) * funnel.rho[k] + s * funnel.rho[k + 1]
+        frames.append(np.sqrt(rho) * coordinates(P, curving))
+    order = np.array([j for j in range(funnel.n) if j not in curving] + list(curving))
+    M = np.array(frames)[:, order]
+    T, inverse = np.zeros_like(M), np.zeros_like(M)
+    T[:, order[:, None], order] = M
+    inverse[:, order[:, None], order] = np.triu(np.linalg.inv(M))  # exactly, not up to rounding
+    return T[which.ravel()], inverse[which.ravel()]
 
 
 @dataclass(frozen=True, eq=False)

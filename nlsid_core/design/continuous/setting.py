@@ -13,18 +13,16 @@ from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.expansion import Expansion, NoExpansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
-    MAX_DEGREE,
     LSteps,
     refuse_degree,
     section_at,
 )
-from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
 from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
+from nlsid_core.design.continuous.witnesses import affine
 from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
-from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import DataError, NotPolynomial
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.options import numbers
@@ -184,9 +182,7 @@ def _dynamics(
         return dynamics.within(valid), None
     try:
         field = VectorField.from_function(dynamics, *sizes, uncertain=uncertain)
-        few = field.n <= FEW_STATES and not (held is not None and held.period)
-        affine = held is None or not field.squares_inputs
-        if field.degree <= (MAX_DEGREE if few else DEGREE) and affine:
+        if field.degree <= DEGREE and (held is None or not field.squares_inputs):
             return field.within(valid), None
     except NotPolynomial:
         pass

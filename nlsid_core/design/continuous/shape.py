@@ -14,20 +14,21 @@ from typing import NamedTuple
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.expanded_sweep import swept
 from nlsid_core.design.continuous.knots import KnotForms
-from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
+from nlsid_core.design.continuous.lstep import LSteps, section_at
 from nlsid_core.design.continuous.pieces import Proved, proof_basis, prove_pieces, unsolved
-from nlsid_core.design.continuous.sweep import Ends, Wanted, sweep_rho
-from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
-from nlsid_core.dynamics import VectorField
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.design.continuous.setting import Setting
+from nlsid_core.design.continuous.sweep import Ends, Wanted
+from nlsid_core.design.continuous.validity import validity_caps, validity_rows
+from nlsid_core.design.continuous.vstep import improve
+from nlsid_core.errors import Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 STOP = 0.025  # thesis: growth of the volume below which the alternation has converged
 MAX_ITERATIONS = 30
-CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 TRUST = 0.5  # of P in the V-step: the volume is linearised at the present one
 SHAPE_MARGIN = 16.0  # times the sweep's margin: with P(t) free there is volume to pay it with
 INSIDE = 0.95  # of what validity allows, at the start: a V-step begins strictly inside
@@ -35,66 +36,8 @@ SWEEPS, NEAR = 6, 0.05  # of P/ρ, until ρ is nearly 1
 ROOM = 10.0  # times the margin, at the start, so that the first V-step has somewhere to go
 
 
-def refuse_shape(steps: LSteps) -> None:
-    """Raise DataError for dynamics of a degree that V-steps do not apply to."""
-    if steps.field.degree > MAX_DEGREE:
-        raise DataError(
-            f"V-steps (shape P, alternation) are for dynamics of degree up to {MAX_DEGREE}, not "
-            f"{steps.field.degree}: take shape rho by the sweep, or a Taylor polynomial of degree "
-            f"{MAX_DEGREE} with its remainder as an uncertain w"
-        )
-
-
-def validity_rows(
-    field: VectorField, policy: ContinuousPolicy, widths: FloatArray | None = None
-) -> list[FloatArray]:
-    """Per knot (R, n): |r'x̄| ≤ 1 keeps x and u where the dynamics are valid, for every row r.
-
-    widths: (K-1, m) that the applied input is off.
-    Raises DataError if the nominal itself does not keep to it.
-    """
-    found: list[list[FloatArray]] = [[] for _ in policy.t]
-    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
-    for k in range(len(policy.t) - 1):
-        for entry, low, high in field.validity(field.span(float(policy.t[k]))):
-            centre, rows = policy.entry(entry, k)
-            least, most = clipped.get(entry, (-np.inf, np.inf))
-            if most < low or high < least:
-                raise DataError(
-                    f"the limits [{least:g}, {most:g}] of input {entry - field.n} lie outside "
-                    f"where its dynamics are valid, [{low:g}, {high:g}]"
-                )
-            # A limit within the bounds keeps its side by itself.
-            room = min(
-                np.inf if most <= high else high - float(np.max(centre)),
-                np.inf if low <= least else float(np.min(centre)) - low,
-            )
-            if widths is not None and entry >= field.n:
-                room -= float(widths[k, entry - field.n])
-            if room <= 0:
-                raise DataError(
-                    f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
-                    f"{centre[0]:.4g} at {policy.t[k]:g} s, not well within [{low:g}, {high:g}]"
-                )
-            for knot in (k, k + 1) if np.isfinite(room) else ():
-                found[knot] += list(rows / (CAP_ROOM**0.5 * room))
-    return [np.array(rows).reshape(-1, field.n) for rows in found]
-
-
-def validity_caps(
-    field: VectorField, policy: ContinuousPolicy, P: FloatArray, widths: FloatArray | None = None
-) -> FloatArray:
-    """(K,) the largest ρ at each knot with which x and u stay where the dynamics are valid."""
-    caps = np.empty(len(P))
-    for knot, rows in enumerate(validity_rows(field, policy, widths)):
-        reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(P[knot]), rows)
-        caps[knot] = 1 / reach.max() if reach.any() else np.inf
-    return caps
-
-
 def enlarge_shape(
-    steps: LSteps,
-    policy: ContinuousPolicy,
+    setting: Setting,
     funnel: ContinuousFunnel,
     *,
     margin: float,
@@ -107,10 +50,11 @@ def enlarge_shape(
 
     The volume is linearised within a trust region. Raises Infeasible if none could be proved.
     """
+    steps, policy = setting.steps, setting.policy
     margin *= SHAPE_MARGIN
     volume_before, kappa = funnel.volume_integral(), steps.kappa
     steps.kappa = None if kappa is None else kappa.copy()
-    present = _normalised(steps, policy, funnel, ROOM * margin)
+    present = _normalised(setting, funnel, ROOM * margin)
     found = [_Kept(present, steps.kappa)]
     ends = solve_ends(steps, policy, present, executor=executor)
     for iteration in range(MAX_ITERATIONS):
@@ -140,17 +84,16 @@ def enlarge_shape(
     raise Infeasible(f"no proof from {unsolved(policy, proved.unproved)}: try more knots there")
 
 
-def _normalised(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, margin: float
-) -> ContinuousFunnel:
+def _normalised(setting: Setting, funnel: ContinuousFunnel, margin: float) -> ContinuousFunnel:
     """The funnel with P/ρ for P and ρ = 1, ρ as the sweep finds it for a margin.
 
     P/ρ at the knots, linear between them, is no longer what was swept: so it is swept again.
     """
     P, final = funnel.P, float(funnel.rho[-1])
     for _ in range(SWEEPS):
-        caps = INSIDE * validity_caps(steps.field, policy, P)
-        rho, _ = sweep_rho(steps, sections(steps, policy, P), Wanted(margin, final, caps))
+        caps = INSIDE * validity_caps(setting.steps.field, setting.policy, P)
+        same = replace(setting, P=P, expansion=None)
+        rho = swept(same, Wanted(margin, final, caps)).rho
         P, final = P / rho[:, None, None], 1.0
         if np.abs(rho - 1).max() < NEAR:
             break

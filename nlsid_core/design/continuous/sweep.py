@@ -15,7 +15,6 @@ from scipy.optimize import brentq
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import Diagnosis, NoFunnel, diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section
-from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
 ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
@@ -65,30 +64,6 @@ class Again(NamedTuple):
     rho: FloatArray
     ends: list[Ends]
     last: int
-
-
-def sweep_rho(
-    steps: LSteps,
-    instants: Sequence[Sequence[Section]],
-    wanted: Wanted,
-    progress: Progress = silent,
-    again: Again | None = None,
-) -> tuple[FloatArray, list[Ends]]:
-    """ρ (K,) and the L-steps at both ends of every interval.
-
-    instants: per interval its start, its end and, between them, others where ρ has to hold too.
-    Raises Infeasible naming the time.
-    """
-    count = len(instants)
-    rho, ends, last = np.full(count + 1, wanted.final), {}, count - 1
-    if again is not None:
-        rho, ends, last = again.rho.copy(), dict(enumerate(again.ends)), again.last
-    for k in range(last, -1, -1):
-        after, cap = float(rho[k + 1]), wanted.cap(k)
-        duals = ends[k + 1].start if k + 1 < count else None
-        rho[k], ends[k] = largest_before(steps, instants[k], after, cap, wanted.on(k), duals)
-        progress(f"rho at {instants[k][0].t:.3g} s", 1 - k / count)
-    return rho, [ends[k] for k in range(count)]
 
 
 def largest_before(

@@ -33,34 +33,51 @@ def rounded(pieces: Pieces) -> Pieces:
     """The pieces in x̄ with multipliers of few bits, and how a proof states these."""
     n = pieces.basis.shape[1]
     rows = monomials(n, pieces.multiplier_degrees(pieces.basis))
-    places = positions(
-        np.vstack([np.zeros((1, n), dtype=np.int64), monomials(n, [1])]), pieces.basis
-    )
+    places = positions(affine(n), pieces.basis)
     diagonal = np.diagonal(pieces.gram, axis1=2, axis2=3).max(axis=1)[:, places]
     reach = np.sqrt(diagonal[:, :1] / diagonal[:, 1:])  # of each x̄_i on the funnel, nearly
     sizes = np.exp(np.log(reach) @ monomials(n, [1]).T @ rows.T)  # (B, M) of the monomials
     largest = (np.abs(pieces.mu).max(axis=1) * sizes).max(axis=1, keepdims=True)
     shifts = np.round(np.log2(largest / sizes)).astype(np.int64) - MU_BITS
     whole = np.round(pieces.mu * np.exp2(-shifts[:, None].astype(np.float64)))
-    tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
-    sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
-    for b in range(len(pieces)):
-        stated[b] = {
-            "mu": {
-                "shifts": shifts[b].tolist(),
-                "start": whole[b, 0].astype(np.int64).tolist(),
-                "end": whole[b, 1].astype(np.int64).tolist(),
-            }
-        }
-        factors = []
-        for limited in range(tau.shape[2]):
-            found = multiplier(sides, pieces.tau[b, :, limited], bits=TAU_BITS)
-            tau[b, :, limited] = matrices(found["columns"], found["squares"])
-            factors.append({"columns": found["columns"], "squares": found["squares"]})
-        if factors:
-            stated[b] |= {"mode": pieces.mode[b].tolist(), "tau": factors}
     mu = whole * np.exp2(shifts[:, None].astype(np.float64))
-    return replace(pieces, mu=mu, tau=tau, stated=stated)
+    pieces = stated_multipliers(replace(pieces, mu=mu))
+    for b in range(len(pieces)):
+        pieces.stated[b]["mu"] = {
+            "shifts": shifts[b].tolist(),
+            "start": whole[b, 0].astype(np.int64).tolist(),
+            "end": whole[b, 1].astype(np.int64).tolist(),
+        }
+    return pieces
+
+
+def stated_multipliers(pieces: Pieces) -> Pieces:
+    """The pieces with τ of few bits, and how a proof states it."""
+    tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
+    for b in range(len(pieces)):
+        factors = [_factors(S) for S in pieces.tau[b].swapaxes(0, 1)]
+        for place, written in enumerate(factors):
+            tau[b, :, place] = matrices(written["columns"], written["squares"])
+        stated[b] = {"tau": factors} if factors else {}
+        if pieces.mode.shape[1]:
+            stated[b]["mode"] = pieces.mode[b].tolist()
+    return replace(pieces, tau=tau, stated=stated)
+
+
+def _factors(S: FloatArray) -> Json:
+    """S (2, n+1, n+1) at both ends as factors in 1 and x̄; what is not used is charged least."""
+    used = np.asarray(np.diagonal(S, axis1=1, axis2=2).any(axis=0))
+    if not used.any():
+        return {"columns": [0] * len(used), "squares": {"unit": 0, "factors": [[]]}}
+    found = multiplier(affine(len(used) - 1), S, bits=TAU_BITS)
+    columns = np.array(found["columns"])
+    columns[~used] = columns[used].min()
+    return {"columns": columns.tolist(), "squares": found["squares"]}
+
+
+def affine(n: int) -> IntArray:
+    """(n + 1, n) the monomials 1, x0, x1, ..."""
+    return np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
 
 
 def matrices(columns: Sequence[int], squares: Json) -> FloatArray:
@@ -80,12 +97,8 @@ def piece_margins(
     """Each piece's margin in 1/s; nan where its Gram matrices are not positive definite."""
     c = closed_loop_polynomial(field, policy, funnel, pieces)
     curves = _Curves.of(funnel, pieces, c)
-    with np.errstate(all="ignore"):  # of a funnel so small that its numbers overflow
-        scaled = curves.scaled()
-    finite = np.asarray(np.isfinite(scaled).all(axis=(1, 2, 3), keepdims=True))
-    lowest = np.linalg.eigvalsh(np.where(finite, scaled, 0.0)).min(axis=(1, 2))
     margins = np.full(len(pieces), np.nan)
-    sound = np.isfinite(lowest) & (lowest > 0)
+    sound = curves.lowest() > 0
     if sound.any():
         Q = curves.grams[sound]
         constant = 1 / np.linalg.inv(Q)[:, :, curves.one, curves.one]  # Schur complement
@@ -117,30 +130,6 @@ def documents(
     return [_written(pieces, curves, b) for b in range(len(pieces))]
 
 
-def stated_multipliers(pieces: Pieces) -> Pieces:
-    """The pieces with τ of few bits, and how a proof states it; there is no μ."""
-    n = pieces.basis.shape[1]
-    sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
-    nothing: Json = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
-    tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
-    for b in range(len(pieces)):
-        factors = []
-        for place in range(tau.shape[2]):
-            written = nothing
-            here = pieces.tau[b, :, place]
-            used = np.flatnonzero(np.diagonal(here, axis1=1, axis2=2).any(axis=0))
-            if len(used):
-                found = multiplier(sides[used], here[:, used[:, None], used], bits=TAU_BITS)
-                unused = [min(found["columns"])] * (n + 1)
-                written = among({key: found[key] for key in nothing}, used, unused)
-                tau[b, :, place] = matrices(written["columns"], written["squares"])
-            factors.append(written)
-        stated[b] = {"tau": factors}
-        if pieces.mode.shape[1]:
-            stated[b]["mode"] = pieces.mode[b].tolist()
-    return replace(pieces, tau=tau, stated=stated)
-
-
 def rate_documents(
     funnel: ContinuousFunnel, pieces: Pieces, c: Graded, basis: IntArray, used: IntArray
 ) -> list[Json | None]:
@@ -149,10 +138,7 @@ def rate_documents(
     basis: (k, n) of the proof, of which `used` are those of the pieces.
     """
     curves = _Curves.of(funnel, pieces, c)
-    with np.errstate(all="ignore"):  # of a funnel so small that its numbers overflow
-        scaled = curves.scaled()
-    finite = np.asarray(np.isfinite(scaled).all(axis=(1, 2, 3), keepdims=True))
-    lowest = np.linalg.eigvalsh(np.where(finite, scaled, 0.0)).min(axis=(1, 2))
+    lowest = curves.lowest()
     found: list[Json | None] = []
     for b in range(len(pieces)):
         try:
@@ -247,10 +233,13 @@ class _Curves:
         one = int(np.flatnonzero(~basis.any(axis=1))[0])
         return cls(grams, h[:, None] * rho, one)
 
-    def scaled(self) -> FloatArray:
-        """The Gram matrices with a unit diagonal."""
-        root = np.sqrt(np.maximum(np.diagonal(self.grams, axis1=2, axis2=3), 1e-300))
-        return np.asarray(self.grams / root[..., :, None] / root[..., None, :])
+    def lowest(self) -> FloatArray:
+        """(B,) the least eigenvalue, with a unit diagonal; 0 where the numbers are not finite."""
+        with np.errstate(all="ignore"):  # of a funnel so small that its numbers overflow
+            root = np.sqrt(np.maximum(np.diagonal(self.grams, axis1=2, axis2=3), 1e-300))
+            scaled = self.grams / root[..., :, None] / root[..., None, :]
+        finite = np.isfinite(scaled).all(axis=(1, 2, 3), keepdims=True)
+        return np.asarray(np.linalg.eigvalsh(np.where(finite, scaled, 0.0)).min(axis=(1, 2)))
 
 
 def fitted(basis: IntArray, grams: FloatArray) -> FloatArray:

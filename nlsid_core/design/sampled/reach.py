@@ -13,13 +13,16 @@ from functools import cache
 from math import factorial, prod
 
 import numpy as np
+import scipy.sparse as sp
 
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core import conic
+from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.conic import Cone, ConeProgram
+from nlsid_core.design.continuous.graded import positions
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.kernel.polynomials import Polynomial as Exact
 from nlsid_core.kernel.polynomials import Ring
-from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
-from nlsid_core.sos import Compiled, Program, SumOfSquares, compile_program, template
+from nlsid_core.polynomial import monomials
 
 UP = 1.0 + 1e-14  # more than the rounding of a square root
 ROOM = 1e-6  # relative; what β is raised by, well above the solver's 1e-8
@@ -46,7 +49,7 @@ class Reach:
         return {"reach": self.bound, **squares, "ball": ball}
 
 
-def bases(n: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+def bases(n: int, degree: int) -> tuple[IntArray, IntArray]:
     """The monomials of the squares, and those of the ball's multiplier."""
     return monomials(n, range(degree + 1)), monomials(n, range(degree))
 
@@ -55,29 +58,28 @@ def reach(rows: Sequence[Exact], ring: Ring, radius: float, degree: int) -> Reac
     """The least bound that sums of squares give; raises SolverError or Infeasible as the solver."""
     n = ring.count
     found = [closed_loop.scaled_terms(row, ring, [radius] * n) for row in rows]
-    size = sum(value**2 for row in found for value in row.values())  # makes the solver's size one
-    names = _names(n)
-    total: Polynomial = constant(0.0, names=names)
-    for row in found:
-        exponents = np.array(list(row) or [(0,) * n], dtype=np.int64)
-        p = Polynomial(exponents, np.array(list(row.values()) or [0.0]) / np.sqrt(size), names)
-        total = total + p * p
-    compiled, place = _program(n, degree)
-    values = dict.fromkeys(compiled.program.parameters, 0.0)
-    for exponent, coefficient in total.terms():
-        values[place[exponent]] = float(coefficient)
-    solution = compiled.solve(values)
-    beta = max(solution.objective, 0.0)
+    basis, inner = bases(n, degree)
+    g = np.array([[row.get(tuple(v), 0.0) for v in basis.tolist()] for row in found])
+    size = float(np.sum(g**2))  # makes the solver's size one
+    places, A = _identity(n, degree)
+    square = np.bincount(places.ravel(), (g.T @ g / size).ravel(), len(A))
+    unknowns = A.shape[1]
+    x = conic.solve(
+        ConeProgram(
+            P=sp.csc_matrix((unknowns, unknowns)),
+            q=np.r_[1.0, np.zeros(unknowns - 1)],
+            A=sp.vstack([A, -sp.eye(unknowns, format="csr")[1:]], "csc"),
+            b=np.r_[square, np.zeros(unknowns - 1)],
+            cones=(Cone("zero", len(A)), Cone("psd", len(basis)), Cone("psd", len(inner))),
+        )
+    ).x
+    beta = max(float(x[0]), 0.0)
     room = ROOM * max(beta, 1e-3)
-    identity = solution["reach"]
-    Q, sigma = _full(identity.gram, degree), _full(identity.multipliers[0], degree - 1)
+    first = 1 + len(basis) * (len(basis) + 1) // 2
+    Q, sigma = conic.smat(x[1:first]), conic.smat(x[first:])
     lift_Q, lift_sigma = _lift(n, degree)
     bound = float(np.sqrt(size * (beta + room))) * UP
     return Reach(radius, bound, size * (Q + room * lift_Q), size * (sigma + room * lift_sigma))
-
-
-def _names(n: int) -> tuple[str, ...]:
-    return tuple(f"z{i}" for i in range(n))
 
 
 def _degree(order: int, n: int) -> int:
@@ -85,34 +87,25 @@ def _degree(order: int, n: int) -> int:
 
 
 @cache
-def _program(n: int, degree: int) -> tuple[Compiled, dict[tuple[int, ...], str]]:
-    """The program of one size; the coefficients of |g|² are its parameters."""
-    names = _names(n)
-    powers = monomials(n, range(2 * degree + 1))
-    square = template("c", powers, names)
-    parameters = tuple(name for name in square.names if name not in names)
-    (beta,) = variables("beta")
-    ball = constant(1.0, names=names) - sum(z * z for z in variables(names))
-    constraint = SumOfSquares(
-        beta - square,
-        domain=(ball,),
-        degree=2 * degree,
-        basis=monomials(n, range(degree + 1)),
-        name="reach",
-    )
-    program = Program(names, (constraint,), minimise=beta, parameters=parameters)
-    place = {tuple(e): name for e, name in zip(powers.tolist(), parameters, strict=True)}
-    return compile_program(program), place
-
-
-def _full(gram: Gram, degree: int) -> FloatArray:
-    """The Gram matrix over all monomials up to `degree`."""
-    basis = monomials(gram.basis.shape[1], range(degree + 1))
-    index = {tuple(row): i for i, row in enumerate(basis.tolist())}
-    at = [index[tuple(row)] for row in gram.basis.tolist()]
-    Q = np.zeros((len(basis), len(basis)))
-    Q[np.ix_(at, at)] = gram.Q
-    return Q
+def _identity(n: int, degree: int) -> tuple[IntArray, FloatArray]:
+    """Where each product of the basis is among the monomials up to 2·degree, and their coefficients
+    in β - v'Qv - σ(1 - |z|²), by β, svec Q and svec σ.
+    """
+    basis, inner = bases(n, degree)
+    every = monomials(n, range(2 * degree + 1))
+    places = positions((basis[:, None] + basis).reshape(-1, n), every).reshape(len(basis), -1)
+    i, j = conic.triangle(len(basis))
+    a, b = conic.triangle(len(inner))
+    coefficients = np.zeros((len(every), 1 + len(i) + len(a)))
+    coefficients[0, 0] = 1.0
+    weight = np.where(i == j, 1.0, conic.SQRT2)
+    coefficients[places[i, j], 1 + np.arange(len(i))] = -weight
+    columns = 1 + len(i) + np.arange(len(a))
+    weight, products = np.where(a == b, 1.0, conic.SQRT2), inner[a] + inner[b]
+    coefficients[positions(products, every), columns] = -weight
+    for unit in np.eye(n, dtype=np.int64):
+        coefficients[positions(products + 2 * unit, every), columns] = weight
+    return places, coefficients
 
 
 @cache

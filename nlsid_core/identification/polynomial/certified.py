@@ -116,7 +116,7 @@ class _Steps:
             b=self.F[:, 0] + moved @ step.theta,
             cones=self.cones,
         )
-        v = conic.solve(program, "clarabel refined").x[:n]
+        v = conic.solve(program, refined=True).x[:n]
         return np.asarray(step.theta + v * (size / step.D))
 
 

@@ -133,8 +133,7 @@ class ImplicitSet:
         e, f = unknowns(rows)
         S = np.array([[constant(MONOTONE * (i == j)) for j in range(n_v)] for i in range(n_v)])
         columns = [
-            [*left_coefficients(rows, i, n_v), *right_coefficients(rows, i, n_v)]
-            for i in range(n_v)
+            [*left_coefficients(rows, i, n_v), *right_coefficients(rows, i)] for i in range(n_v)
         ]
         names = list(np.array(columns, dtype=object).T.ravel())
         kept = np.repeat(np.concatenate([np.ones(n_e, dtype=bool), ~rows.driven]), n_v)

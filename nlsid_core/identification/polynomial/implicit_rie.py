@@ -13,6 +13,7 @@ Terms of f in the inputs alone are in no inequality and cost a search nothing: f
 other terms of f, least squares gives the best.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,11 +41,11 @@ from nlsid_core.models import ImplicitModel, MonotoneEquation
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import (
+    Builder,
     NonNegative,
     NormBound,
     Program,
     Solution,
-    compile_program,
     forms_of,
     matrix_sum_of_squares,
     solve,
@@ -106,7 +107,7 @@ def refuse_large_program(rows: ImplicitRows) -> None:
     e, f = unknowns(rows)
     S = symmetric_template("S", len(e))
     program = Program(indeterminates_of(rows.names), tuple(set_constraints(rows, e, f, S, 1.0)))
-    size = max(cone.size for cone in compile_program(program).layout.cones if cone.kind == "psd")
+    size = max(cone.size for cone in Builder(program).cones if cone.kind == "psd")
     if size > LARGEST_BLOCK:
         raise DataError(
             f"a semidefinite block of order {size} in set {rows.set}, more than "
@@ -172,7 +173,7 @@ def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
             e[i] = template(f"e{i}", rows.left, names.v)
         else:
             e[i] = sum(entry * v for entry, v in zip(symmetric[i], variables(names.v), strict=True))
-        f[i] = template(f"f{i}", rows.right[~rows.driven], known).substitute(_tied(rows, i, len(e)))
+        f[i] = template(f"f{i}", rows.right[~rows.driven], known)
     return e, f
 
 
@@ -231,7 +232,7 @@ def _residual(rows: ImplicitRows) -> Objects:
     """(p, n_v): the equation errors, affine in the decisions; least over `driven` terms of f."""
     columns, n_v, R = [], len(rows.y_scale[0]), rows.reduced[0]
     for i in range(n_v):
-        right = [-c for c in right_coefficients(rows, i, n_v)]
+        right = [-c for c in right_coefficients(rows, i)]
         columns.append(combinations(R, [*left_coefficients(rows, i, n_v), *right]))
     return np.array(columns, dtype=object).T
 
@@ -244,23 +245,11 @@ def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
     return [E[i, int(np.argmax(unit))] for unit in rows.left]
 
 
-def right_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+def right_coefficients(rows: ImplicitRows, i: int) -> list[Polynomial]:
     """The decisions in f of equation i, in the order of those of the rows' monomials that hold a
     state.
     """
-    tied = _tied(rows, i, n_v)
-    names = [f"f{i}[{k}]" for k in range(int((~rows.driven).sum()))]
-    return [tied.get(name, own) for name, own in zip(names, variables(names), strict=True)]
-
-
-def _tied(rows: ImplicitRows, i: int, n_v: int) -> dict[str, Polynomial]:
-    """What replaces decisions in f: e + f of a continuous class is affine in the states."""
-    if not rows.model_class.continuous:
-        return {}
-    left = left_coefficients(rows, i, n_v)
-    of_e = {tuple(row): -c for row, c in zip(rows.left.tolist(), left, strict=True)}
-    powers = [tuple(row[: rows.states]) for row in rows.right[~rows.driven].tolist()]
-    return {f"f{i}[{k}]": of_e[row] for k, row in enumerate(powers) if sum(row) > 1}
+    return list(variables([f"f{i}[{k}]" for k in range(int((~rows.driven).sum()))]))
 
 
 def _interior(constraints: list[Constraint], names: Names) -> tuple[Solution, float]:
@@ -283,8 +272,11 @@ def coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, Float
     """e (m_e, n_v) and f (m_f, n_v), the `driven` terms by least squares for the others."""
     n_v = len(rows.y_scale[0])
     e, of_x = (
-        np.array([[float(found.value(p)) for p in part(rows, i, n_v)] for i in range(n_v)]).T
-        for part in (left_coefficients, right_coefficients)
+        _values(found, part).T
+        for part in (
+            [left_coefficients(rows, i, n_v) for i in range(n_v)],
+            [right_coefficients(rows, i) for i in range(n_v)],
+        )
     )
     f = np.zeros((len(rows.right), n_v))
     f[~rows.driven] = of_x
@@ -292,7 +284,7 @@ def coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, Float
     return e, f
 
 
-def _values(found: Solution, matrix: Objects) -> FloatArray:
+def _values(found: Solution, matrix: Objects | Sequence[Sequence[Polynomial]]) -> FloatArray:
     return np.array([[float(found.value(entry)) for entry in row] for row in matrix])
 
 

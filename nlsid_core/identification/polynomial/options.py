@@ -24,7 +24,7 @@ StableSet = Literal["2.11", "2.13", "2.19", "3.8"]
 
 @dataclass(frozen=True)
 class Degrees:
-    """Of the polynomials in e(y(t)) = f(past outputs, inputs).
+    """How high the powers in e(y(t)) = f(past outputs, inputs) go.
 
     left: of e, odd, 1 to 9. past: of f in past outputs, 1 to 5. inputs: of f in the inputs alone, 0
     to 5. leading: in the inputs, of the coefficient of y(t), 0 to 5. lagged: in the inputs, of the
@@ -57,8 +57,6 @@ class Polynomial:
     set: of stable models to search, by its number in the thesis: "2.11", "2.13" for one lag, "2.19"
     for linear models, "3.8" for equations that are monotone in y(t) and affine in the rest (None:
     for a linear left side those of Chapter 4, else "3.8" or "2.11", whichever has such equations).
-    continuous: of measured states, lags 1 and delays (1,), only models that E dx/dt = g(x) + r(u)
-    makes by the trapezoidal rule; `dynamics.identified_field` is then the equation itself.
     Raises OptionError, which names an option, its value and what is allowed, or DataError for a
     combination that no model can satisfy. Source: thesis (2.4), (2.7), (3.14), (4.1).
     """
@@ -70,7 +68,6 @@ class Polynomial:
     output_range: Ranges | None = None
     on_out_of_range: OutOfRange = "clip"
     set: StableSet | None = None
-    continuous: bool = False
 
     def __post_init__(self) -> None:
         require_whole(self, "lags", 1, MOST_LAGS)
@@ -94,7 +91,7 @@ class Polynomial:
         d = self.degrees
         affine = (d.left, d.past, d.inputs, d.leading, d.lagged) == (3, 1, 1, 0, 0)
         everywhere = self.input_range is None and self.output_range is None
-        return "3.8" if affine and everywhere and not self.continuous else "2.11"
+        return "3.8" if affine and everywhere else "2.11"
 
     @property
     def is_linear(self) -> bool:
@@ -157,13 +154,6 @@ class Polynomial:
         everywhere = self.output_range is None
         if name == "2.19" and ((d.left, d.past) != (1, 1) or not everywhere):
             raise DataError("set 2.19 is linear: degrees left 1 and past 1, and no ranges")
-        if self.continuous and (self.lags, self.delays, d.lagged) != (1, (1,), 0):
-            raise DataError("continuous models have measured states: lags 1, delays [1], uncoupled")
-        if self.continuous and d.left != d.past:
-            raise DataError(
-                f"continuous models have the degrees left and past the same, not {d.left} and "
-                f"{d.past}"
-            )
         if everywhere:
             self._refuse_growth()
 
