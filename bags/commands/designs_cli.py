@@ -248,12 +248,14 @@ def decided(paths: list[Path], limits: deciding.Limits, *, second: bool = False)
 
 
 def _proofs(path: Path) -> list[Path]:
-    """The proofs in a folder; the path itself if it is none."""
-    if path.is_dir() and not any(path.glob("*.proof.json")):
+    """The proofs in a folder, or the proof itself; DocumentError if the path is neither."""
+    proofs = sorted(path.glob("*.proof.json")) if path.is_dir() else [path]
+    if not any(proof.name.endswith(".proof.json") for proof in proofs):
         raise DocumentError(
-            f"{path} has no FILE.proof.json: `nlsid identify` and `nlsid funnel` write them"
+            f"{path} is no FILE.proof.json, and no folder that has one: `nlsid identify` and "
+            "`nlsid funnel` write them"
         )
-    return sorted(path.glob("*.proof.json")) if path.is_dir() else [path]
+    return proofs
 
 
 def report(

@@ -57,11 +57,10 @@ def say_identified(console: Console, result: Identified) -> None:
 
 def worth(result: Identified) -> str:
     """How well the model simulates, and what is proved of it."""
-    fit = result.fit
-    error = percent(fit.errors["test"][fit.method.name])
+    error = percent(result.fit.errors["test"][result.fit.method.name])
     return (
         f"The model simulates {len(result.test)} test trials with an error of {error}. "
-        f"{tables.stability_sentence(fit.chosen)}"
+        f"{tables.stability_sentence(result.fit.chosen)}"
     )
 
 

@@ -15,7 +15,9 @@ SAMPLES = 9  # per interval, where a defect is looked for
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """x: states (n,), continuous; u: inputs (m,); the same knots. A jump of rounding is closed.
+    """A motion: states and inputs as cubics over time.
+
+    x: states (n,), continuous; u: inputs (m,); the same knots. A jump of rounding is closed.
 
     Raises ShapeError or DataError if they do not fit together.
     """

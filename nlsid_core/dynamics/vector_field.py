@@ -30,7 +30,9 @@ _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{0,3999})?", re.ASCII)
 
 @dataclass(frozen=True, eq=False)
 class VectorField:
-    """ẋ_i = pieces[j][i](t, x, u, w) on the j-th of the time spans that `breaks` separate.
+    """Equations of motion, ẋ_i = pieces[j][i](t, x, u, w).
+
+    The j-th pieces hold on the j-th of the time spans that `breaks` separate.
 
     pieces: exact polynomials in `names` = t, x0.., u0.., w0... n, m: numbers of states and inputs.
     breaks: (J-1,) s, increasing, where the equations change. uncertain: (n_w, 2) lower and upper

@@ -101,7 +101,7 @@ class History:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Generic[M]):
-    """Every candidate in order, the chosen one, and what was measured on the way.
+    """What `identify` found: every candidate in order, the chosen one, and their errors.
 
     errors: simulation error in % by dataset name ("train", "test", those given) and
     name of the method. max_rate: the slowest rate a sample that was searched, and proofs of which

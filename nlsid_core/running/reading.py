@@ -12,7 +12,7 @@ _NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 
 
 class Status(Enum):
-    """What a reading says, best to worst."""
+    """What a monitor says of a sample, best to worst."""
 
     UNKNOWN = "unknown"
     INSIDE = "inside"

@@ -132,7 +132,7 @@ def test_each_class_is_identified_to_files_that_check_proves(made: tuple[str, Pa
     stated = "the implicit model" if CLASSES[name][1] is ImplicitModel else "incremental stability"
     assert checked.startswith(f"PROVED {stated}")
     page = (out / documents.REPORT).read_text()
-    assert "decided exactly" in page
+    assert 'class="proved"' in page
     assert "simulation residual is" in page
 
 
@@ -300,7 +300,7 @@ def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
     made = nlsid("identify", tmp_path, coupled, "--config", config)
     assert "NOT PROVED stable" in made
     assert not (tmp_path / documents.MODEL_PROOF).exists()
-    assert "Not proved stable" in (tmp_path / documents.REPORT).read_text()
+    assert "NOT PROVED stable" in (tmp_path / documents.REPORT).read_text()
 
 
 # -- the documentation -------------------------------------------------------------------------

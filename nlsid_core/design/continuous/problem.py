@@ -19,7 +19,7 @@ START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rat
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """{x : |x - centre|²_P ≤ 1}, the set to end in. centre: (n,), P: (n, n) ≻ 0."""
+    """The set to end in, {x : |x - centre|²_P ≤ 1}; centre: (n,), P: (n, n) ≻ 0."""
 
     centre: FloatArray
     P: FloatArray

@@ -113,7 +113,11 @@ class Row:
             low[cell["phi"]], high[cell["phi"]] = 0.0, slowest
             if len(cell["limit"]) == 2:
                 low[cell["limit"][0]] = LEAST_FRICTION
-            for slopes in (cell["phi"], cell.get("g", NONE)):
+            flow = cell.get("g", NONE)
+            if "gamma" in cell:  # what flows over goes on as what does not
+                low[cell["gamma"]] = 0.0
+                flow = np.append(flow, cell["gamma"])
+            for slopes in (cell["phi"], flow):
                 bend += list(np.diff(np.eye(size)[slopes], axis=0))
         return Problem(self.built[0], trials, np.sqrt(SMOOTHING) * np.array(bend), (low, high))
 

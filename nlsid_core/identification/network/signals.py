@@ -9,7 +9,6 @@ Source: the sensitivities are those of linear filters, each a filter itself.
 """
 
 from bisect import bisect_right
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -151,7 +150,7 @@ class Signals:
                     forcing += passed(part.weights(theta), sources[part.source], trial)
             A = self.own_filter(number, theta)
             if own := self.own_maps(number):
-                sources.append(_looped(A, own, theta, forcing, start))
+                sources.append(_looped(A, own[0], theta, forcing, start))
             else:
                 sources.append(_filtered(A, forcing, start, trial))
         return sources
@@ -233,42 +232,29 @@ def _filtered(A: FloatArray, forcing: FloatArray, start: FloatArray, trial: Tria
 
 def _looped(
     A: FloatArray,
-    own: list[tuple[Taps, Mapped]],
+    own: tuple[Taps, Mapped],
     theta: FloatArray,
     forcing: FloatArray,
     start: FloatArray,
 ) -> FloatArray:
     """(N,): sample by sample, held at DIVERGED where it grows beyond all measure."""
-    a, y = list(enumerate((-A[1:]).tolist(), 1)), start.tolist()
-    mapped = []
-    for part, one in own:
-        f = _compiled(one.function, theta[one.at])
-        mapped.append((f, part.weights(theta), [f(value) for value in y]))
-    for t, value in enumerate(forcing[len(y) :].tolist(), len(y)):
+    part, one = own
+    f = as_piecewise_linear(one.function, theta[one.at])
+    inner, slopes = f.knots[1:-1].tolist(), f.slopes.tolist()
+    levels = (f.values[:-1] - f.slopes * f.knots[:-1]).tolist()
+    a, weights = list(enumerate((-A[1:]).tolist(), 1)), part.weights(theta)
+    y, mapped = start.tolist(), f(start).tolist()
+    for value in forcing[len(y) :].tolist():
         for k, weight in a:
-            value += weight * y[t - k]
-        for _, weights, w in mapped:
-            for k, weight in weights:
-                value += weight * w[t - k]
-        value = min(max(value, -DIVERGED), DIVERGED)
+            value += weight * y[-k]
+        for k, weight in weights:
+            value += weight * mapped[-k]
+        if not -DIVERGED <= value <= DIVERGED:
+            value = min(max(value, -DIVERGED), DIVERGED)
         y.append(value)
-        for f, _, w in mapped:
-            w.append(f(value))
+        i = bisect_right(inner, value)
+        mapped.append(levels[i] + slopes[i] * value)
     return np.array(y)
-
-
-def _compiled(function: Map, p: FloatArray) -> Callable[[float], float]:
-    """A piecewise-linear map of one number."""
-    f = as_piecewise_linear(function, p)
-    inner, knots, values, slopes = (
-        part.tolist() for part in (f.knots[1:-1], f.knots, f.values, f.slopes)
-    )
-
-    def at(x: float) -> float:
-        i = bisect_right(inner, x)
-        return values[i] + slopes[i] * (x - knots[i])  # type: ignore[no-any-return]
-
-    return at
 
 
 def _bands(

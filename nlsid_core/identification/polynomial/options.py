@@ -24,7 +24,7 @@ StableSet = Literal["2.11", "2.13", "2.19", "3.8"]
 
 @dataclass(frozen=True)
 class Degrees:
-    """Of the polynomials in e(y(t)) = f(past outputs, inputs).
+    """How high the powers in e(y(t)) = f(past outputs, inputs) go.
 
     left: of e, odd, 1 to 9. past: of f in past outputs, 1 to 5. inputs: of f in the inputs alone, 0
     to 5. leading: in the inputs, of the coefficient of y(t), 0 to 5. lagged: in the inputs, of the

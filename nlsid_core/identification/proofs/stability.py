@@ -32,8 +32,8 @@ LEAST_ROOM = 1e-3  # of 1 - rate of the worst vertex alone: what is asked for fi
 RATE_RISE = 4.0  # of 1 - rate from one attempt to the next, until one is not proved
 RATE_STEPS = 6  # bisections of 1 - rate, the first failure among them
 FEASIBLE = 1e-7  # least eigenvalue, in balanced units, that the kernel's exact decision can use
-MOST_HALVINGS = 100  # of a layer's weight: beyond any coupling worth a model
-LEAST_PIVOT = 1e-3  # eigenvalue, in units of the diagonal, that the weight of a layer leaves
+MOST_HALVINGS = 100  # of a part's weight: beyond any coupling worth a model
+LEAST_PIVOT = 0.1  # of the least eigenvalue of parts alone, that the weight of a part leaves
 LARGEST = 1e3  # entry of a multiplier in balanced units: where nothing else bounds it
 SPLITTING_ROUNDS = 16
 MOST_LEAVES = 64
@@ -112,9 +112,10 @@ def prove_stability(model: Any) -> StabilityProof | None:
         root = search.leaf(form.E.box)
         if len(root.E) == 1 and not form.E.ray:
             return _decided(model, _linear(search, root))
-        layer = _layers(search, root)
-        if layer is not None and not form.E.ray and form.E.whole == len(form.E.box):
-            return _by_weights(model, search, root, layer)
+        if not form.E.ray and form.E.whole == len(form.E.box):
+            layer = _layers(search, root)
+            parts = [np.flatnonzero(layer == number) for number in range(layer.max() + 1)]
+            return _by_layers(model, search, root, parts)
         return _decided(model, _by_programs(search, root))
     except (kernel.Rejected, LinAlgError, SolverError):
         return None
@@ -151,8 +152,7 @@ def _linear(search: _Search, leaf: Leaf | None) -> StabilityProof | None:
     m = search.m
     lead = np.zeros((m, search.F.shape[1])) if leaf is None else leaf.E[0]
     A, G = _eliminated(search, lead)
-    radius = float(np.abs(np.linalg.eigvals(A)).max())
-    rate = radius + RATE_ROOM * (1.0 - radius)
+    rate = _slower(A)
     if not 0.0 < rate < 1.0 - SLOWEST:
         return None
     P = _lyapunov(A / rate)
@@ -167,73 +167,81 @@ def _linear(search: _Search, leaf: Leaf | None) -> StabilityProof | None:
     return StabilityProof(rate, P, {"N": N.tolist()})
 
 
-def _layers(search: _Search, root: Leaf) -> NDArray[np.intp] | None:
-    """(n,): the layer of every state, if no ν depends on what it moves; else None.
-
-    A state's layer is the number of ν, one after the other, on the longest way to it; states that
-    depend on each other have the same one. ν come in their order in the form.
+def _layers(search: _Search, root: Leaf) -> NDArray[np.intp]:
+    """(m + n,): the layer of every ν and x. A ν is one deeper than what it reads from outside the
+    loops that it is in; all else is as deep as the deepest that it depends on.
     """
-    m, F = search.m, search.F
-    n = len(F)
-    reads, moves = (root.E[:, :, m:] != 0.0).any(axis=0), F[:, :m] != 0.0
-    among, passes = F[:, m:] != 0.0, (root.E[:, :, :m] != 0.0).any(axis=0)
-    layer: NDArray[np.intp] = np.zeros(n, dtype=np.intp)
-    for _ in range((n + m) * (m + 1)):
-        before = layer.copy()
-        depth = np.zeros(m, dtype=np.intp)
-        for j in range(m):
-            known = [layer[reads[j]].max(initial=0), depth[:j][passes[j, :j]].max(initial=0)]
-            depth[j] = 1 + max(known)
-        for i in range(n):
-            layer[i] = max(layer[i], depth[moves[i]].max(initial=0), layer[among[i]].max(initial=0))
-        if layer.max(initial=0) > m:
-            return None
-        if (layer == before).all():
-            return layer
-    return None
+    reads = np.vstack([(root.E != 0.0).any(axis=0), search.F != 0.0])
+    np.fill_diagonal(reads, True)
+    reach = np.linalg.matrix_power(reads.astype(float), len(reads)) > 0.0
+    deeper = reads & ~reach.T
+    deeper[search.m :] = False
+    layer: NDArray[np.intp] = np.zeros(len(reads), dtype=np.intp)
+    for _ in range(len(reads)):
+        layer = np.where(reads, layer + deeper, 0).max(axis=1)
+    return layer
 
 
-def _by_weights(
-    model: Any, search: _Search, root: Leaf, layer: NDArray[np.intp]
+def _by_layers(
+    model: Any, search: _Search, root: Leaf, parts: Sequence[NDArray[np.intp]]
 ) -> StabilityProof | None:
-    """P = diag(w₀P₀, w₁P₁ …) of filters with ν between them: the weight of a layer is halved until
-    what couples it to those before it is nothing.
+    """P = diag(w₀P₀, w₁P₁ …) of parts, each proved alone: its weight is halved until what couples
+    it to those before it is nothing.
 
-    Each P_l solves (A/r)'P(A/r) - P + I = 0. N ζ = w(G'P_l G ν + G'P_l A x_l), G ν what ν moves
-    x_l by, leaves w G'P_l G on ν, and the coupling falls with w.
+    A part whose ν read its own x is proved by programs. Of another P_l solves
+    (A/r)'P(A/r) - P + I = 0, and N ζ = G'P_l G ν + G'P_l A x_l, G ν what ν moves x_l by, leaves
+    G'P_l G on ν.
     """
     m, F = search.m, search.F
     A = F[:, m:]
-    radius = float(np.abs(np.linalg.eigvals(A)).max())
-    rate = radius + RATE_ROOM * (1.0 - radius)
+    rate, alone = 0.0, []
+    for part in parts:
+        nu, x, found = part[part < m], part[part >= m] - m, None
+        E = np.unique(root.E[:, nu][:, :, part], axis=0)
+        if len(E) > 1:
+            found = _by_programs(_Search(search.form, F[np.ix_(x, part)]), Leaf(root.box, E))
+            if found is None:
+                return None
+        alone.append(found)
+        own = _slower(A[np.ix_(x, x)]) if found is None else found.rate
+        rate = max(rate, own)
     if not 0.0 < rate < 1.0 - SLOWEST:
         return None
-    P, N, weight = np.zeros_like(A), np.zeros((m + len(A), m)), 1.0
+    P, N, weight, least = np.zeros_like(A), np.zeros((m + len(A), m)), 1.0, np.inf
     done: NDArray[np.bool_] = np.zeros(m + len(A), dtype=bool)
-    for number in range(int(layer.max()) + 2):
-        part = np.flatnonzero(layer == number)  # of the last one none, but ν that move no state
-        G, own = F[part, :m], A[np.ix_(part, part)]
-        P_l = _lyapunov(own / rate) if len(part) else np.zeros((0, 0))
-        P_l /= np.abs(P_l).max(initial=1.0)
-        moves = G.any(axis=0) if len(part) else ~F[:, :m].any(axis=0)
-        size = G.T @ P_l @ G
-        size += (np.trace(size) * 1e-3 if len(part) else 1.0) * np.diag(moves.astype(float))
-        done[:m] |= moves
-        done[m + part] = True
+    for part, found in zip(parts, alone, strict=True):
+        nu, x = part[part < m], part[part >= m] - m
+        if found is None or found.multipliers is None:
+            P_l, N_l = _filters(F[np.ix_(x, nu)], A[np.ix_(x, x)], rate)
+        else:
+            P_l, N_l = found.P, np.array(found.multipliers["N"])
+        done[part] = True
         for _ in range(MOST_HALVINGS):
-            P_with, N_with = P.copy(), N.copy()
-            P_with[np.ix_(part, part)] = weight * P_l
-            N_with[:m] += weight * size
-            N_with[m + part] = weight * own.T @ P_l @ G
-            cross = N_with @ root.E
-            M = _gap(F, P_with, rate, m) + cross + cross.transpose(0, 2, 1)
-            if _least_in_units(M[:, done][:, :, done]) > LEAST_PIVOT:
+            P[np.ix_(x, x)], N[np.ix_(part, nu)] = weight * P_l, weight * N_l
+            cross = N @ root.E
+            M = _gap(F, P, rate, m) + cross + cross.transpose(0, 2, 1)
+            least = min(least, _least_in_units(M[:, part][:, :, part]))
+            if _least_in_units(M[:, done][:, :, done]) > LEAST_PIVOT * least:
                 break
             weight *= 0.5
         else:
             return None
-        P, N = P_with, N_with
     return _decided(model, StabilityProof(rate, P, {"N": N.tolist()}))
+
+
+def _filters(G: FloatArray, A: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
+    """P and N of filters x⁺ = A x + G ν."""
+    P = _lyapunov(A / rate) if len(A) else np.zeros((0, 0))
+    P /= np.abs(P).max(initial=1.0)
+    size = G.T @ P @ G
+    size += (np.trace(size) * 1e-3 if len(A) else 1.0) * np.eye(len(size))
+    return P, np.vstack([size, A.T @ P @ G])
+
+
+def _slower(A: FloatArray) -> float:
+    """A little slower than x⁺ = A x is."""
+    radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+    return radius + RATE_ROOM * (1.0 - radius)
 
 
 def _least_in_units(M: Matrices) -> float:
