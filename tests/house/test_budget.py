@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_189,
-    ("bags",): 11_916,
+    ("nlsid_core",): 18_188,
+    ("bags",): 11_906,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_792,
+    ("tests",): 22_794,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
