@@ -64,7 +64,7 @@ clean:
 # $(call install,EXTRAS): with ROS where its wheels exist, else without, said in one line.
 define install
 @echo 'nlsid: installing into $(VENV), about two minutes the first time'
-$(PIP) install --editable '.[ros,$(1)]' || { \
+@$(PIP) install --editable '.[ros,$(1)]' || { \
   echo 'nlsid: no ROS wheels for this Python or platform; installing without (nothing live runs).'; \
   $(PIP) install --editable '.[$(1)]'; }
 touch $@

@@ -25,12 +25,7 @@ import numpy as np
 
 from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.machine import parser, tell
-from benchmarks.thesis.soundness import (
-    OneSet,
-    simulate_boundary,
-    simulate_held,
-    smallest_escape,
-)
+from benchmarks.thesis.soundness import OneSet, Simulation
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
@@ -450,13 +445,8 @@ def run(name: str, starts: int, limit: float) -> dict[str, Any]:
         "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
     }
     told |= judged(function, found, given, starts)
-    told["room"] = smallest_escape(
-        Truth(function, found, given),
-        found.policy,
-        found.funnel,
-        found.found.goal.P,
-        starts=starts // 8,
-        rng=np.random.default_rng(5),
+    told["room"] = Simulation(Truth(function, found, given), found.policy, found.funnel).escape(
+        found.found.goal.P, starts=starts // 8, rng=np.random.default_rng(5)
     )
     if found.model.m:  # without an input there is nothing to hold
         error = WRONG * np.asarray(problem.goal, dtype=np.float64)
@@ -481,9 +471,9 @@ def judged(
         at: dict[str, Any] = {"starts": count, "rng": rng, "knot": knot}
         if "hold" in found.claim:
             at["error"] = np.asarray(found.claim.get("error", np.zeros(found.model.n)))
-            runs.append(simulate_held(*parts, hold=found.claim["hold"], **at))
+            runs.append(Simulation(*parts).held(hold=found.claim["hold"], **at))
         else:
-            runs.append(simulate_boundary(*parts, substeps=SUBSTEPS, **at))
+            runs.append(Simulation(*parts).boundary(substeps=SUBSTEPS, **at))
     return {key: found.claim[key] for key in ("hold", "error") if key in found.claim} | {
         "check_seconds": check_seconds,
         "margin": float(verdict.margin),

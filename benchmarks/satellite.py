@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.machine import parser, peers, spending, tell
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
-from benchmarks.thesis.soundness import simulate_boundary, smallest_escape
+from benchmarks.thesis.soundness import Simulation
 from examples import satellite
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel
@@ -81,14 +81,14 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 def _attacks(design: FunnelDesign, goal: Any, starts: int) -> dict[str, Any]:
     rng = np.random.default_rng(7)
     parts = (design.model, design.policy, design.funnel)
-    runs = [simulate_boundary(*parts, starts=starts, rng=rng)]
+    runs = [Simulation(*parts).boundary(starts=starts, rng=rng)]
     each = math.ceil(2 * starts / len(LATER_KNOTS))
-    runs += [simulate_boundary(*parts, starts=each, rng=rng, knot=k) for k in LATER_KNOTS]
+    runs += [Simulation(*parts).boundary(starts=each, rng=rng, knot=k) for k in LATER_KNOTS]
     return {
         "starts": sum(run.starts for run in runs),
         "violations": sum(run.violations for run in runs),
         "max_v": max(run.max_v for run in runs),
-        "tightness": smallest_escape(*parts, goal, starts=4000, rng=rng),
+        "tightness": Simulation(*parts).escape(goal, starts=4000, rng=rng),
     }
 
 
@@ -96,7 +96,7 @@ def _shape(field: Any, nominal: Any, goal: Any, weights: Any, starts: int) -> di
     with spending() as spent:
         design = design_funnel(ContinuousTracking(field, nominal, goal=goal, shape="P", **weights))
     rng = np.random.default_rng(8)
-    run = simulate_boundary(design.model, design.policy, design.funnel, starts=starts, rng=rng)
+    run = Simulation(design.model, design.policy, design.funnel).boundary(starts=starts, rng=rng)
     return {
         "p_seconds": spent.seconds,
         "p_processor_seconds": spent.processor,

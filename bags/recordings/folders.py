@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from bags.recordings.quality import KEY, Profile, offered
+from bags.recordings.quality import KEY, LOADER, Profile, offered
 from bags.recordings.remote import RemotePath, matching, place
 from nlsid_core.errors import BagError
 
@@ -22,9 +22,6 @@ COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MOST_PARTS: Final = 10_000  # of one recording; a greater number is a date
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
-
-# The C loader where PyYAML has it: ten thousand topics are seconds in Python.
-_LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class DescribedTopic(NamedTuple):
@@ -169,7 +166,7 @@ def _metadata(file: Path) -> dict[str, Any]:
     if size > MAX_METADATA_BYTES:
         raise _bad(file, f"it has {size} bytes, at most {MAX_METADATA_BYTES} are read")
     try:
-        content = yaml.load(file.read_bytes(), Loader=_LOADER)
+        content = yaml.load(file.read_bytes(), Loader=LOADER)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise _bad(file, f"it is not YAML: {str(error)[:200]}") from error
     found = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None

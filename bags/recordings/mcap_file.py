@@ -26,13 +26,11 @@ from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
-    Channel,
     Chunk,
     ChunkIndex,
     Footer,
     Metadata,
     MetadataIndex,
-    Schema,
     Statistics,
 )
 
@@ -40,6 +38,7 @@ from bags.recordings.batch import Batch
 from bags.recordings.mcap_fetch import Fetching
 from bags.recordings.mcap_records import (
     CHUNK_FIXED,
+    DECLARES,
     INDEX,
     INDEX_ENTRY,
     MAGIC,
@@ -64,7 +63,7 @@ from bags.recordings.remote import GAP_BYTES, TAIL_BYTES, RemotePath, place
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
-OF_SUMMARY: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
+OF_SUMMARY: Final = (*DECLARES, Opcode.STATISTICS)
 ATTACHMENT_FIXED: Final = 8 + 8 + 4 + 4 + 8  # bytes of two times and three lengths
 CHECKSUM_AT: Final = RECORD.size + 24  # of a chunk's record, its checksum
 SEARCH_BYTES: Final = 2**20
@@ -80,8 +79,7 @@ KNOWN_BYTES: Final = 16 * 2**10  # of a declaration that is kept for other bags
 _FOOTER: Final = RECORD.size + 20 + len(MAGIC)
 
 READS: Final[dict[int, Callable[[Any], Any]]] = {
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
+    **DECLARES,
     Opcode.STATISTICS: Statistics.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
@@ -354,10 +352,8 @@ class McapFile:
             _add_loose(found.blocks, at, content + length)
         elif opcode == Opcode.CHUNK:
             found.blocks.append(self._chunk(content, length))
-        elif opcode == Opcode.SCHEMA:
-            found.declared.add(self._parse(Schema.read, content, length))
-        elif opcode == Opcode.CHANNEL:
-            found.declared.add(self._parse(Channel.read, content, length))
+        elif opcode in DECLARES:
+            found.declared.add(self._parse(DECLARES[opcode], content, length))
         elif opcode == Opcode.METADATA:
             found.metadata.append(self._parse(Metadata.read, content, length))
         elif opcode == Opcode.ATTACHMENT:
@@ -543,7 +539,7 @@ def _lists_everything(found: Contents, metadata: int, statistics: Statistics) ->
 
 def _declared(opcode: int, content: bytes) -> Any:
     """A record; robots of a fleet declare the same schemas and channels in every bag."""
-    known = opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and len(content) <= KNOWN_BYTES
+    known = opcode in DECLARES and len(content) <= KNOWN_BYTES
     return (_known if known else parse)(READS[opcode], content)
 
 

@@ -42,6 +42,11 @@ INDEX: Final = struct.Struct("<BQHI")  # a message index record before its entri
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE.itemsize - RECORD.size  # of a message's content, before its data
 
+DECLARES: Final[dict[int, Callable[[Any], Any]]] = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+}
+
 Record = TypeVar("Record")
 
 
@@ -158,10 +163,8 @@ def walk_chunk(content: bytes) -> tuple[list[Schema | Channel], dict[int, IntArr
     declared: list[Schema | Channel] = []
     found: dict[int, list[int]] = {}
     for opcode, at, end in walk_records(content):
-        if opcode == Opcode.SCHEMA:
-            declared.append(parse(Schema.read, content[at + RECORD.size : end]))
-        elif opcode == Opcode.CHANNEL:
-            declared.append(parse(Channel.read, content[at + RECORD.size : end]))
+        if opcode in DECLARES:
+            declared.append(parse(DECLARES[opcode], content[at + RECORD.size : end]))
         elif opcode == Opcode.MESSAGE:
             if end - at < MESSAGE.itemsize:
                 raise BagError(f"a message record of {end - at} bytes")

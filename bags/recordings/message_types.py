@@ -36,8 +36,6 @@ MAX_ELEMENTS: Final = 2**16  # of a whole message, arrays in arrays multiplied o
 
 _TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
 _FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
-_LITTLE_ENDIAN_STAMP: Final = struct.Struct("<iI")
-_BIG_ENDIAN_STAMP: Final = struct.Struct(">iI")
 
 
 @cache
@@ -72,8 +70,7 @@ def header_stamp_ns(data: bytes) -> int:
     """
     if len(data) < 12 or data[0] != 0 or data[1] > 1:
         raise BagError(f"not a CDR message with a header: it starts with {data[:12].hex(' ')}")
-    layout = _LITTLE_ENDIAN_STAMP if data[1] else _BIG_ENDIAN_STAMP
-    seconds, nanoseconds = layout.unpack_from(data, 4)
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
 
 

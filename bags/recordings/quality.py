@@ -19,7 +19,8 @@ MAX_TEXT: Final = 2**16  # characters; a topic with a hundred publishers has 30 
 KEY: Final = "offered_qos_profiles"  # in metadata.yaml, and of a channel's metadata
 TYPE_HASH: Final = "topic_type_hash"  # of a channel's metadata, as rosbag2 writes it
 
-_LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# The C loader where PyYAML has it: ten thousand topics are seconds in Python.
+LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class Times(NamedTuple):
@@ -98,7 +99,7 @@ def profile_of(qos: Any) -> Profile:
 @lru_cache(maxsize=1024)
 def _parsed(text: str) -> tuple[Profile, ...]:
     try:
-        found = yaml.load(text, Loader=_LOADER)
+        found = yaml.load(text, Loader=LOADER)
     except (yaml.YAMLError, ValueError, RecursionError):
         return ()
     return () if isinstance(found, str) else offered(found)

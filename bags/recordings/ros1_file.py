@@ -8,6 +8,7 @@ Source: the ROS bag format, version 2.0, http://wiki.ros.org/Bags/Format/2.0.
 
 import bz2
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from io import BytesIO
@@ -197,11 +198,10 @@ class Ros1File:
 
 def _counts(blocks: Sequence[Block]) -> dict[int, int]:
     """Messages of each connection, as the blocks' indexes say."""
-    found: dict[int, int] = {}
+    found: Counter[int] = Counter()
     for block in blocks:
-        for number, (_, count) in (block.index or {}).items():
-            found[number] = found.get(number, 0) + count
-    return found
+        found.update({number: count for number, (_, count) in (block.index or {}).items()})
+    return dict(found)
 
 
 def _records(stream: BinaryIO, end: int) -> Iterator[tuple[Header, int, int]]:

@@ -196,9 +196,7 @@ class _Growing:
             self._times = np.pad(self._times[:, :start], ((0, 0), (0, more)))
             self._values = np.pad(self._values[:, :start], ((0, 0), (0, more)))
         here = slice(start, self._length)
-        self._times[0, here] = part.log_ns
-        self._times[1, here] = part.publish_ns
-        self._times[2, here] = part.sequence
+        self._times[:3, here] = part.log_ns, part.publish_ns, part.sequence
         if part.stamp_ns is not None:
             self._times[3, here] = part.stamp_ns
         for row, name in enumerate(self._names):

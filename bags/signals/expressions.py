@@ -106,10 +106,6 @@ class Expression:
     def __str__(self) -> str:
         return "|".join(map(str, (self.path, *self.operations)))
 
-    def of(self, path: SignalPath) -> "Expression":
-        """The same operations on another path."""
-        return replace(self, path=path)
-
     def operation(self, *names: str) -> Operation | None:
         """The one operation of these names, None if there is none."""
         return next((found for found in self.operations if found.name in names), None)

@@ -120,7 +120,8 @@ def expanded(bag: Bag, texts: Sequence[str]) -> dict[str, Expression]:
     for text in texts:
         signal = Expression.parse(text)
         for path in expand_path(bag, signal.path):
-            found[str(signal.of(path)) if signal.path.every else text] = signal.of(path)
+            single = replace(signal, path=path)
+            found[str(single) if signal.path.every else text] = single
     return found
 
 

@@ -6,7 +6,6 @@ for every t makes a funnel.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -68,7 +67,6 @@ def alternate_rho(
     margin: float = 0.0,
     stop: float = STOP,
     iterations: int = MAX_ITERATIONS,
-    executor: Executor | None = None,
 ) -> Sampled:
     """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f) and, where the start has it, a margin in 1/s.
 
@@ -77,7 +75,7 @@ def alternate_rho(
     """
     volumes = [funnel.volume_integral()]
     for _ in range(iterations):
-        ends = solve_ends(steps, policy, funnel, executor=executor)
+        ends = solve_ends(steps, policy, funnel)
         forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
         rho = funnel.rho.copy()
         basis = np.vstack([monomials_of(funnel.n, q) for q in range(3)])

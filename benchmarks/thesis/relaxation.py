@@ -4,23 +4,17 @@ Between the instants anything may happen, so what is found is at least as large 
 `Sampled` has no certificate and nothing that could become one: only `design_funnel` proves.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike
 from nlsid_core.design import ContinuousTracking
 from nlsid_core.design.continuous.expanded_sweep import swept
-from nlsid_core.design.continuous.problem import Goal
 from nlsid_core.design.continuous.setting import prepare
 from nlsid_core.design.continuous.sweep import Wanted
-from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 
@@ -39,24 +33,16 @@ class Sampled:
 
 
 def sample_funnel(
-    dynamics: VectorField | Callable[..., Any],
-    nominal: Nominal,
-    *,
-    goal: Goal | ArrayLike,
-    policy: ContinuousPolicy | None = None,
-    samples: int = 4,
-    Q: ArrayLike | None = None,
-    R: ArrayLike | None = None,
-    progress: Progress = silent,
+    problem: ContinuousTracking, *, samples: int = 4, progress: Progress = silent
 ) -> Sampled:
     """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
 
     Necessary for a funnel with this P(t), not sufficient: to compare with, or to see what could be
-    hoped for. The other arguments are those of `design_funnel`, and so is what it raises.
+    hoped for. Raises what `design_funnel` does.
     """
     if samples < 2:
         raise DataError(f"{samples} samples an interval: its two ends are the least")
-    setting = prepare(ContinuousTracking(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R))
+    setting = prepare(problem)
     policy = setting.policy
     wanted = Wanted(setting.margin(setting.rho_final), setting.rho_final)
     shares = np.linspace(0, 1, samples).tolist()

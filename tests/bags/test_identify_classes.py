@@ -70,7 +70,7 @@ def test_a_cascade_fit_is_a_fit_with_the_choices_as_its_history(cascade: Fit[Blo
     assert cascade.proof.rate < 1.0
     text = str(cascade)
     assert "block cascade: filters of orders 2 and 1" in text
-    assert "train        test" in text
+    assert "train    test" in text
 
 
 def test_moments_stand_beside_the_biased_rie_and_least_squares(

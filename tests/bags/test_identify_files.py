@@ -117,7 +117,7 @@ def made(
     """A class's name, the folder that `nlsid identify` wrote, and what it said."""
     out = tmp_path_factory.mktemp(request.param)
     config = write_config(out / "robot.yaml", CLASSES[request.param][0])
-    done = nlsid("identify", out, folder, "--config", config)
+    done = nlsid("identify", out, folder, "--config", config, "--verbose")
     return request.param, out, done
 
 
@@ -126,7 +126,7 @@ def test_each_class_is_identified_to_files_that_check_proves(made: tuple[str, Pa
     document = files.load_document(out / documents.MODEL)
     CLASSES[name][1].from_document(document)
     predicts = CLASSES[name][1] not in (BlockCascade, CellNetwork)  # these: what they simulate
-    assert ("steps ahead: 1:" in said) == predicts
+    assert ("one step ahead: " in said) == predicts
     assert ("predicts what it simulates" in " ".join(said.split())) != predicts
     checked = nlsid("check", out / documents.MODEL_PROOF)
     stated = "the implicit model" if CLASSES[name][1] is ImplicitModel else "incremental stability"

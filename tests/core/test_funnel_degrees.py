@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
+from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from nlsid_core.design import ContinuousTracking, design, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError
@@ -28,7 +28,7 @@ def test_functions_of_degree_five_are_expanded_and_no_start_leaves(n: int, tmp_p
     assert check(found.save(tmp_path)[-1]).margin > 0
     truth = TrueDynamics(lambda x, u: np.stack(springs(x.T, u.T), axis=1))
     rng = np.random.default_rng(2)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=2000, rng=rng)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=2000, rng=rng)
     assert run.violations == 0
 
 

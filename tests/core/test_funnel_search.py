@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
-from benchmarks.thesis.soundness import simulate_boundary
+from benchmarks.thesis.soundness import Simulation
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.pieces import proof_basis, prove_pieces
@@ -53,13 +53,13 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
 ) -> None:
     field, nominal = pulsed()
     options: Any = {"goal": np.eye(1), "Q": np.zeros((1, 1))}
-    found = sample_funnel(field, nominal, samples=2, **options)
+    found = sample_funnel(ContinuousTracking(field, nominal, **options), samples=2)
     assert str(found).startswith("NOT PROVED")
     assert not hasattr(found, "certificate")
     assert not hasattr(found, "save")
     setting = prepare(ContinuousTracking(field, nominal, **options))
     parts = (field, setting.policy, found.funnel)
-    run = simulate_boundary(*parts, starts=100, rng=np.random.default_rng(1), substeps=50)
+    run = Simulation(*parts).boundary(starts=100, rng=np.random.default_rng(1), substeps=50)
     assert run.violations == 100
     proved = prove_pieces(setting.steps, setting.policy, found.funnel)
     assert proved.unproved
@@ -81,15 +81,15 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
 
 def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> None:
     with pytest.raises(Infeasible, match=r"no funnel at t = 1\.5 s"):
-        sample_funnel(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1)), samples=3)
-    sampled = sample_funnel(*hanging(), goal=GOAL)
-    proved = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
+        sample_funnel(ContinuousTracking(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1))), samples=3)
+    problem = ContinuousTracking(*hanging(), goal=GOAL)
+    sampled, proved = sample_funnel(problem), design_funnel(problem)
     assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
 
 
 def test_a_sample_at_one_end_only_is_refused() -> None:
     with pytest.raises(DataError, match="its two ends are the least"):
-        sample_funnel(*hanging(), goal=GOAL, samples=1)
+        sample_funnel(ContinuousTracking(*hanging(), goal=GOAL), samples=1)
 
 
 # -- the thesis's alternation for ρ ------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.soundness import simulate_held
+from benchmarks.thesis.soundness import Simulation
 from nlsid_core import proofs
 from nlsid_core.design import (
     ContinuousTracking,
@@ -48,7 +48,7 @@ def largest(found: FunnelDesign, *, hold: float) -> float:
     """The largest V of simulated runs from the boundary, with the input held."""
     parts = found.model, found.policy, found.funnel
     error = np.asarray(found.claim.get("error", np.zeros(found.funnel.n)))
-    run = simulate_held(*parts, hold=hold, error=error, starts=500, rng=np.random.default_rng(5))
+    run = Simulation(*parts).held(hold=hold, error=error, starts=500, rng=np.random.default_rng(5))
     return run.max_v
 
 
@@ -214,14 +214,8 @@ def test_a_hold_of_inputs_that_are_not_affine_is_proved_of_a_function() -> None:
     found = design(ContinuousTracking(squared, nominal, goal=[[25.0]], hold=0.01))
     assert found.claim["hold"] == 0.01
     assert not found.model.squares_inputs
-    ran = simulate_held(
-        field,
-        found.policy,
-        found.funnel,
-        hold=0.01,
-        error=np.zeros(1),
-        starts=200,
-        rng=np.random.default_rng(0),
+    ran = Simulation(field, found.policy, found.funnel).held(
+        hold=0.01, error=np.zeros(1), starts=200, rng=np.random.default_rng(0)
     )
     assert ran.violations == 0
     assert ran.max_v > 0.9

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
+from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import ContinuousTracking, design, plan_motion
@@ -55,13 +55,8 @@ def test_a_friction_that_equations_leave_out_is_measured_and_the_funnel_holds_wi
     problem = ContinuousTracking(pushed, motion, goal=[0.2, 0.3], uncertain=push.box)
     found = design(problem)
     np.testing.assert_array_equal(found.model.uncertain[:2], push.box)
-    simulated = simulate_boundary(
-        TrueDynamics(true_rate),
-        found.policy,
-        found.funnel,
-        starts=200,
-        rng=np.random.default_rng(1),
-        substeps=5,
+    simulated = Simulation(TrueDynamics(true_rate), found.policy, found.funnel).boundary(
+        starts=200, rng=np.random.default_rng(1), substeps=5
     )
     assert simulated.violations == 0
 

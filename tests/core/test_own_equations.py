@@ -13,7 +13,7 @@ from bags.commands.cli import app
 from bags.designs.documents import load
 from bags.pictures.tubes import draw_tube
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
-from benchmarks.thesis.soundness import simulate_boundary
+from benchmarks.thesis.soundness import Simulation
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -54,7 +54,7 @@ def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) ->
     assert check(tmp_path / "funnel.proof.json").margin > 0
     truth = Truth(names["rate"], found, 0)
     rng = np.random.default_rng(0)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=1000, rng=rng, substeps=10)
     assert run.violations == 0
     assert run.max_v > 0.9
 
@@ -80,7 +80,7 @@ def test_a_rocket_lands_at_the_first_try_and_no_start_leaves() -> None:
     assert lines_of(rocket) <= 20
     rng = np.random.default_rng(0)
     truth = Truth(rate, found, 0)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=1000, rng=rng, substeps=10)
     assert run.violations == 0
     assert found.found.proved.pieces.kappa is not None
     assert np.ptp(np.log2(found.found.proved.pieces.kappa), axis=0).max() > 1  # it follows ρ
@@ -93,7 +93,7 @@ def test_a_stiff_arm_gets_the_knots_that_its_springs_need() -> None:
     assert len(found.funnel.t) > len(problem.nominal.t)
     truth = Truth(rate, found, 0)
     rng = np.random.default_rng(0)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=1000, rng=rng, substeps=10)
     assert run.violations == 0
     assert run.max_v > 0.9
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.first_try import Truth, dubins
-from benchmarks.thesis.soundness import simulate_boundary
+from benchmarks.thesis.soundness import Simulation
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design, plan_motion
 from nlsid_core.dynamics import Nominal
@@ -85,13 +85,8 @@ def test_a_motion_with_more_knots_is_the_same_motion() -> None:
 def test_an_airplane_in_half_a_metre_per_second_of_wind_is_proved_at_the_first_try() -> None:
     rate, problem = dubins(0.5)
     found = design(problem)
-    run = simulate_boundary(
-        Truth(rate, found, 3),
-        found.policy,
-        found.funnel,
-        starts=1000,
-        rng=np.random.default_rng(0),
-        substeps=10,
+    run = Simulation(Truth(rate, found, 3), found.policy, found.funnel).boundary(
+        starts=1000, rng=np.random.default_rng(0), substeps=10
     )
     assert run.violations == 0
     assert found.funnel.widths(0.0)[0] > 0.1

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
-from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
+from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
 from nlsid_core.arrays import FloatArray, IntArray
@@ -86,12 +86,12 @@ def test_no_start_leaves_with_the_true_sine_and_with_less_torque_some_do(
 ) -> None:
     truth, rng = TrueDynamics(pendulum.truth), np.random.default_rng(2)
     for knot in (0, 6):
-        run = simulate_boundary(
-            truth, design.policy, design.funnel, starts=3000, rng=rng, knot=knot
+        run = Simulation(truth, design.policy, design.funnel).boundary(
+            starts=3000, rng=rng, knot=knot
         )
         assert run.violations == 0
     weaker = replace(design.policy, limits=np.array([[0, -LIMIT / 2, LIMIT / 2]]))
-    assert simulate_boundary(truth, weaker, design.funnel, starts=500, rng=rng).violations > 0
+    assert Simulation(truth, weaker, design.funnel).boundary(starts=500, rng=rng).violations > 0
 
 
 def test_what_is_proved_in_a_mode_is_what_the_clipped_loop_does(design: FunnelDesign) -> None:
@@ -258,7 +258,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     assert check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(7)
     assert (
-        simulate_boundary(field, found.policy, found.funnel, starts=3000, rng=rng).violations == 0
+        Simulation(field, found.policy, found.funnel).boundary(starts=3000, rng=rng).violations == 0
     )
 
 
@@ -277,7 +277,9 @@ def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
     assert demand(found, 0.0) > 0.6
     assert check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(10)
-    run = simulate_boundary(field, found.policy, found.funnel, starts=2000, rng=rng, adversary=True)
+    run = Simulation(field, found.policy, found.funnel).boundary(
+        starts=2000, rng=rng, adversary=True
+    )
     assert run.violations == 0
 
 
@@ -336,5 +338,5 @@ def test_the_torque_limited_pendulum_covers_most_of_its_best_ellipse() -> None:
     assert 0.1 < everything < 1
     assert 0.8 < ellipse <= 1.02
     truth, rng = TrueDynamics(pendulum.truth), np.random.default_rng(3)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=10_000, rng=rng)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=10_000, rng=rng)
     assert run.violations == 0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
+from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import cart_pole, planar_quadrotor, torque_limited_pendulum
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, nominal_through
@@ -253,7 +253,7 @@ def test_a_funnel_of_taylor_models_holds_for_the_true_dynamics(
     assert any('computed by: "cubic Taylor models' in text for text in verdict.assumptions)
     assert any("w0 in [-1, 1]" in text for text in verdict.assumptions)
     truth, rng = TrueDynamics(swinging_truth), np.random.default_rng(3)
-    run = simulate_boundary(truth, design.policy, design.funnel, starts=3000, rng=rng)
+    run = Simulation(truth, design.policy, design.funnel).boundary(starts=3000, rng=rng)
     assert run.violations == 0
     assert VectorField.from_document(design.model.document()).document() == design.model.document()
     for t in design.funnel.t:
@@ -333,13 +333,8 @@ def test_known_problems_are_proved_and_no_start_of_the_true_dynamics_leaves(
     design = example.designed()
     check(design.save(tmp_path)[-1])
     assert encloses(design.model, example.truth)
-    followed = simulate_boundary(
-        TrueDynamics(example.truth),
-        design.policy,
-        design.funnel,
-        starts=5000,
-        rng=np.random.default_rng(21),
-        substeps=10,
+    followed = Simulation(TrueDynamics(example.truth), design.policy, design.funnel).boundary(
+        starts=5000, rng=np.random.default_rng(21), substeps=10
     )
     assert followed.violations == 0
     assert 0.9 < followed.max_v <= 1

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from bags.commands.cli import app
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
-from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary, smallest_escape
+from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import one_dimensional, pendulum
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import files
@@ -81,11 +81,11 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
     parts = (satellite.model, satellite.policy, satellite.funnel)
     rng = np.random.default_rng(3)
     for knot in (0, 12):
-        run = simulate_boundary(*parts, starts=2000, rng=rng, knot=knot)
+        run = Simulation(*parts).boundary(starts=2000, rng=rng, knot=knot)
         assert run.violations == 0
         assert 0.9 < run.max_v <= 1
-    assert simulate_boundary(*parts, starts=500, rng=rng, scale=1.2).violations == 500
-    assert smallest_escape(*parts, goal_matrix(), starts=300, rng=rng) < 1.4
+    assert Simulation(*parts).boundary(starts=500, rng=rng, scale=1.2).violations == 500
+    assert Simulation(*parts).escape(goal_matrix(), starts=300, rng=rng) < 1.4
 
 
 @pytest.mark.slow
@@ -133,15 +133,11 @@ def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path
     verdict = check(design.save(tmp_path)[-1])
     assert any("w0 in [-0.02, 0.02]" in text for text in verdict.assumptions)
     rng = np.random.default_rng(1)
-    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    run = Simulation(field, design.policy, design.funnel).boundary(starts=2000, rng=rng)
     assert run.violations == 0
-    worse = simulate_boundary(
-        replace(field, uncertain=20 * field.uncertain),
-        design.policy,
-        design.funnel,
-        starts=500,
-        rng=rng,
-    )
+    worse = Simulation(
+        replace(field, uncertain=20 * field.uncertain), design.policy, design.funnel
+    ).boundary(starts=500, rng=rng)
     assert worse.violations > 0
 
 
@@ -185,7 +181,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     for t in design.funnel.t:
         assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
     rng = np.random.default_rng(4)
-    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    run = Simulation(field, design.policy, design.funnel).boundary(starts=2000, rng=rng)
     assert run.violations == 0
     forged = saved(design, tmp_path)
     forged["vector_field.json"]["valid"] = [[0, -0.1, 0.1]]
@@ -205,7 +201,7 @@ def test_a_pendulum_with_its_true_sine_stays_within_its_torque_limits() -> None:
         assert np.abs(inputs).max() <= pendulum.TORQUE
     truth = TrueDynamics(pendulum.truth)
     rng = np.random.default_rng(6)
-    run = simulate_boundary(truth, found.policy, found.funnel, starts=3000, rng=rng)
+    run = Simulation(truth, found.policy, found.funnel).boundary(starts=3000, rng=rng)
     assert run.violations == 0
 
 

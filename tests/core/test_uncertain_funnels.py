@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.soundness import simulate_boundary
+from benchmarks.thesis.soundness import Simulation
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected
@@ -68,14 +68,14 @@ def test_the_worst_w_at_every_instant_breaks_nothing_and_a_larger_one_does(
     for adversary in (False, True):
         rng = np.random.default_rng(8)
         runs.append(
-            simulate_boundary(design.model, *parts, starts=2000, rng=rng, adversary=adversary)
+            Simulation(design.model, *parts).boundary(starts=2000, rng=rng, adversary=adversary)
         )
     assert [run.violations for run in runs] == [0, 0]
     assert runs[0].max_v <= runs[1].max_v
     middle = design.model.uncertain.mean(axis=1, keepdims=True)
     wide = replace(design.model, uncertain=middle + WIDER[kind] * (design.model.uncertain - middle))
     rng = np.random.default_rng(9)
-    run = simulate_boundary(wide, *parts, starts=500, rng=rng, adversary=True)
+    run = Simulation(wide, *parts).boundary(starts=500, rng=rng, adversary=True)
     assert run.violations > 0
 
 

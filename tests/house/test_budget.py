@@ -12,13 +12,13 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_188,
-    ("bags",): 11_916,
+    ("bags",): 11_906,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_794,
-    ("benchmarks", "examples"): 3_801,
+    ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 7, 12  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 1, 12  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
