@@ -31,7 +31,9 @@ from bags.commands.options import (
 )
 from nlsid_core import deciding
 from nlsid_core import second as second_kernel
-from nlsid_core.errors import CertificateRejected, DataError, DocumentError
+from nlsid_core.errors import CertificateRejected, DataError, DocumentError, SolverError
+
+MODELS = 3  # that may be tried before there is one with a tube
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
@@ -321,8 +323,12 @@ def export(
     from nlsid_core.running.c_table import write_table
 
     if table is not None:
-        verdict = write_table(documents.load(folder), table)
-        out.print(f"{verdict}\nwrote {table}", soft_wrap=True, markup=False, highlight=False)
+        out.print(
+            f"{write_table(documents.load(folder), table)}\nwrote {table}",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
         return
 
     found = tolerances.tolerances(folder)
@@ -355,6 +361,9 @@ def learn(
     """
     from bags.chain.config import load_config
     from bags.recordings.folders import expand_bags
+    from bags.setup.proposing import take_next
+    from bags.setup.written import yaml_text
+    from nlsid_core.files import write_atomically
 
     proposal = models_cli.proposed(folder, bags, signals, definitions, robot="robot", yes=True)
     if proposal.doubts:
@@ -362,9 +371,19 @@ def learn(
             f"{proposal.doubts[0]}. Name the signals with -y and -u; or, if they are right, go on "
             f"with nlsid identify {folder}"
         )
-    settings = load_config(folder / CONFIG)
-    models_cli.identify_here(expand_bags(bags), settings, folder)
-    tube(folder, settings)
+    for left in reversed(range(MODELS)):
+        settings = load_config(folder / CONFIG)
+        try:
+            models_cli.identify_here(expand_bags(bags), settings, folder)
+            tube(folder, settings)
+            break
+        except (DataError, SolverError) as refusal:
+            taken = take_next(proposal, refusal) if left else ""
+            if not taken:
+                raise
+            write_atomically(folder / CONFIG, yaml_text(proposal).encode())
+            said = f"no tube of it: {refusal}; the next best is taken: {taken}"
+            out.print(said, soft_wrap=True, markup=False)
     status = decided([folder], deciding.USUAL)
     report(folder)
     out.print(f"next: nlsid monitor {folder} BAG...; nlsid run monitor {folder}", soft_wrap=True)

@@ -78,7 +78,7 @@ def run_init(
         ]
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, yaml_text(proposal).encode())
-    _say(console, proposal, target, bags)
+    _say(console, proposal, target)
     return proposal
 
 
@@ -92,8 +92,8 @@ def _paths(proposal: Proposal, role: str) -> list[str]:
     return [signal["path"] for signal in proposal.content["signals"][role]]
 
 
-def _say(console: Console, proposal: Proposal, target: Path, bags: Sequence[Path]) -> None:
-    """What was chosen and why, what to mind, and which commands come next."""
+def _say(console: Console, proposal: Proposal, target: Path) -> None:
+    """What was chosen and why, and what to mind."""
     for text in (path for role in ROLES for path in _paths(proposal, role)):
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
     if proposal.choice is not None:
@@ -101,8 +101,13 @@ def _say(console: Console, proposal: Proposal, target: Path, bags: Sequence[Path
     for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
-    console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
-    given, folder = said_briefly(bags), shlex.quote(str(target.parent))
+    console.print(f"wrote {target}", soft_wrap=True, markup=False)
+
+
+def say_next(console: Console, target: Path, bags: Sequence[Path]) -> None:
+    """Which commands come next."""
+    console.print("next:")
+    given, folder = said_briefly(bags), shlex.quote(str(target))
     if given == MANY:
         console.print(f"  {MANY} stands for the {len(bags)} bags that you gave to init")
     for step in (
@@ -128,8 +133,11 @@ def tried_table(choice: Choice) -> Table:
     table.add_column("error", justify="right")
     judged = choice.ranked
     for row in judged:
-        style = "bold" if row is choice.best else ""
-        table.add_row(escape(str(row.attempt)), percent(row.percent), style=style)
+        table.add_row(
+            escape(str(row.attempt)),
+            percent(row.percent),
+            style="bold" if row is choice.best else "",
+        )
     for row in (row for row in choice.rows if row not in judged):
         table.add_row(escape(str(row.attempt)), escape(row.refusal), style="dim")
     return table
@@ -139,8 +147,12 @@ def _show_others(console: Console, found: Found, taken: set[str]) -> None:
     """Which other pairs of signals were seen, the likeliest first."""
     others = [pair for pair in found.pairs if not {pair.command.text, pair.response.text} <= taken]
     for pair in others[:SHOWN]:
-        said = f"  {pair.command.text} drives {pair.response.text}: {pair}"
-        console.print(said, soft_wrap=True, markup=False, highlight=False)
+        console.print(
+            f"  {pair.command.text} drives {pair.response.text}: {pair}",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
 
 
 def _confirm(console: Console, question: str) -> None:

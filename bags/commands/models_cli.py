@@ -50,7 +50,10 @@ def init(
     It is tried on the bags, and every key says why it is as it is. What later steps will meet is
     said first. Status 1 if nothing can be identified from these bags.
     """
+    from bags.commands.init import say_next
+
     proposed(folder, bags, signals, definitions, robot=robot, yes=yes)
+    say_next(out, folder, bags)
 
 
 def proposed(

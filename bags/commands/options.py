@@ -217,8 +217,7 @@ def progress_bar(task: str) -> Iterator[Progress]:
 
     started = time.monotonic()
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    console = Console(stderr=True)
-    bar = Bar(*columns, console=console, transient=True)
+    bar = Bar(*columns, console=Console(stderr=True), transient=True)
     identifier = bar.add_task(task, total=1.0)
 
     def show(what: str, fraction: float) -> None:

@@ -500,6 +500,17 @@ def _say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> Non
     )
 
 
+def take_next(proposal: Proposal, refusal: object) -> str:
+    """Take the next best of what was tried, as the best was refused; which, empty if none is."""
+    choice = proposal.choice
+    if choice is None or len(choice.ranked) < 2:
+        return ""
+    left = replace(choice, rows=tuple(row for row in choice.rows if row is not choice.best))
+    _say_model(proposal, left, left.held_out.data)
+    proposal.why["model"] += f"; {choice.best.attempt} has no tube: {refusal}"
+    return str(left.best.attempt)
+
+
 def _say_untried(proposal: Proposal, train: Dataset) -> None:
     """What identification does with the first guess, where nothing could be held out."""
     proposal.why["model"] = "a first guess"

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.signal import lfilter
 
 from bags.chain.config import load_config
+from bags.chain.identification_config import section_of
 from bags.chain.training import decoded
 from bags.commands.init import said_briefly
 from bags.designs import documents
@@ -24,10 +25,14 @@ from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
-from bags.setup.proposing import choose
+from bags.setup.proposal import Proposal
+from bags.setup.proposing import choose, take_next
 from bags.tools.fitness import check_fitness
 from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.identification import Attempt, Choice, LeastSquares, Polynomial
+from nlsid_core.identification.choosing import HeldOut
 from tests.bag_messages import (
     CMD_TYPE,
     COMMAND,
@@ -723,3 +728,21 @@ def test_one_command_goes_from_bags_to_a_checked_design_or_says_what_to_decide(
         "learn", bags, "--out", tmp_path / "b", "-u", "/b:data", "-y", "/a:data", status=None
     )
     assert "are they swapped?" in swapped
+
+
+def test_a_model_without_a_tube_makes_way_for_the_next_best() -> None:
+    rng, trials = np.random.default_rng(0), []
+    for name in "abc":
+        u = np.repeat(rng.standard_normal(60), 5)
+        y = lfilter([0.0, 0.2], [1.0, -0.8], u) + 0.01 * rng.standard_normal(300)
+        trials.append(Trajectory(t=0.1 * np.arange(300), y=y, u=u, name=name))
+    held_out = HeldOut.of(Dataset(tuple(trials)))
+    glances = [held_out.glance(Attempt(Polynomial(lags), LeastSquares())) for lags in (1, 2)]
+    rows = tuple(map(held_out.judged, glances))
+    choice = Choice(held_out, rows)
+    best, other = (row.attempt for row in choice.ranked)
+    proposal = Proposal({"identification": {}}, choice=choice)
+    assert take_next(proposal, "too wide") == str(other)
+    assert proposal.content["identification"] == section_of(other, held_out.data)
+    assert f"{best} has no tube: too wide" in proposal.why["model"]
+    assert not take_next(proposal, "too wide"), "nothing is left"

@@ -12,9 +12,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_188,
-    ("bags",): 11_906,
+    ("bags",): 11_927,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_794,
+    ("tests",): 22_815,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
