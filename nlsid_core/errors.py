@@ -71,6 +71,11 @@ def percent(error: float) -> str:
     return f"{error:.2f} %" if error < 1000.0 else "diverges"
 
 
+def counted(count: int, what: str) -> str:
+    """How many there are of what, as text: 1 trial, 3 trials."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def duration(seconds: float) -> str:
     """A time of processing, in ms below a second."""
     return f"{seconds * 1e3:.0f} ms" if seconds < 1.0 else f"{seconds:.1f} s"

@@ -27,6 +27,7 @@ from bags.commands.options import (
     progress_bar,
     settings_if_any,
 )
+from nlsid_core.errors import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -293,15 +294,11 @@ def _since(row: Row) -> str:
     return f"from {row.numbers['bad_at']:.3f} s on: {row.reason}"
 
 
-def _bags(count: int) -> str:
-    return f"{count} bag" if count == 1 else f"{count} bags"
-
-
 def _say_counts(read: Rows, manifest: Path | None, counts: Sequence[tuple[int, str]]) -> None:
     """How many there are of each verdict, and how many were known from a run before."""
     count, known = len(read.rows), read.known
     said = ", ".join(f"{n} {'copies' if word == 'copy' and n != 1 else word}" for n, word in counts)
-    out.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
+    out.print(f"{counted(count, 'bag')}: {said}", soft_wrap=True, highlight=False)
     if manifest is not None:
         out.print(
             f"{known} of them known from {manifest}, {count - known} asked of now",
@@ -315,7 +312,7 @@ def say_read(found: FleetTrials, manifest: Path) -> None:
     """How many bags are used, and which are not and why."""
     count, left_out = len(found.answers), len(found.left_out)
     out.print(
-        f"{_bags(count)}: {count - left_out} used, {len(found.unread)} not read, "
+        f"{counted(count, 'bag')}: {count - left_out} used, {len(found.unread)} not read, "
         f"{len(found.unusable)} not usable, {len(found.copies)} copies; "
         f"{sum(answer.kept for answer in found.answers)} of them known from {manifest}",
         soft_wrap=True,
@@ -340,7 +337,7 @@ def _plain(text: str) -> str:
 def _say_bags(title: str, said: Mapping[str, str]) -> None:
     """Each of these bags, with what is said of it."""
     if said:
-        out.print(f"{title}: {_bags(len(said))}")
+        out.print(f"{title}: {counted(len(said), 'bag')}")
     for name, reason in list(said.items())[:LISTED]:
         out.print(f"  {_plain(name)}: {_plain(reason)}", soft_wrap=True, highlight=False)
     if len(said) > LISTED:

@@ -25,7 +25,7 @@ from bags.signals.grid import said_restarts
 from bags.signals.sampling import said_filled
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import AnyDesign
-from nlsid_core.errors import DataError, percent
+from nlsid_core.errors import DataError, counted, percent
 from nlsid_core.funnels.tube import Tube
 from nlsid_core.kernel import text
 from nlsid_core.running.comparison import Centre
@@ -59,7 +59,7 @@ def worth(result: Identified) -> str:
     """How well the model simulates, and what is proved of it."""
     error = percent(result.fit.errors["test"][result.fit.method.name])
     return (
-        f"The model simulates {len(result.test)} test trials with an error of {error}. "
+        f"The model simulates {counted(len(result.test), 'test trial')} with an error of {error}. "
         f"{tables.stability_sentence(result.fit.chosen)}"
     )
 
@@ -99,23 +99,27 @@ def promise(design: OutputTubeDesign) -> str:
     scaled = " times sqrt(g), g of the commands," if tube.follows is not None else ""
     widths = zip(design.signals[0], tube.half_widths.tolist(), strict=True)
     stays = " and ".join(
-        f"{signal.name} stays within {text.above(Fraction(width))} {signal.unit}"
+        f"{signal.name} stays within {text.above(Fraction(width))} {signal.unit}".rstrip()
         for signal, width in widths
     )
     lasting = "for ever" if tube.samples is None else f"for {tube.samples} samples"
     measured, count = tube.measured, len(tube.measured.measured_on)
-    trials = f"{count}" if measured.rank == 1 else f"{count + 1 - measured.rank} of {count}"
+    trials = counted(count, "trial")
+    if measured.rank > 1:
+        trials = f"{count + 1 - measured.rank} of {trials}"
     return (
         f"Proved: the measured {stays}{scaled} of the model's simulation, {lasting}. It holds "
         f"while the model's one-step errors are at most {measured.safety_factor:g} times as large "
-        f"as in {trials} trials; the monitor watches that."
+        f"as in {trials}; the monitor watches that."
     )
 
 
 def _plainest(design: OutputTubeDesign) -> Tube:
-    """The tube whose half-widths hold as they stand, and for ever, if there is one."""
-    tubes = design.funnel.tubes
-    return min(tubes, key=lambda tube: (tube.follows is not None, tube.samples or 0))
+    """The tightest of those whose half-widths hold as they stand, and for ever, if there are."""
+    return min(
+        design.funnel.tubes,
+        key=lambda tube: (tube.follows is not None, tube.samples or 0, tube.half_widths.prod()),
+    )
 
 
 def say_tube(console: Console, design: OutputTubeDesign) -> None:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bags.monitoring.catching import Breaking, Catching, Caught
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import duration, percent
+from nlsid_core.errors import counted, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import StateAffineModel
 
@@ -27,7 +27,7 @@ def html(say: Callable[[Console], None]) -> str:
 
 def methods_table(fit: Fit[Model], test: Dataset, uses: Sequence[str] = ("test",)) -> Table:
     """Every method's errors on trials of these uses, time, and whether its model is stable."""
-    table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
+    table = Table(title=f"{fit.model}; {counted(len(test), 'test trial')}", title_justify="left")
     table.collapse_padding = True
     longest = max(len(candidate.method.title) for candidate in fit.candidates)
     table.add_column("method", no_wrap=longest <= 38)  # as long as the rate beside it stays whole
