@@ -92,12 +92,12 @@ def _driven(out: Path, console: Console, shown: Shown) -> bool:
     _step(console, "1  identify a model from recordings", f"identify {out} {bags}")
     result = models_cli.identify_here(shown.bags, settings, out)
     show.say(console, f"{len(result.train)} recordings made it. {show.worth(result)}")
-    show.say(console, "Commands alone tell what will be measured, and none upsets the model.")
+    show.say(console, "It simulates what will be measured from the commands alone.")
 
     _step(console, "2  prove a tube around it", f"funnel {out}")
     design = designs_cli.tube(out, settings)
     show.say(console, show.promise(design))
-    show.say(console, "A robot that leaves the tube is not the robot that was recorded.")
+    show.say(console, "A robot outside the tube does what it did in none of these trials.")
 
     _step(console, "3  check both proofs", f"check {out}")
     for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):

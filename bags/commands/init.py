@@ -23,7 +23,7 @@ from bags.setup.proposal import Proposal
 from bags.setup.proposing import Chosen, choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.reader import expanded
-from nlsid_core.errors import BagError, DataError, percent
+from nlsid_core.errors import BagError, DataError, counted, percent
 from nlsid_core.files import write_atomically
 from nlsid_core.identification import Choice
 
@@ -44,7 +44,7 @@ def run_init(
         raise DataError(f"{target} exists already; give another folder, or remove it")
     folders = expand_bags(bags)
     types = read_definitions(given.definitions)
-    console.print(f"looking into {len(folders)} bag{'s' * (len(folders) != 1)}", soft_wrap=True)
+    console.print(f"looking into {counted(len(folders), 'bag')}", soft_wrap=True)
     found = look(folders, definitions=types)
     with Bag(folders[0], definitions=types) as bag:
         responses, excitations = (

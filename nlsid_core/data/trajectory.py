@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.errors import DataError, ShapeError, counted
 
 ROUNDING = 1e-5  # ns; a mean step this close to whole nanoseconds was not meant to differ from them
 POINTS = 80  # of a line in a notebook
@@ -163,10 +163,13 @@ class Dataset:
             The dataset; its signals are called as the columns.
 
         Raises:
-            DataError: on NaN, and where the rows are not equally far apart in time.
+            DataError: on NaN, where a column is missing, and where the rows are not equally far
+                apart in time.
         """
         trials = []
         for name, table in (frames if isinstance(frames, Mapping) else {"data": frames}).items():
+            if missing := [str(column) for column in (*y, *u) if column not in table]:
+                raise DataError(f"{name}: no column {missing[0]}; there are {list(table.columns)}")
             t = table.index.to_numpy()
             if t.dtype.kind == "M":
                 t = (t - t[0]) / np.timedelta64(1, "s")
@@ -185,7 +188,7 @@ class Dataset:
     def __repr__(self) -> str:
         first = self.trajectories[0]
         return (
-            f"<Dataset: {len(self)} trial{'s' * (len(self) > 1)}, {sum(map(len, self))} samples of "
+            f"<Dataset: {counted(len(self), 'trial')}, {sum(map(len, self))} samples of "
             f"{self.period:g} s, {', '.join(first.u_names)} -> {', '.join(first.y_names)}>"
         )
 

@@ -85,14 +85,15 @@ class Validation:
         return 100.0 - self.simulation_percent
 
     def __str__(self) -> str:
-        predicted = [
-            f"prediction error, one step ahead: {self.one_step_percent or 0.0:.2f} %",
-            f"one-step residual is {self.one_step}",
-        ]
         if self.one_step_percent is None:
             predicted = [
                 "prediction error: -, as this class of models predicts what it simulates: it "
                 "learns nothing from outputs after the start"
+            ]
+        else:
+            predicted = [
+                f"prediction error, one step ahead: {self.one_step_percent:.2f} %",
+                f"one-step residual is {self.one_step}",
             ]
         lines = [
             f"simulation error {self.simulation_percent:.2f} % (fit {self.fit_percent:.2f} %) "
@@ -277,7 +278,10 @@ def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
     They are right where the simulation's errors are white; `validate` says whether they are.
     J = ∂ŷ/∂(a, b, c) is the row of the equation through the filter 1/(1 - Σ a_k z⁻ᵏ), and the
     covariance σ² (J'J)⁻¹. Source: Ljung, System Identification, Section 9.3, of an output error.
+    Raises DataError for another class of models, and where the data do not determine all of them.
     """
+    if not isinstance(model, DifferenceEquation):
+        raise DataError("standard errors are those of a linear model of one output and one input")
     n = len(model)
     parts = []
     for trial in data:
@@ -288,5 +292,7 @@ def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
         moved = lfilter([1.0], np.append(1.0, -model.a), rows, axis=0)
         parts.append(np.column_stack([moved, (trial.y[:, 0] - simulated)[n:]]))
     J, e = np.split(np.concatenate(parts), [-1], axis=1)
+    if np.linalg.matrix_rank(J) < J.shape[1]:
+        raise DataError("the inputs of these trials do not determine all numbers of the model")
     covariance = np.linalg.inv(J.T @ J) * np.sum(e**2) / (len(e) - J.shape[1])
     return np.asarray(np.sqrt(np.diag(covariance)))

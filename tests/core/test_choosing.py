@@ -80,8 +80,11 @@ def test_the_simplest_that_is_as_good_as_the_best_is_taken(
 
 def test_repeats_of_an_excitation_stay_together_and_others_make_the_promise() -> None:
     """A linear model of a gain that falls: other amplitudes are what it is worst at."""
-    sizes = (0.4, 0.8, 1.2)
-    runs = [replace(trial(9, size=s, bend=0.1), name=f"{s} {k}") for s in sizes for k in range(3)]
+    runs = [
+        replace(trial(9, size=size, bend=0.1), name=f"{size} {k}")
+        for size in (0.4, 0.8, 1.2)
+        for k in range(3)
+    ]
     choice = judged(Dataset(tuple(runs)), [Attempt(Polynomial(2), Rse(6))])
     assert choice.held_out.on == "excitations"
     for fold in choice.held_out.folds:

@@ -39,12 +39,16 @@ def test_data_frames_are_trials(train: Dataset) -> None:
         np.testing.assert_array_equal(np.hstack([one.y, one.u]), np.hstack([other.y, other.u]))
     with pytest.raises(DataError, match=r"DataFrame.*from_pandas"):
         identify(tables["run_0"], Polynomial(2))
+    with pytest.raises(DataError, match=r"run_0: no column effort; there are \['speed'"):
+        Dataset.from_pandas(tables, y=["speed"], u=["effort"])
 
 
 def test_a_trials_own_columns_are_simulated(train: Dataset, fit: Fit[DifferenceEquation]) -> None:
     trial = train.trajectories[0]
-    outputs = fit.model.simulate(trial.u, trial.y[:2])
-    np.testing.assert_array_equal(outputs, fit.model.simulate(trial.u[:, 0], trial.y[:2, 0]))
+    np.testing.assert_array_equal(
+        fit.model.simulate(trial.u, trial.y[:2]),
+        fit.model.simulate(trial.u[:, 0], trial.y[:2, 0]),
+    )
     with pytest.raises(ShapeError, match=r"\(80,\), \(3,\)"):
         fit.model.simulate(trial.u, trial.y[:3])
 
@@ -82,5 +86,8 @@ def test_standard_errors_are_those_of_the_differences(
     J = np.array(rows).T / (2.0 * step)
     errors = np.concatenate([t.y[2:, 0] for t in train]) - simulated(given)
     covariance = np.linalg.inv(J.T @ J) * (errors @ errors) / (len(errors) - 6)
-    found = standard_errors(model, train)
-    np.testing.assert_allclose(found, np.sqrt(np.diag(covariance)), rtol=1e-3)
+    expected = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(standard_errors(model, train), expected, rtol=1e-3)
+    still = Dataset(tuple(replace(trial, u=0.0 * trial.u) for trial in train))
+    with pytest.raises(DataError, match="do not determine"):
+        standard_errors(model, still)

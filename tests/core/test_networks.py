@@ -128,8 +128,8 @@ def test_the_network_simulates_what_was_fitted(name: str) -> None:
     """From the state that it begins with, recorded signals having other units."""
     signals, theta, one = example(name)
     y = signals.run(theta, one)[signals.output]
-    n_u = signals.inputs
-    scaled = Scaled((3.0, 2.0), (np.full(n_u, 1.0), np.full(n_u, 0.5)), (one,))
+    ones = np.ones(signals.inputs)
+    scaled = Scaled((3.0, 2.0), (ones, 0.5 * ones), (one,))
     u, recorded = 1.0 + 0.5 * one.u, (3.0 + 2.0 * y)[:, None]
     train = Dataset((Trajectory(t=np.arange(60.0), y=recorded, u=u),))
     model = network_of(signals, Minimum(1e-3, theta, (one,)), scaled, train, 20)
@@ -183,8 +183,7 @@ def rms(model: Any, data: Dataset, skipped: int = 60) -> float:
 
 @pytest.mark.slow
 def test_a_cascade_is_found_to_the_noise_and_proved() -> None:
-    train = Dataset((recording(2500, 0), recording(1500, 1)))
-    found = identify(train, CASCADE, transient=60)
+    found = identify(Dataset((recording(2500, 0), recording(1500, 1))), CASCADE, transient=60)
     assert rms(found.model, Dataset((recording(1500, 9, noise=0.0),))) < 0.002
     assert found.history.steps[-1].value == pytest.approx(0.002, rel=0.15)
 
@@ -220,8 +219,9 @@ def sliding(seed: int, samples: int = 1200) -> Dataset:
         free = 0.95 * v + 0.05 * force
         v = free - min(max(free, -0.06), 0.05)
     measured = np.array(y) + 0.002 * rng.standard_normal(samples)
-    t = 0.01 * np.arange(samples)
-    return Dataset((Trajectory(t=t, y=measured, u=u, name=f"slide {seed}"),))
+    return Dataset(
+        (Trajectory(t=0.01 * np.arange(samples), y=measured, u=u, name=f"slide {seed}"),)
+    )
 
 
 def test_a_slide_that_comes_to_rest_in_dry_friction_is_found_and_proved() -> None:
@@ -246,8 +246,9 @@ def servo(seed: int, samples: int = 1500) -> Dataset:
         v = 0.6 * v + 0.4 * np.clip(0.15 * (u[max(k - 3, 0)] - x), -0.02, 0.02)
         x += v
     measured = np.array(y) + 0.003 * rng.standard_normal(samples)
-    t = 0.02 * np.arange(samples)
-    return Dataset((Trajectory(t=t, y=measured, u=u, name=f"servo {seed}"),))
+    return Dataset(
+        (Trajectory(t=0.02 * np.arange(samples), y=measured, u=u, name=f"servo {seed}"),)
+    )
 
 
 def test_a_servo_with_a_limit_of_speed_is_found_and_proved() -> None:

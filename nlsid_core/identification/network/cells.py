@@ -163,8 +163,10 @@ def cells_in_a_row(
         refined.append((finer, last))
         steps.append(Step(f"{made.intervals} intervals", scaled.y[1] * last.rms))
     row, best = min(refined, key=lambda entry: entry[1].rms)
-    model = network_of(row.built[0], best, scaled, train, model_class.start_samples)
-    return model, tuple(steps)
+    return (
+        network_of(row.built[0], best, scaled, train, model_class.start_samples),
+        tuple(steps),
+    )
 
 
 def _filtered(u: FloatArray, poles: Sequence[float]) -> list[FloatArray]:

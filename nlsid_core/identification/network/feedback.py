@@ -17,7 +17,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import DataError, Infeasible, counted
 from nlsid_core.identification.fit import Proof, Step
 from nlsid_core.identification.network.fit import (
     MAX_RADIUS,
@@ -198,11 +198,13 @@ def feedback_unrolled(
         further = theta[-len(further) :]
         every = _stages(layout, maps, loop.trials, slowest)
         error = every.mean_square(theta) ** 0.5
-        steps.append(Step(f"{maps} map{'s' * (maps > 1)}", scaled.y[1] * error))
+        steps.append(Step(counted(maps, "map"), scaled.y[1] * error))
         task.progress(steps[-1].what, 0.2 + 0.8 * maps / made.stages)
     found = Minimum(error, theta, tuple(every.trials))
-    model = network_of(every.signals, found, scaled, train, model_class.start_samples)
-    return model, tuple(steps)
+    return (
+        network_of(every.signals, found, scaled, train, model_class.start_samples),
+        tuple(steps),
+    )
 
 
 def _stages(layout: Layout, maps: int, trials: Sequence[Trial], radius: float) -> Problem:

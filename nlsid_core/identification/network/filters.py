@@ -185,8 +185,9 @@ def _best_start(
         for _ in range(made.starts)
     ]
     screened.sort(key=lambda found: found[1].rms)
-    kept = screened[:KEPT_STARTS]
-    finished = [_minimised(start, part, radius, steps=START_STEPS) for start, _ in kept]
+    finished = [
+        _minimised(start, part, radius, steps=START_STEPS) for start, _ in screened[:KEPT_STARTS]
+    ]
     return min(finished, key=lambda found: found[1].rms)[0]
 
 

@@ -138,13 +138,16 @@ def follower(
     refined = []
     for loop, found in sorted(tried, key=lambda entry: entry[1].rms)[:KEPT]:
         begun = [replace(t, start=loop.errors(found.parameters, t)[:2]) for t in trials]
-        most = task.wanted("sem_certified").iterations
-        last = loop.fitted(found.parameters, begun, slowest, most)
+        last = loop.fitted(
+            found.parameters, begun, slowest, task.wanted("sem_certified").iterations
+        )
         refined.append((loop, last))
         steps.append(Step("of all samples", scaled.y[1] * last.rms))
     loop, best = min(refined, key=lambda entry: entry[1].rms)
-    model = network_of(loop.signals, best, scaled, train, model_class.start_samples)
-    return model, tuple(steps)
+    return (
+        network_of(loop.signals, best, scaled, train, model_class.start_samples),
+        tuple(steps),
+    )
 
 
 def _start(

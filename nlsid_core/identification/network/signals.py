@@ -150,7 +150,7 @@ class Signals:
                     forcing += passed(part.weights(theta), sources[part.source], trial)
             A = self.own_filter(number, theta)
             if own := self.own_maps(number):
-                sources.append(_looped(A, own[0], theta, forcing, start))
+                sources.append(_looped(A, own, theta, forcing, start))
             else:
                 sources.append(_filtered(A, forcing, start, trial))
         return sources
@@ -232,13 +232,13 @@ def _filtered(A: FloatArray, forcing: FloatArray, start: FloatArray, trial: Tria
 
 def _looped(
     A: FloatArray,
-    own: tuple[Taps, Mapped],
+    own: list[tuple[Taps, Mapped]],
     theta: FloatArray,
     forcing: FloatArray,
     start: FloatArray,
 ) -> FloatArray:
-    """(N,): sample by sample, held at DIVERGED where it grows beyond all measure."""
-    part, one = own
+    """(N,) through its one map, held at DIVERGED where it grows beyond all measure."""
+    [(part, one)] = own
     f = as_piecewise_linear(one.function, theta[one.at])
     inner, slopes = f.knots[1:-1].tolist(), f.slopes.tolist()
     levels = (f.values[:-1] - f.slopes * f.knots[:-1]).tolist()

@@ -5,7 +5,8 @@ The kernel's own reading of the model file is the lowering: it gives F and the v
 and the search here finds P and N. Without E (a linear model), or with a single vertex, P solves a
 Lyapunov equation and N completes the square. Else P and N are found by one semidefinite program a
 rate: at a slow rate first, where a box whose vertices are too coarse is split, then 1 - r is raised
-and bisected. The kernel decides the result. Source: docs/certificate_stability.md.
+and bisected. A network is proved loop by loop, and weights join the loops. The kernel decides the
+result. Source: docs/certificate_stability.md.
 """
 
 import warnings
@@ -203,8 +204,7 @@ def _by_layers(
             if found is None:
                 return None
         alone.append(found)
-        own = _slower(A[np.ix_(x, x)]) if found is None else found.rate
-        rate = max(rate, own)
+        rate = max(rate, _slower(A[np.ix_(x, x)]) if found is None else found.rate)
     if not 0.0 < rate < 1.0 - SLOWEST:
         return None
     P, N, weight, least = np.zeros_like(A), np.zeros((m + len(A), m)), 1.0, np.inf
