@@ -26,7 +26,7 @@ def changes_in(found: FunnelDesign, rho: Any) -> Changes:
     """dũ/dt in the funnel of a design, or one with other ρ."""
     funnel = ContinuousFunnel(found.funnel.x, found.funnel.P, rho, "", "")
     steps = LSteps(found.model, found.policy, widths=np.zeros((len(funnel.t) - 1, 1)))
-    return Changes.of(steps, found.policy, funnel)
+    return Changes.of(steps, funnel)
 
 
 def test_rates_in_a_smaller_funnel_follow_from_those_in_a_larger(held: FunnelDesign) -> None:
