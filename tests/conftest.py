@@ -14,10 +14,9 @@ import pytest
 from typer.main import get_command
 
 from bags.designs.documents import MODEL, MODEL_PROOF
+from nlsid import Dataset, Fit, OutputTube, Polynomial, Trajectory, identify
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
-from nlsid_core.identification import Fit, Polynomial, identify
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.models import DifferenceEquation
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.

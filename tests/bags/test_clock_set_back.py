@@ -9,17 +9,13 @@ import pytest
 from bags.monitoring.replay import replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.signals.grid import read_dataset
 from bags.signals.reader import read_signals
-from bags.signals.sampling import Grid
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.designs import AnyDesign, Design
+from nlsid import Dataset, Design, Fit, Grid, OutputTube, Status, read_bags
+from nlsid_core.design import design_output_tube
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError
-from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -51,7 +47,7 @@ def bag(tmp_path: Path) -> Path:
 
 def test_identification_refuses_it_as_it_does_header_stamps(bag: Path) -> None:
     with pytest.raises(BagError) as caught:
-        read_dataset(
+        read_bags(
             [bag], responses=[SPEED], excitations=[COMMAND], grid=Grid(max_gap=0.3, clock="log")
         )
     assert f"time goes back by 1.9 s at message {SET_AT}: log time 1700000003.900" in str(

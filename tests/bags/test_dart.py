@@ -13,10 +13,9 @@ from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.samples import dart, dart_tables
 from bags.signals.reader import bag_origin, read_signals
+from nlsid import Status, check
 from nlsid_core.progress import silent
-from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 
 SOURCE = Path(__file__).parents[2].parent / "shared" / "data" / "dart"
 needs_source = pytest.mark.skipif(not SOURCE.is_dir(), reason="needs ../shared/data")

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.signals.grid import read_dataset, to_trajectories
+from bags.signals.grid import to_trajectories
 from bags.signals.reader import Samples, bag_digest
-from bags.signals.sampling import Grid
 from bags.signals.timing import seconds
-from nlsid_core.data.trajectory import Trajectory
+from nlsid import Grid, Trajectory, read_bags
 from nlsid_core.errors import DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 
@@ -217,7 +216,7 @@ def test_a_dataset_carries_names_groups_digests_and_reports_progress(tmp_path: P
     ]
     bags.append(speed_bag(tmp_path / "single", [0.0, 0.1], [0.0, 0.1]))
     seen: list[tuple[str, float]] = []
-    dataset = read_dataset(
+    dataset = read_bags(
         [bags[0], bags[1] / "trial_1.mcap", bags[2]],
         responses=[SPEED],
         excitations=[COMMAND],
@@ -233,9 +232,9 @@ def test_a_dataset_carries_names_groups_digests_and_reports_progress(tmp_path: P
 def test_two_bags_of_one_name_are_refused(tmp_path: Path) -> None:
     bags = [speed_bag(tmp_path / day / "trial", [0.0, 0.1], [0.0, 0.1]) for day in ("mon", "tue")]
     with pytest.raises(DataError, match="two bags are called 'trial'"):
-        read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
+        read_bags(bags, responses=[SPEED], excitations=[COMMAND])
     named = {bag.parent.name: bag for bag in bags}
-    data = read_dataset(named, responses=[SPEED], excitations=[COMMAND])
+    data = read_bags(named, responses=[SPEED], excitations=[COMMAND])
     assert data.names == ("mon", "tue")
 
 
@@ -246,9 +245,9 @@ def test_trials_of_different_sample_times_are_refused(tmp_path: Path) -> None:
         speed_bag(tmp_path / "slow", [0.0, 0.1, 0.2], [0.0, 0.1, 0.2], stamps_ns=slow),
     ]
     with pytest.raises(DataError, match=r"slow: sample time 0\.05 s, but fast has 0\.025 s"):
-        read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
+        read_bags(bags, responses=[SPEED], excitations=[COMMAND])
     with pytest.raises(DataError, match=r"slow: /odom.*is sampled every 0\.05 s"):
-        read_dataset(bags, responses=[SPEED], excitations=[COMMAND], grid=Grid(0.025))
+        read_bags(bags, responses=[SPEED], excitations=[COMMAND], grid=Grid(0.025))
 
 
 @pytest.mark.parametrize(

@@ -10,18 +10,14 @@ import pytest
 
 from bags.monitoring.replay import replay_messages
 from bags.recordings.writer import BagWriter
-from bags.signals.grid import read_dataset
 from bags.signals.publishers import two_curves
-from bags.signals.sampling import Grid
 from bags.tools.fitness import Level, check_fitness
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.designs import AnyDesign, Design
+from nlsid import Dataset, Design, Fit, Grid, OutputTube, Status, read_bags
+from nlsid_core.design import design_output_tube
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError
-from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -114,7 +110,7 @@ def test_a_signal_of_two_publishers_is_unknown_bad_and_refused(
     assert any(f.check == "publishers" for f in fitness.findings)
 
     with pytest.raises(BagError, match="several publishers"):
-        read_dataset(
+        read_bags(
             [bag],
             responses=[SPEED],
             excitations=[COMMAND],

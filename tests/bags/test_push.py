@@ -9,12 +9,10 @@ import pytest
 
 from bags.chain.joint_bags import write_joint_bag
 from bags.monitoring.catching import breaking
+from nlsid import Dataset, Goal, Trajectory, VectorField, check, plan_motion
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import Goal, plan_motion
-from nlsid_core.dynamics import MeasuredPush, VectorField, measured_push
+from nlsid_core.dynamics import MeasuredPush, measured_push
 from nlsid_core.errors import DocumentError
-from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.verbs import nlsid
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid import Dataset, Degrees, Polynomial, Trajectory
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.polynomial.moment_rie import identify_from_repeats
 from nlsid_core.identification.polynomial.moments import offsets_of, repeated_moments
 from nlsid_core.identification.repeats import compare_repeats

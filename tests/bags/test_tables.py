@@ -15,9 +15,8 @@ from bags.commands.cli import app
 from bags.monitoring.replay import Replay
 from bags.pictures import tables
 from bags.tools.fitness import LEAST_OVERLAP
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Degrees, Polynomial, Rse, Sem, identify
-from nlsid_core.running.reading import Reading, Status
+from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Status, Trajectory, identify
+from nlsid_core.running.reading import Reading
 from tests.bag_messages import COMMAND, SPEED, speed_bag
 
 

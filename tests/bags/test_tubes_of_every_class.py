@@ -16,12 +16,10 @@ from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.monitoring.watch import Watch
 from bags.signals.sampling import LOST
-from nlsid_core.data.trajectory import Trajectory
+from nlsid import Status, Trajectory, check
 from nlsid_core.designs import AnyDesign
 from nlsid_core.progress import silent
-from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from tests.identified_bags import (
     FUNNEL,
     ONE,

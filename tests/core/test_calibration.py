@@ -8,15 +8,14 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.stats import binomtest
 
 from bags.designs.provenance import of_funnel
+from nlsid import Dataset, Fit, OutputTube
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials, windows
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.tube import Tube
-from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation
 from tests.conftest import synthetic_dataset
 

@@ -7,26 +7,21 @@ from typing import Any
 
 import pytest
 
-from bags.designs.documents import load
-from nlsid_core import documents, files
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import (
+from nlsid import (
     ContinuousTracking,
+    Dataset,
+    Design,
+    Fit,
     OutputTube,
-    OutputTubeDesign,
     SampledTracking,
+    check,
     design,
     integrate_nominal,
+    load,
 )
-from nlsid_core.designs import (
-    COMPOSITION,
-    FUNNEL,
-    MODEL,
-    POLICY,
-    PROOF,
-    AnyDesign,
-    Design,
-)
+from nlsid_core import documents, files
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.designs import COMPOSITION, FUNNEL, MODEL, POLICY, PROOF, AnyDesign
 from nlsid_core.errors import (
     CertificateMismatch,
     CertificateRejected,
@@ -34,9 +29,7 @@ from nlsid_core.errors import (
     DocumentError,
     OptionError,
 )
-from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.proofs import check
 from tests.tracked import assumption, designed, tracked
 
 PROFILE = ((0.0, 0.0), (7.0, 0.5))

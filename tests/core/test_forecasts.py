@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nlsid import Monitor, Status
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError
@@ -16,8 +17,6 @@ from nlsid_core.funnels.level import LevelMeter
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.forecast import Forecast, linear_form, reach
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
 from tests.core.kernel.tube_claims import HIGH, LONG, LOW, MODELS, design

@@ -11,20 +11,10 @@ from bags.chain.shipped import config_file
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.pictures.report import page
-from bags.samples import f1tenth
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid import Dataset, LeastSquares, Polynomial, Rse, Sem, Trajectory, check, f1tenth, identify
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification import (
-    LeastSquares,
-    Method,
-    Polynomial,
-    Rse,
-    Sem,
-    identify,
-    validate,
-)
+from nlsid_core.identification import Method, validate
 from nlsid_core.models import DifferenceEquation, StateAffineModel
-from nlsid_core.proofs import check
 from tests.conftest import TRUE_A, synthetic_dataset
 
 STATE_AFFINE = {

@@ -15,6 +15,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataErro
 from nlsid_core.identification.proofs.stable_sets import prove_implicit
 from nlsid_core.models import ImplicitModel
 from nlsid_core.proofs import check, proof_document
+from tests.decided import decided
 from tests.implicit_models import coupled, cubic_spring, lagged, linear, quintic
 
 DELTA = 0.1
@@ -148,7 +149,7 @@ def test_a_forgery_of_any_set_is_rejected(
     model, proof = map(copied, made[name])
     change(model, proof)
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -158,7 +159,7 @@ def test_a_proof_of_another_model_is_a_mismatch(
     model, proof = map(copied, made[name])
     model["h"]["coefficients"][0][0] = float(np.nextafter(model["h"]["coefficients"][0][0], 9.0))
     with pytest.raises(CertificateMismatch):
-        check(write(tmp_path, model, proof, rebound=False))
+        decided(write(tmp_path, model, proof, rebound=False))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
@@ -173,10 +174,10 @@ def test_a_local_proof_is_about_its_own_box(
     else:
         proof["claim"]["box"] = [[-100.0, 100.0] for _ in proof["claim"]["box"]]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
     del proof["claim"]["box"]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
@@ -187,7 +188,7 @@ def test_a_multiplier_of_the_wrong_size_or_place_is_rejected(
         model, proof = map(copied, made[name])
         change(proof["proof"]["inequalities"]["stable"]["multipliers"])
         with pytest.raises(CertificateRejected):
-            check(write(tmp_path, model, proof))
+            decided(write(tmp_path, model, proof))
 
 
 def _shrunk(multipliers: list[Json]) -> None:
@@ -219,7 +220,7 @@ def test_a_storage_that_is_not_positive_is_rejected(
         for entry in [entry for row in proof["proof"]["M"] for entry in row]:
             entry["coefficients"] = [-c for c in entry["coefficients"]]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @settings(deadline=None, max_examples=10)
@@ -270,4 +271,4 @@ def test_a_document_that_would_take_forever_is_refused(
     model, proof = map(copied, made["derivatives, 2.11"])
     change(model, proof)
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nlsid import Monitor, Status
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.levels import candidates, followed
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.level import CHANGE, VALUE, CommandLevel, LevelMeter, Term
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 from tests.core.kernel.tube_claims import MODELS, dataset, design
 from tests.marks import slow_among

@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nlsid import Dataset, Fit, Polynomial, Trajectory, check, identify
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError
-from nlsid_core.identification import Fit, Polynomial, identify
 from nlsid_core.models import ImplicitModel
-from nlsid_core.proofs import check
 
 A = np.array([[0.9, 0.2], [-0.2, 0.7]])
 B = np.array([[1.0], [0.5]])

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import Infeasible, OptionError
-from nlsid_core.identification import (
+from nlsid import (
+    Dataset,
     Degrees,
     Fit,
     LeastSquares,
@@ -18,8 +16,11 @@ from nlsid_core.identification import (
     Rie,
     Rse,
     Sem,
+    Trajectory,
     identify,
 )
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import Infeasible, OptionError
 from nlsid_core.identification.rates import rate_of_memory, searched_rate
 from nlsid_core.models import DifferenceEquation
 from tests.marks import slow_among

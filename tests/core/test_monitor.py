@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid import Dataset, Monitor, OutputTube, Status
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.funnels.tube import Tube
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading
 from nlsid_core.running.stage import Stage
 from tests.conftest import PERIOD
 

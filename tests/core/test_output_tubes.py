@@ -11,18 +11,17 @@ import pytest
 from scipy.stats import binomtest
 
 from bags.designs.provenance import of_funnel
+from nlsid import Dataset, Monitor, OutputTube, Status, Trajectory
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.design import design_output_tube
 from nlsid_core.design.tube import calibrated, energy, innovations
 from nlsid_core.design.tube_program import finsler
 from nlsid_core.errors import CertificateMismatch, DataError, OptionError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification.prediction import history, simulate_trial
 from nlsid_core.models import BlockCascade, DifferenceEquation
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading
 from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
 from nlsid_core.running.tubes import BEYOND, WATCHED

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid import Dataset, Monitor, Status, Trajectory
 from nlsid_core.design.sampled.design import assume
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.reading import Level, Reading
 from nlsid_core.running.stage import Stage
 from tests.tracked import PERIOD, designed, run, tracked
 

@@ -40,6 +40,7 @@ from nlsid_core.kernel.files import Rejected
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.proofs import check
 from tests import funnel_problem
+from tests.decided import decided
 from tests.funnel_files import saved, write
 
 
@@ -186,11 +187,11 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     forged = saved(design, tmp_path)
     forged["vector_field.json"]["valid"] = [[0, -0.1, 0.1]]
     with pytest.raises(CertificateRejected, match="where its dynamics are valid"):
-        check(write(forged, tmp_path))
+        decided(write(forged, tmp_path))
     forged = saved(design, tmp_path)
     forged["funnel.proof.json"]["proof"]["kappa"][1][1] = -1.0
     with pytest.raises(CertificateRejected, match="kappa should be positive"):
-        check(write(forged, tmp_path))
+        decided(write(forged, tmp_path))
 
 
 @pytest.mark.slow
