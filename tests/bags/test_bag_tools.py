@@ -108,7 +108,6 @@ def test_bag_tools_need_no_solver_and_what_does_says_which_extra(bag: Path, tmp_
     copy = tmp_path / "copy"
     verbs: dict[int, list[tuple[object, ...]]] = {
         0: [
-            ("bag", "info", bag),
             ("bag", "check", bag, "-u", COMMAND, "-y", SPEED),
             ("bag", "convert", bag, "--out", copy),
         ],

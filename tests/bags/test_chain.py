@@ -478,10 +478,10 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
     "verb",
     [
         ("monitor", "DIR", "BAG"),
-        ("check", "DIR"),
-        ("bag", "info", "BAG"),
+        pytest.param(("check", "DIR"), marks=pytest.mark.slow),
+        pytest.param(("bag", "info", "BAG"), marks=pytest.mark.slow),
         ("bag", "signals", "BAG", "--json"),
-        ("fleet", "monitor", "DIR", "BAG"),
+        pytest.param(("fleet", "monitor", "DIR", "BAG"), marks=pytest.mark.slow),
     ],
 )
 def test_the_status_is_the_same_where_nobody_reads_what_is_said(

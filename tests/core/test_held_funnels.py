@@ -163,6 +163,7 @@ def test_errors_of_0_are_none() -> None:
     assert (found.funnel.rho == design(tracking()).funnel.rho).all()
 
 
+@pytest.mark.slow
 def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
     def rate(x: Any, u: Any) -> Any:
         return [x[1], 5 * x[0] + u[0]]

@@ -174,6 +174,7 @@ def test_rates_bound_what_samples_show_and_not_by_much(rate: Any) -> None:
     assert (bound <= 1.2 * fastest).all()
 
 
+@pytest.mark.slow
 def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

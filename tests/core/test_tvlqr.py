@@ -81,7 +81,7 @@ def test_the_cost_to_go_is_what_it_costs_and_no_other_gain_is_cheaper() -> None:
 
 def test_the_recursion_tends_to_the_differential_equation() -> None:
     gaps = []
-    for knots in (201, 401):
+    for knots in (51, 101):
         field, nominal = driven(knots)
         continuous = tvlqr(field, nominal, Q=Q, R=R, S_final=np.eye(2)).S
         h = 1 / (knots - 1)
