@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, f1tenth, identify, read_bags
+from bags.samples import f1tenth
+from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, identify, read_bags
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.c_table import c_table, write_table

@@ -21,8 +21,9 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
 from bags.designs import documents
+from bags.samples import f1tenth
 from benchmarks.verified import generator, mutated
-from nlsid import design, f1tenth
+from nlsid import design
 from nlsid_core import files as saved
 from nlsid_core import kernel, proofs, second
 from nlsid_core.errors import CertificateRejected
