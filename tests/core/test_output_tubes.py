@@ -2,7 +2,6 @@
 
 import re
 import sys
-import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -163,26 +162,12 @@ def test_a_run_that_starts_at_a_wrong_measurement_is_inside_or_breaks_the_assump
 
 
 @pytest.mark.slow
-def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
-    monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
-    run(monitor, trial)
-    tracemalloc.start()
-    before = tracemalloc.get_traced_memory()[0]
-    for lap in range(1, 6):
-        readings = run(monitor, replace(trial, t=trial.t + lap * 25.0))
-        assert all(r.status is not Status.UNKNOWN for r in readings)
-    grown = tracemalloc.get_traced_memory()[0] - before - 1_000_000
-    tracemalloc.stop()
-    assert grown < 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear", "following"])
-def test_two_hundred_thousand_samples_take_no_more_memory_at_the_end(name: str) -> None:
+def test_nothing_ends_a_run_and_forty_thousand_samples_take_no_more_memory(name: str) -> None:
     monitor, trial = monitor_of(name), trial_of(name, 1000)
     rows = list(zip(trial.t.tolist(), trial.y, trial.u, strict=True))
-    blocks = np.zeros(200)
-    for lap in range(200):
+    blocks = np.zeros(40)
+    for lap in range(40):
         for t, y, u in rows:
             assert monitor.update(t + lap * 25.0, y, u).status is not Status.UNKNOWN or lap == 0
         blocks[lap] = sys.getallocatedblocks()
