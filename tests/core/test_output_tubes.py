@@ -3,7 +3,6 @@
 import re
 import sys
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design import design_output_tube
 from nlsid_core.design.tube import calibrated, energy, innovations
 from nlsid_core.design.tube_program import finsler
-from nlsid_core.errors import CertificateMismatch, DataError, OptionError
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import history, simulate_trial
 from nlsid_core.models import BlockCascade, DifferenceEquation
 from nlsid_core.running.reading import Reading
@@ -330,17 +328,6 @@ def test_an_energy_is_over_and_the_fading_tube_lasts() -> None:
     assert "covers 40 samples" in readings[43].reason
 
 
-def test_a_funnel_of_another_model_is_refused() -> None:
-    with pytest.raises(CertificateMismatch, match="another model"):
-        Monitor([Stage(MODELS["monotone"](), None, design("linear").funnel)])
-
-
-def test_a_funnel_reads_back_as_it_was_written() -> None:
-    for name in ("two_outputs", "implicit_box"):
-        funnel = design(name).funnel
-        assert TubeFunnel.from_document(funnel.document()).document() == funnel.document()
-
-
 # -- design ----------------------------------------------------------------------------------
 
 
@@ -380,16 +367,6 @@ def test_a_next_trial_sets_off_any_alarm_as_rarely_as_the_rank_bound_says(
     low, _ = binomtest(alarmed, splits).proportion_ci(0.95)
     assert low <= rank / 10
     assert alarmed, "a bound that nothing comes near would be met by levels that are never reached"
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"safety_factor": 0.5}, {"reaction_time": 0.0}, {"horizon": -1.0}, {"false_alarms": 0.0}],
-)
-def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None:
-    model = MODELS["linear"]()
-    with pytest.raises(OptionError):
-        OutputTube(model, Dataset(dataset(model, 0, 2).trajectories), **options)
 
 
 @pytest.mark.slow
