@@ -154,7 +154,7 @@ class Node:
 
     def integers(self, least: int, most: int) -> list[int]:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
-        if type(self.value) is not list or any(type(entry) is not int for entry in self.value):
+        if type(self.value) is not list or not {int}.issuperset(map(type, self.value)):
             return [entry.integer() for entry in self.items(least, most)]
         if not least <= len(self.value) <= most:
             raise Rejected(f"{self.where} should be a list of {least} to {most} entries")

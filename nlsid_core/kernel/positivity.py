@@ -10,11 +10,12 @@ is left on the diagonal: c > 0 if something is left for the monomial 1. docs/cer
 from collections.abc import Mapping
 from fractions import Fraction
 from math import comb
-from operator import mul
+from operator import lshift, mul
 from types import SimpleNamespace
 
+from .exact import unit
 from .files import MAX_DEGREE, Node, Rejected, Table, itself, limit, no_more, refuse_if, whole
-from .polynomials import Polynomial, Ring, packed, unpacked
+from .polynomials import Polynomial, Ring
 
 MAX_BASIS = 200
 MAX_FACTORS = 24
@@ -43,9 +44,14 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     }
     stated = parts["squares"].read(table)
     keys, shifts, grams = list(map(ring.key, basis)), [c - min(columns) for c in columns], []
+    pairs = [(i, j) for i in range(size) for j in range(i, size)]
+    products = [(keys[i] + keys[j], shifts[i] + shifts[j] + (i != j)) for i, j in pairs]
     for factor in stated["factors"].items(1, MAX_FACTORS):
         rows = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
-        grams.append(_gram(keys, shifts, rows))
+        gram: dict[int, int] = {}
+        for (key, shift), entry in zip(products, _upper(rows, size), strict=True):
+            gram[key] = gram.get(key, 0) + (entry << shift)
+        grams.append(gram)
     weight, degree = Fraction(2) ** (2 * min(columns) - 2 * stated["unit"]), max(map(sum, basis))
     return Squares(keys=keys, columns=columns, degree=degree, weight=weight, grams=grams)
 
@@ -61,12 +67,12 @@ def powers_of_two(node: Node, size: int) -> list[int]:
 def expanded(parts: Mapping[str, Node], ring: Ring) -> Polynomial:
     """Squares that are stated as a polynomial in s and x: a multiplier that is never negative."""
     squares = read_squares(parts, ring)
-    summands, J = [], len(squares.grams) - 1
-    for j, gram in enumerate(squares.grams):
-        constants = Polynomial(ring, gram, 1, 2 * squares.degree, 0, sum(map(abs, gram.values())))
-        basis = ring.bernstein([Fraction(i == j) for i in range(J + 1)])
-        summands.append((squares.weight, basis * constants))
-    return ring.weighted(summands)
+    J, degree = len(squares.grams) - 1, 2 * squares.degree
+    shares = [squares.weight * ring.bernstein(unit(j, J + 1)) for j in range(J + 1)]
+    constants = [
+        Polynomial(ring, gram, 1, degree, 0, sum(map(abs, gram.values()))) for gram in squares.grams
+    ]
+    return ring.dot(shares, constants)
 
 
 def positive(
@@ -77,91 +83,95 @@ def positive(
     Raises TooNarrow if the ring is.
     """
     try:  # with c rounded down to few bits, which is nearly always enough
-        left = _left(c, squares, ring, what, rounded=True)
+        some = _dominant(c, squares, ring, what, rounded=True)
     except Rejected:
-        left = _left(c, squares, ring, what, rounded=False)
-    some = min(left.get(0, (0,))) > 0
+        some = _dominant(c, squares, ring, what, rounded=False)
     refuse_if(strict and not some, f"{what}: not positive, only nonnegative", "not_positive")
 
 
-def _left(
-    c: Polynomial, squares: Squares, ring: Ring, what: str, *, rounded: bool
-) -> dict[int, tuple[int, ...]]:
-    """What r leaves on the diagonal by monomial, for each Bernstein coefficient, in some unit.
+def _dominant(c: Polynomial, squares: Squares, ring: Ring, what: str, *, rounded: bool) -> bool:
+    """Whether r leaves something for the monomial 1; Rejected unless it leaves 0 or more for all.
 
+    All Bernstein coefficients of r are compared at once: coefficient k, times C(D, k) and a
+    positive number, is lane k of an integer, at the bit k * width.
     What is cut off a coefficient of c, from 0 to 1 in the last place, only adds to a square; where
     it is one of a product, all of it is charged. So c is as stated where something is left then.
     """
-    basis, columns, grams = squares.keys, squares.columns, squares.grams
+    keys, grams, highest = squares.keys, squares.grams, max(squares.columns)
+    room: list[int] = [highest - column for column in squares.columns]
     # r times c.denominator times below: below * (c's numerators) - above * (those of the squares).
-    above, below = (squares.weight * c.denominator).as_integer_ratio()
-    spare = (above & -above).bit_length() - 1 - SPARE if rounded else 0
-    cut = min(max(0, spare // 8), ring.width // 8 - 1)  # bytes of c's numerators
-    of_c, above = ring.coefficients(c, cut), above >> 8 * cut
-    found = set(of_c).union(*grams)
-    squared = {2 * key: i for i, key in enumerate(basis) if 2 * key in found}
-    paired: dict[int, tuple[int, int]] = {}  # who is charged for a product
-    for i, left_key in enumerate(basis):
-        for j in range(i + 1, len(basis)):
-            key = left_key + basis[j]
-            if key in found and key not in squared:
-                a, b = paired.setdefault(key, (i, j))
-                if columns[i] + columns[j] > columns[a] + columns[b]:
-                    paired[key] = i, j
-    balanced = len(squared) + len(paired) == len(found)
-    refuse_if(not balanced, f"{what}: a monomial is no product of the basis", "not_positive")
+    scale: Fraction = squares.weight * c.denominator
+    above, below = scale.as_integer_ratio()
+    cut = max(0, (above & -above).bit_length() - 1 - SPARE) if rounded else 0
+    above, of_c = above >> cut, ring.coefficients(c, cut)
 
     J, order = len(grams) - 1, c.order
     D = max(order, J)
-    # Each times C(D, k): Bernstein coefficient k of s^i, of B_j, and of what is cut off.
-    of_powers = [[below * comb(D - i, D - k) for k in range(D + 1)] for i in range(order + 1)]
-    of_squares = [
-        [-above * comb(J, j) * comb(D - J, k - j) if k >= j else 0 for k in range(D + 1)]
-        for j in range(J + 1)
-    ]
-    lost = [sum(column) if cut else 0 for column in zip(*of_powers, strict=True)]
-    # A lane of `width` bytes for each k: below * Σ|c's numerators| + above * |that of the squares|,
-    # times 2^D, is less than half of it.
-    largest = max((abs(entry) for gram in grams for entry in gram.values()), default=0)
-    most = below * ((c.norm >> 8 * cut) + order + 2) + above * largest
-    width = (most.bit_length() + D + 1) // 8 + 1
-    lines, zeros = [packed(row, width) for row in of_powers + of_squares], [0] * (order + 1)
+    # 2^(D + largest room + 1) times this bounds what is added to one diagonal, or taken off it.
+    most = below * ((c.norm >> cut) + 1 + (order + 1) * len(of_c) + 2 * len(keys))
+    most += above * sum(sum(map(abs, gram.values())) for gram in grams)
+    width = most.bit_length() + D + max(room) + 3
+    s = 1 << width
+    powers = [below * s**i * (1 + s) ** (D - i) for i in range(order + 1)]
+    lost = sum(powers) if cut else 0
+    powers = [-above * comb(J, j) * s**j * (1 + s) ** (D - J) for j in range(J + 1)] + powers
+    ones = sum(1 << width * k for k in range(D + 1))
+    halves = ones << width - 1
 
-    def coefficients(key: int) -> list[int]:
-        values = of_c.get(key, zeros) + [gram.get(key, 0) for gram in grams]
-        return unpacked(sum(map(mul, lines, values)), width, D + 1)
+    def negative(lanes: int) -> int:
+        """The highest bit of every lane that is negative."""
+        return ((lanes + halves) & halves) ^ halves
 
-    left, highest = [[0] * len(basis) for _ in range(D + 1)], max(columns)
-    for key, i in squared.items():
-        shift = 2 * (highest - columns[i]) + 1
-        for row, value in zip(left, coefficients(key), strict=True):
-            row[i] = value << shift
-    for key, (i, j) in paired.items():
-        shift = 2 * highest - columns[i] - columns[j]
-        for row, value, more in zip(left, coefficients(key), lost, strict=True):
-            charge = abs(value) + more << shift
-            row[i] -= charge
-            row[j] -= charge
-    for k, row in enumerate(left):
-        enough = min(row) > 0 if cut else min(row) >= 0
-        failed = f"{what}: not positive (Bernstein coefficient {k} of {D})"
-        refuse_if(not enough, failed, "not_positive")
-    return dict(zip(basis, zip(*left, strict=True), strict=True))
+    def absolute(lanes: int) -> int:
+        """The absolute value of every lane: of a negative one the complement, and 1."""
+        some = negative(lanes) >> width - 1
+        return ((lanes + halves) ^ halves ^ ((some << width) - some)) + some
+
+    squared, paired = {2 * key: i for i, key in enumerate(keys)}, _pairs(keys, room)
+    left = [0] * len(keys)  # of row i in some unit times 2^-room[i]
+    for key in of_c.keys() | set().union(*grams):
+        values = [gram.get(key, 0) for gram in grams] + of_c.get(key, [])
+        lanes = sum(map(mul, powers, values))
+        if key in squared:
+            i = squared[key]
+            left[i] += lanes << room[i] + 1
+        elif key in paired:
+            i, j = paired[key]
+            charge = absolute(lanes) + lost
+            left[i] -= charge << room[j]
+            left[j] -= charge << room[i]
+        else:
+            refuse_if(lanes, f"{what}: a monomial is no product of the basis", "not_positive")
+
+    failing = 0
+    for lanes in left:
+        failing |= negative(lanes - ones if cut else lanes)
+    first = f"Bernstein coefficient {(failing & -failing).bit_length() // width - 1} of {D}"
+    refuse_if(failing, f"{what}: not positive ({first})", "not_positive")
+    return 0 in keys and not negative(left[keys.index(0)] - ones)
 
 
-def _gram(keys: list[int], shifts: list[int], rows: list[list[int]]) -> dict[int, int]:
-    """Σ_i (rows[i]·diag(2^shifts) v)² by monomial.
+def _pairs(keys: list[int], room: list[int]) -> dict[int, tuple[int, int]]:
+    """Who is charged for a product: the pair with the largest columns, the first such."""
+    paired: dict[int, tuple[int, int]] = {}
+    for i, left in enumerate(keys):
+        for j in range(i + 1, len(keys)):
+            a, b = paired.setdefault(left + keys[j], (i, j))
+            if room[i] + room[j] < room[a] + room[b]:
+                paired[left + keys[j]] = i, j
+    return paired
 
-    Rows are packed into one integer each, so that a row of R'R is a few products.
-    """
-    size, most = len(keys), max((abs(entry) for row in rows for entry in row), default=0)
-    width = (most * most * (len(rows) + 1)).bit_length() // 8 + 1
-    lines = [(packed(row, width) << 8 * width * (size - len(row)), row) for row in rows]
-    gram: dict[int, int] = {}
-    for i, left in enumerate(keys):  # a row's last entry belongs to the last monomial
-        line = sum(line * row[i - size] for line, row in lines if len(row) >= size - i)
-        for j, entry in enumerate(unpacked(line, width, size, i), start=i):
-            if entry:
-                key = left + keys[j]
-                gram[key] = gram.get(key, 0) + (entry << shifts[i] + shifts[j] + (i != j))
-    return gram
+
+def _upper(rows: list[list[int]], size: int) -> list[int]:
+    """R'R on and above its diagonal, row by row: a row of R, packed into one integer, times R'."""
+    rows = [[0] * (size - len(row)) + row for row in [[], *rows]]
+    most = max(max(max(row), -min(row)) for row in rows)
+    width = (most * most * len(rows)).bit_length() + 1
+    lanes = range(0, width * size, width)
+    lines = [sum(map(lshift, row, lanes)) for row in rows]
+    half, found = 1 << width - 1, []
+    halves = sum(half << lane for lane in lanes)
+    for i, column in enumerate(zip(*rows, strict=True)):
+        line = sum(map(mul, lines, column)) + halves
+        found += [(line >> lane & 2 * half - 1) - half for lane in lanes[i:]]
+    return found

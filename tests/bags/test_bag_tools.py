@@ -24,15 +24,13 @@ from bags.recordings.folders import expand_bags
 from bags.recordings.message_types import types_in_bag
 from bags.recordings.writer import BagWriter
 from bags.samples import schunk
-from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin, read_signals
 from bags.tools.copies import Rows
 from bags.tools.fitness import Level, check_fitness
 from bags.tools.importing import import_table
 from bags.tools.info import bag_info
-from nlsid import frame
+from nlsid import Polynomial, frame, identify, read_bags
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import Polynomial, identify
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -110,7 +108,6 @@ def test_bag_tools_need_no_solver_and_what_does_says_which_extra(bag: Path, tmp_
     copy = tmp_path / "copy"
     verbs: dict[int, list[tuple[object, ...]]] = {
         0: [
-            ("bag", "info", bag),
             ("bag", "check", bag, "-u", COMMAND, "-y", SPEED),
             ("bag", "convert", bag, "--out", copy),
         ],
@@ -572,7 +569,7 @@ def test_a_command_that_changes_only_where_no_response_is_is_named(tmp_path: Pat
     assert found.verdict is Level.BAD
     said = [finding.what for finding in found.findings if finding.level is Level.BAD]
     assert said == [f"{COMMAND} is 0.5 wherever every response was recorded: no excitation"]
-    dataset = read_dataset([tmp_path / "late"], responses=[SPEED], excitations=[COMMAND])
+    dataset = read_bags([tmp_path / "late"], responses=[SPEED], excitations=[COMMAND])
     with pytest.raises(DataError, match=r"/cmd_vel.* is constant \(0\.5\) in all trials"):
         identify(dataset, Polynomial(1))
 

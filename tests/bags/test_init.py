@@ -87,9 +87,8 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     assert replayed.count("inside") == 8
 
 
-def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
-    nlsid("init", tmp_path, *f1tenth()[:6], "--yes")
-    lines = (tmp_path / "robot.yaml").read_text().splitlines()
+def test_every_key_of_the_written_file_has_a_comment(axes: tuple[Path, str]) -> None:
+    lines = axes[0].read_text().splitlines()
     keys = [k for k, line in enumerate(lines) if re.match(r" *[a-z_]+:", line)]
     assert len(keys) >= 15
     assert not [lines[k] for k in keys if not lines[k - 1].lstrip().startswith("#")]
@@ -422,6 +421,7 @@ def test_a_command_that_never_varies_is_an_answer_and_no_configuration(
     assert not config.exists()
 
 
+@pytest.mark.slow
 def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) -> None:
     """Steps of 20, 22 and 22 ms in turn: on a grid of the median a monitor judges 4 samples."""
     stamps = START_NS + np.cumsum([20_000_000, 22_000_000, 22_000_000] * 100)
@@ -465,10 +465,18 @@ def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: 
         choose(found, ["/speed_c:data"])
 
 
-def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(tmp_path: Path) -> None:
-    bag, config = tmp_path / "bag", tmp_path / "robot.yaml"
-    two_axes(bag)
-    said = nlsid("init", config.parent, bag, "--yes")
+@pytest.fixture(scope="module")
+def axes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The configuration that init writes for two axes, and what it says."""
+    folder = tmp_path_factory.mktemp("axes")
+    two_axes(folder / "bag")
+    return folder / "robot.yaml", nlsid("init", folder, folder / "bag", "--yes")
+
+
+def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(
+    axes: tuple[Path, str],
+) -> None:
+    config, said = axes
     [chosen] = load_config(config).signals.response
     other = "b" if chosen.path.startswith("/speed_a") else "a"
     assert f"there are others like it: /speed_{other}:data follows /cmd_{other}:data (+" in said
@@ -700,6 +708,7 @@ def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path)
     assert reason in refused
 
 
+@pytest.mark.slow
 def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_path: Path) -> None:
     """The trials that are not held back stand still: only with the moving one is there a model."""
     rng = np.random.default_rng(0)

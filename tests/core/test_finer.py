@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlsid_core.design import ContinuousTracking, design, integrate_nominal
+from nlsid import ContinuousTracking, Nominal, design, integrate_nominal
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis, NoFunnel
 from nlsid_core.design.continuous.finer import FEW, LOST, Unproved, coarse, halved, lost, most_knots
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import MOST_KNOTS, Setting, prepare
-from nlsid_core.dynamics import Nominal
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
 

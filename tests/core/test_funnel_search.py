@@ -9,19 +9,18 @@ import pytest
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import Simulation
+from nlsid import ContinuousTracking, Design, Nominal, VectorField, check, integrate_nominal
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import solve_ends
 from nlsid_core.design.continuous.vstep import enlarging, samples_of
 from nlsid_core.design.continuous.vstep_program import GAP
-from nlsid_core.designs import AnyDesign, Design
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.proofs import check
 
 GOAL = 20 * np.eye(2)
 WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}

@@ -10,23 +10,25 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
-from bags.designs.documents import load
 from bags.pictures.tubes import draw_tube
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import Simulation
-from nlsid_core.arrays import FloatArray
-from nlsid_core.design import (
+from nlsid import (
     ContinuousTracking,
     Goal,
+    NlsidError,
+    Nominal,
+    check,
     design,
-    design_funnel,
     integrate_nominal,
+    load,
     plan_motion,
 )
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import design_funnel
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
-from nlsid_core.dynamics import Nominal, PiecewisePolynomial, Rates
-from nlsid_core.errors import DataError, Infeasible, NlsidError, ShapeError
-from nlsid_core.proofs import check
+from nlsid_core.dynamics import PiecewisePolynomial, Rates
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 
 MASSES = {"arm": 2.0}  # in kg; a rate that asks for another mass is wrong
 PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"

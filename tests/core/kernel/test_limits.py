@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -21,12 +22,17 @@ def deciding(claim: Claim, limits: Limits) -> Deciding:
 
 
 @pytest.mark.parametrize(
-    ("limits", "reason"),
-    [(Limits(seconds=1), "more than 1 s of processor time"), (Limits(memory=60), "memory")],
+    ("made", "size", "limits", "reason"),
+    [
+        (network, 100, Limits(seconds=1), "more than 1 s of processor time"),
+        (equal_hashes, 12, Limits(memory=60), "memory"),
+    ],
 )
-def test_a_claim_that_takes_too_much_is_ended_with_the_reason(limits: Limits, reason: str) -> None:
+def test_a_claim_that_takes_too_much_is_ended_with_the_reason(
+    made: Callable[[int], Claim], size: int, limits: Limits, reason: str
+) -> None:
     with pytest.raises(CertificateRejected, match=reason):
-        deciding(network(100), limits).wait()
+        deciding(made(size), limits).wait()
 
 
 def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:

@@ -23,9 +23,9 @@ from bags.commands.cli import app
 from bags.designs import documents
 from bags.samples import f1tenth
 from benchmarks.verified import generator, mutated
+from nlsid import design
 from nlsid_core import files as saved
 from nlsid_core import kernel, proofs, second
-from nlsid_core.design import design
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
 from tests.core.kernel import mutations, stability_claims
