@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_180,
     ("bags",): 11_927,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_440,
+    ("tests",): 22_385,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
