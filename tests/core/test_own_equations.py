@@ -297,21 +297,6 @@ def test_a_jump_of_rounding_is_none() -> None:
         Nominal(PiecewisePolynomial(t, u - 0.1), x)
 
 
-def lagging(x: Any, u: Any, w: Any) -> Any:
-    """A position whose speed lags its command, and is pushed."""
-    return [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]
-
-
-@pytest.mark.slow
-def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
-    t = np.linspace(0, 3, 45)
-    still = integrate_nominal(
-        lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
-    )
-    found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
-    assert found.found.tried.startswith("found with a quarter of R; as it is: none at")
-
-
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:
     taken = dict.fromkeys(TERMS, 0.0) | {"disturbance": 386.0}
     fast = Diagnosis(11.0, 7990.0, taken, (0.1, 0.2))

@@ -1,6 +1,5 @@
 """Funnels around trajectories: nouns, lemmas, proofs for every t, and what is refused."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -91,9 +90,9 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
 def test_alternation_ends_where_the_sweep_does() -> None:
     field, nominal = hanging()
     design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
-    steps = LSteps(field)
-    start = exponential_start(steps, design.policy, design.funnel.P)
-    found = alternate_rho(steps, design.policy, start, stop=0.002)
+    steps = LSteps(field, design.policy)
+    start = exponential_start(steps, design.funnel.P)
+    found = alternate_rho(steps, start, stop=0.002)
     assert found.volumes[0] < found.volumes[-1]
     assert found.volumes[-1] == pytest.approx(design.funnel.volume_integral(), rel=0.01)
 
@@ -101,10 +100,7 @@ def test_alternation_ends_where_the_sweep_does() -> None:
 def test_p_grows_beyond_rho_and_is_proved() -> None:
     field, nominal = hanging(9)
     rho = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
-    with ThreadPoolExecutor(2) as threads:
-        P = design_funnel(
-            ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"), executor=threads
-        )
+    P = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"))
     assert P.funnel.volume_integral() > rho.funnel.volume_integral()
     assert np.min(P.found.proved.margins) > 0
 
