@@ -96,10 +96,6 @@ def coupled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_coupled_bags(tmp_path_factory.mktemp("coupled"))
 
 
-def bags_in(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir())
-
-
 def one_digit_changed(text: str, after: str) -> str:
     """The document with one digit of the first number after a key changed."""
     start = text.index(f'"{after}"') + len(after) + 2

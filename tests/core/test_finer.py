@@ -85,7 +85,7 @@ def test_a_funnel_whose_numbers_overflow_is_not_proved() -> None:
     setting = prepared(at_rest(41))
     rho = np.geomspace(1e-180, 1e-3, 41)
     funnel = ContinuousFunnel(setting.policy.x, setting.P, rho, setting.policy.vector_field, "")
-    assert prove_pieces(setting.steps, setting.policy, funnel).unproved
+    assert prove_pieces(setting.steps, funnel).unproved
 
 
 def test_a_shape_that_is_wider_before_the_end_than_equations_reach_is_no_refusal() -> None:

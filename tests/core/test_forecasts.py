@@ -115,14 +115,10 @@ def test_no_output_that_keeps_the_assumption_leaves_its_forecast(name: str) -> N
 @pytest.mark.parametrize("peak", [True, False])
 def test_no_output_of_thousands_leaves_its_forecast(name: str, peak: bool) -> None:
     model, funnel = alone(name, peak=peak)
-    most, count = 0.0, 0
     for kind in ("spent", "random", "sign"):
-        y, u = attack(model, funnel, kind, 1500, seed=2)
+        y, u = attack(model, funnel, kind, 500, seed=2)
         for k, forecast in forecasts(model, funnel, y, u):
-            part = used(forecast, y[k + 1 :])
-            most, count = max(most, float(part.max(initial=0.0))), count + len(part)
-    print(f"{name}: {count} outputs, largest part used {most:.4f}")
-    assert most <= 1.0
+            assert used(forecast, y[k + 1 :]).max(initial=0.0) <= 1.0
 
 
 def test_a_linear_forecast_is_reached_at_every_sample() -> None:

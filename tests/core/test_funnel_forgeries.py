@@ -191,4 +191,4 @@ def test_no_proof_is_found_for_a_funnel_that_is_one_percent_too_wide() -> None:
     design = design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
     knots = len(design.funnel.t)
     wide = replace(design.funnel, rho=design.funnel.rho * np.linspace(1.01, 1, knots))
-    assert prove_pieces(LSteps(field), design.policy, wide).unproved
+    assert prove_pieces(LSteps(field, design.policy), wide).unproved

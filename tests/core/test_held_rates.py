@@ -30,7 +30,7 @@ def changes_in(found: FunnelDesign, rho: Any) -> Changes:
     """dũ/dt in the funnel of a design, or one with other ρ."""
     funnel = ContinuousFunnel(found.funnel.x, found.funnel.P, rho, "", "")
     steps = LSteps(found.model, found.policy, widths=np.zeros((len(funnel.t) - 1, 1)))
-    return Changes.of(steps, found.policy, funnel)
+    return Changes.of(steps, funnel)
 
 
 def test_rates_in_a_smaller_funnel_follow_from_those_in_a_larger(held: FunnelDesign) -> None:
@@ -158,7 +158,7 @@ def test_rates_bound_what_samples_show_and_not_by_much(rate: Any) -> None:
     funnel = ContinuousFunnel(x, P, np.array([0.3, 0.5]), "", "")
     widths = np.array([[0.3, 0.2]])
     steps = LSteps(field, policy, widths=np.zeros((1, 2)))
-    bound = Changes.of(steps, policy, funnel).rates(widths)[0]
+    bound = Changes.of(steps, funnel).rates(widths)[0]
     slopes = [np.diff(part.control[0], axis=0)[0] / 2.0 for part in (x, u, K)]
     fastest = np.zeros(2)
     for at in t.tolist():
@@ -182,9 +182,9 @@ def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
     sizes: list[float] = []
     of = Changes.of
 
-    def counted(steps: Any, policy: Any, funnel: Any) -> Changes:
+    def counted(steps: Any, funnel: Any) -> Changes:
         sizes.append(float(funnel.rho[0]))
-        return of(steps, policy, funnel)
+        return of(steps, funnel)
 
     monkeypatch.setattr(Changes, "of", counted)
     periods = noted_periods(monkeypatch)

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import lfilter
-from typer.testing import CliRunner
 
 from bags.chain.shipped import config_file
-from bags.commands.cli import app
 from bags.designs import documents
 from bags.pictures.report import page
 from bags.samples import f1tenth
@@ -41,16 +39,16 @@ from nlsid_core.identification import (
     Method,
     methods_of,
     prove_stability,
-    simulation_percent,
     validate,
 )
 from nlsid_core.identification.polynomial.explicit import equation_error
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.rates import rate_of_memory, searched_rate
 from nlsid_core.models import DifferenceEquation, Signal, StateAffineModel
-from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
+from tests.conftest import TRUE_A, TRUE_B, synthetic_dataset
 from tests.marks import slow_among
 from tests.repeated import CLASS, pair
+from tests.verbs import nlsid
 
 STATE_AFFINE = {
     "lags": 2,
@@ -143,13 +141,11 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     config: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    made = CliRunner().invoke(app, ["identify", str(out), *BAGS, "--config", str(config)])
-    assert made.exit_code == 0, made.output
+    nlsid("identify", out, *BAGS, "--config", config)
     verdict = check(out / documents.MODEL_PROOF)
     assert "clips its inputs" in verdict.statement
-    refused = CliRunner().invoke(app, ["funnel", str(out), "--config", str(config)])
-    assert refused.exit_code != 0
-    assert "has no section 'funnel'" in str(refused.exception)
+    refused = nlsid("funnel", out, "--config", config, status=None)
+    assert "has no section 'funnel'" in refused
 
 
 # -- Robust simulation error: the bound, its derivatives, its iterates, and what is refused
@@ -196,19 +192,6 @@ def test_observer_form_simulates_the_difference_equation(
         x = model.A @ x + model.B[:, 0] * u[t] + model.offset
 
 
-def test_an_unstable_model_gets_no_proof() -> None:
-    model = DifferenceEquation(
-        a=np.array([1.01]),
-        b=np.array([0.0, 1.0]),
-        c=0.0,
-        period=0.1,
-        y=Signal("y"),
-        u=Signal("u"),
-        u_range=(0.0, 1.0),
-    )
-    assert prove_stability(model) is None
-
-
 def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
     model = DifferenceEquation(
         a=np.array([1.9985, -0.99850045]),
@@ -222,14 +205,6 @@ def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
     proof = prove_stability(model)
     assert proof is not None
     assert float(np.abs(model.poles).max()) < proof.rate < 1.0
-
-
-def test_error_percent_is_zero_for_the_truth(fit: Fit[DifferenceEquation]) -> None:
-    clean = synthetic_dataset(0.0, trials=2)
-    truth = DifferenceEquation(
-        a=TRUE_A, b=TRUE_B, c=0.0, period=PERIOD, y=fit.model.y, u=fit.model.u, u_range=(0.0, 1.0)
-    )
-    assert simulation_percent(truth, clean) < 1e-9
 
 
 # -- Options of families and methods: each refusal names the option, its value and what is allowed
@@ -317,12 +292,6 @@ def test_what_no_model_can_satisfy_is_refused(
 def test_options_cannot_be_changed_after_they_were_checked() -> None:
     with pytest.raises(FrozenInstanceError):
         Rse().iterations = 0  # type: ignore[misc]
-
-
-def test_a_word_and_a_title_belong_to_one_method() -> None:
-    assert all(METHODS[word].word == word for word in METHODS)
-    assert {Rse().name, Rse(certified=True).name} == {"rse", "rse_certified"}
-    assert len({method().title for method in METHODS.values()}) == len(METHODS) == 4
 
 
 def test_the_methods_of_a_class_begin_with_the_one_that_is_taken() -> None:

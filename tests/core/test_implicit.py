@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
@@ -108,14 +107,6 @@ def test_only_separable_models_come_apart() -> None:
     np.testing.assert_allclose(again.h(z), model.h(z), rtol=1e-14)
     assert cubic_spring().separated() is None
     assert lagged().separated() is None
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_a_document_round_trips(name: str) -> None:
-    document = EVERY[name]().document()
-    text = files.encode(document)
-    again = ImplicitModel.from_document(files.parse_document(text)).document()
-    assert files.digest(again) == files.digest(document)
 
 
 def test_wrong_sizes_and_documents_are_refused() -> None:

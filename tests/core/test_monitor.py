@@ -1,6 +1,7 @@
 """The tube holds in simulation when its assumption does; the monitor and its alarm say when not."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,6 +224,8 @@ def test_parts_that_do_not_belong_together_are_refused(
     )
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor([Stage(design.model, other.policy, design.funnel)])
+    with pytest.raises(CertificateMismatch, match="another model"):
+        Monitor([Stage(replace(design.model, c=1.0), design.policy, design.funnel)])
 
 
 # -- Alerts: a low margin warns, and what is outside is never anything else

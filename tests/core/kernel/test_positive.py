@@ -148,10 +148,6 @@ def test_a_zero_at_one_end_of_s_is_nonnegative_and_not_positive() -> None:
         decide(below, witness, strict=False)
 
 
-def _squared(exponents: list[int]) -> dict[oracle.Key, Fraction | int]:
-    return {tuple(2 * e for e in exponents): 1}
-
-
 def test_the_same_square_does_not_balance_two_cross_terms() -> None:
     """x²y² is the square of xy and the product of x² and y²: it counts once."""
     witness = {
