@@ -8,7 +8,7 @@ sum of the absolute values of all its integers, and below 2^(width - 1) the pack
 `coefficients` refuses to otherwise, and `at_width` tries a larger width.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -107,7 +107,7 @@ class Ring:
         """dp/ds."""
         terms = {
             key: sum(i * c << self.width * (i - 1) for i, c in enumerate(row) if i)
-            for key, row in self.coefficients(p).items()
+            for key, row in self.coefficients(p)
         }
         return replace(p, terms=terms, order=max(0, p.order - 1), norm=p.order * p.norm)
 
@@ -161,22 +161,31 @@ class Ring:
         """Each of ps with a polynomial in the place of each variable."""
         return list(map(self.substitution(values), ps))
 
-    def coefficients(self, p: Polynomial, cut: int = 0) -> dict[int, list[int]]:
-        """Each monomial's whole coefficients of s^0, s^1 … over p.denominator, to the last but 0.
+    def coefficients(self, p: Polynomial) -> Iterator[tuple[int, list[int]]]:
+        """Each monomial, and its whole coefficients of s^0, s^1 … over p.denominator.
 
-        cut: bits that are cut off each, which rounds down.
+        They go on to the last that is not 0.
         """
         if p.norm.bit_length() >= self.width:
             raise TooNarrow((p.norm.bit_length() // STEP + 1) * STEP)
-        half, found = 1 << self.width - 1, {}
+        half = 1 << self.width - 1
         mask = 2 * half - 1
         for key, value in p.terms.items():
-            row = found[key] = list[int]()
+            row = []
             while value:
-                lowest = ((value + half) & mask) - half
-                row.append(lowest >> cut)
-                value = (value - lowest) >> self.width
-        return found
+                row.append(((value + half) & mask) - half)
+                value = (value - row[-1]) >> self.width
+            yield key, row
+
+    def bernstein_coefficients(self, p: Polynomial, width: int) -> Iterator[tuple[int, int]]:
+        """Each monomial, and Σ_k C(order, k) b_k 2^(width k), b_k of its Bernstein coefficients."""
+        for key, row in self.coefficients(p):
+            lanes = 0
+            for i, coefficient in enumerate(row):  # of s^i (s + (1 - s))^(order - i)
+                lanes += (lanes << width) + (coefficient << width * i)
+            for _ in range(p.order + 1 - len(row)):
+                lanes += lanes << width
+            yield key, lanes
 
 
 @lru_cache(maxsize=64)
