@@ -18,8 +18,10 @@ from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.identification.network.maps import Map, as_piecewise_linear
+from nlsid_core.models import PiecewiseLinear
 
 NONE: IntArray = np.zeros(0, dtype=np.int64)  # taps without parameters
+TOGETHER = 8  # trials whose loops are quicker all at once
 DIVERGED = 1e3  # spreads of a signal, at which a loop's simulation is held
 
 
@@ -244,14 +246,38 @@ def _looped(
     start: FloatArray,
 ) -> FloatArray:
     """(…, N) through its one map, held at DIVERGED where it grows beyond all measure."""
-    if forcing.ndim > 1:
-        pairs = zip(forcing, start, strict=True)
-        return np.array([_looped(A, own, theta, each, begun) for each, begun in pairs])
     [(part, one)] = own
     f = as_piecewise_linear(one.function, theta[one.at])
+    a, weights = list(enumerate((-A[1:]).tolist(), 1)), part.weights(theta)
+    if forcing.ndim == 1:
+        return _one_looped(f, a, weights, forcing, start)
+    if len(forcing) < TOGETHER:
+        pairs = zip(forcing, start, strict=True)
+        return np.array([_one_looped(f, a, weights, *each) for each in pairs])
+    y, mapped = np.empty_like(forcing.T), np.empty_like(forcing.T)
+    given = start.shape[-1]
+    y[:given], mapped[:given] = start.T, f(start.T)
+    for t in range(given, len(y)):
+        value = forcing[:, t].copy()
+        for k, weight in a:
+            value += weight * y[t - k]
+        for k, weight in weights:
+            value += weight * mapped[t - k]
+        y[t] = np.clip(value, -DIVERGED, DIVERGED)
+        mapped[t] = f(y[t])
+    return y.T
+
+
+def _one_looped(
+    f: PiecewiseLinear,
+    a: list[tuple[int, float]],
+    weights: list[tuple[int, float]],
+    forcing: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """(N,), in plain numbers, which is quicker for one or few."""
     inner, slopes = f.knots[1:-1].tolist(), f.slopes.tolist()
     levels = (f.values[:-1] - f.slopes * f.knots[:-1]).tolist()
-    a, weights = list(enumerate((-A[1:]).tolist(), 1)), part.weights(theta)
     y, mapped = start.tolist(), f(start).tolist()
     for value in forcing[len(y) :].tolist():
         for k, weight in a:
