@@ -60,10 +60,10 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     result |= {"check_seconds": spent.processor, "exact_seconds": spent.seconds}
     result["proof_mb"] = proof.stat().st_size / 1e6
     result |= _attacks(design, goal, arguments.starts)
-    start = exponential_start(LSteps(field), design.policy, design.funnel.P)
+    start = exponential_start(LSteps(field, design.policy), design.funnel.P)
     result["start_volume"] = start.volume_integral()
     with spending() as spent:
-        alternated = alternate_rho(LSteps(field), design.policy, start)
+        alternated = alternate_rho(LSteps(field, design.policy), start)
     result["alternation_seconds"] = spent.seconds
     result["alternation_iterations"] = len(alternated.volumes) - 1
     result["alternation_volume"] = alternated.volumes[-1]

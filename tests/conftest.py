@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from bags.designs.documents import MODEL, MODEL_PROOF
+from bags.chain.shipped import config_file
+from bags.designs.documents import FUNNEL, MODEL, MODEL_PROOF
+from bags.samples import f1tenth
+from nlsid import Dataset, Fit, OutputTube, Polynomial, Trajectory, identify
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
-from nlsid_core.identification import Fit, Polynomial, identify
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.models import DifferenceEquation
+from tests.verbs import nlsid
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -123,3 +125,18 @@ def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: OutputTu
     design.save(tmp_path)
     files.write_document(tmp_path / MODEL_PROOF, fit.proof.document(design.model, MODEL))
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def f1tenth_chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `nlsid identify` and `nlsid funnel` write for F1TENTH; to be read only."""
+    out, shared = tmp_path_factory.mktemp("chain"), ("--config", config_file("f1tenth.yaml"))
+    assert "robust simulation error" in nlsid("identify", out, f1tenth()[0].parent, *shared)
+    nlsid("funnel", out, *shared)
+    return out
+
+
+@pytest.fixture(scope="session")
+def funnel(f1tenth_chain: Path) -> Path:
+    """Its funnel.json, with everything it needs beside it."""
+    return f1tenth_chain / FUNNEL

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core.design import ContinuousTracking, integrate_nominal
-from nlsid_core.dynamics import VectorField
+from nlsid import ContinuousTracking, VectorField, integrate_nominal
 
 
 def turning(x: Any, u: Any, w: Any) -> Any:

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from nlsid import Goal, Nominal, VectorField
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.design import Goal
-from nlsid_core.dynamics import Nominal, VectorField
 
 
 def document(field: VectorField, nominal: Nominal, goal: Goal, **options: Any) -> Json:

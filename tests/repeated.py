@@ -4,9 +4,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from nlsid import Degrees, Trajectory
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.identification import Degrees
 from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moments import Offsets
 from nlsid_core.models import MonotoneEquation, Signal

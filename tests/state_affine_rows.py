@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Degrees, Polynomial
+from nlsid import Dataset, Degrees, Polynomial, Trajectory
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nlsid import SampledTracking, Trajectory
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.funnels.sampled import DisturbanceAssumption

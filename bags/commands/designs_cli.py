@@ -19,7 +19,6 @@ from bags.commands.options import (
     ConfigOption,
     DefinitionsOption,
     DesignArgument,
-    Sharing,
     Signals,
     SomeBagsArgument,
     VerboseOption,
@@ -37,7 +36,6 @@ MODELS = 3  # that may be tried before there is one with a tube
 
 if TYPE_CHECKING:
     from bags.chain.config import Config
-    from bags.fleet.workers import Workers
     from nlsid_core.design import OutputTubeDesign
 
 
@@ -76,7 +74,6 @@ def funnel(
     folder: DesignArgument,
     given: Given,
     wired: Wired,
-    sharing: Sharing,
     bags: SomeBagsArgument = None,
     config: ConfigOption = None,
 ) -> None:
@@ -101,12 +98,8 @@ def funnel(
     if given.problem is not None:
         if config is not None:
             raise typer.BadParameter("--problem takes no --config")
-        _around_trajectory(
-            folder, given, wired, sharing.workers(), expand_bags(bags) if bags else []
-        )
+        _around_trajectory(folder, given, wired, expand_bags(bags) if bags else [])
         return
-    if sharing != Sharing():
-        raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
 
     path = config_of(folder, config)
     if not is_tracking(path):
@@ -155,9 +148,7 @@ def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> O
     return design
 
 
-def _around_trajectory(
-    folder: Path, given: Given, wired: Wired, workers: Workers, bags: list[Path]
-) -> None:
+def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path]) -> None:
     """Design a funnel for given equations, and for what they leave out of bags if there are any."""
     from bags.chain.problems import load_problem, measured
     from bags.commands import show
@@ -182,8 +173,8 @@ def _around_trajectory(
         out.print(tables.breaking_table(broken))
         problem = replace(problem, dynamics=field.pushed(push.box))
 
-    with progress_bar("designing") as progress, workers.sharing() as executor:
-        made = design(problem, executor=executor, progress=progress)
+    with progress_bar("designing") as progress:
+        made = design(problem, progress=progress)
     for path in (*made.save(folder), *show.draw_tube(folder, made)):
         out.print(f"wrote {path}", soft_wrap=True)
     out.print(str(made), soft_wrap=True)

@@ -1,17 +1,14 @@
-"""Who reads bags and shares sweeps: this process, processes of this machine, or a Dask cluster."""
+"""Who reads bags: this process, processes of this machine, or a Dask cluster."""
 
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import (
-    BrokenExecutor,
-    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
 )
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -45,22 +42,6 @@ class Workers:
             spawn = multiprocessing.get_context("spawn")  # obstore's threads do not live in a fork
             return ProcessPoolExecutor(self.count, mp_context=spawn, initializer=_end_with_parent)
         return _Here()
-
-    @contextmanager
-    def sharing(self) -> Iterator[Executor | None]:
-        """What shares a sweep; None for this process. Raises DataError if a worker dies."""
-        if not (self.count or self.scheduler):
-            yield None
-            return
-        executor = self.open()
-        try:
-            yield executor
-        except (BrokenExecutor, CancelledError) as error:
-            raise DataError(
-                "a worker died: take fewer workers if memory ran out, and start the command again"
-            ) from error
-        finally:
-            self.close(executor)
 
     def close(self, executor: Executor) -> None:
         """End them, or leave the cluster; what they have not begun is not done."""

@@ -7,8 +7,9 @@ from typing import Any, Final
 
 from bags.chain.config import Config
 from bags.chain.sections import Key, Section, sections_in
-from bags.chain.templates import TEMPLATES
+from bags.chain.templates import TEMPLATES, option_texts
 from bags.setup.proposal import Proposal
+from nlsid_core.identification import METHODS, LeastSquares
 
 WIDTH: Final = 110
 HEAD: Final = (
@@ -49,9 +50,12 @@ def _section(
 
 
 def _options(content: Mapping[str, Any]) -> dict[str, Key]:
-    """The keys of the section `identification`."""
-    texts = TEMPLATES[content["model"]].texts()
-    return {"model": Key("the class of models")} | {key: Key(said) for key, said in texts.items()}
+    """The keys of the section `identification`: of its class of models, and of its method."""
+    method = METHODS.get(content.get("method", ""), LeastSquares)  # which has no options
+    texts = TEMPLATES[content["model"]].texts() | option_texts(method)
+    return {"model": Key("the class of models"), "method": Key("how the model is found")} | {
+        key: Key(said) for key, said in texts.items()
+    }
 
 
 def _said(key: Key | None, why: str) -> str:
@@ -60,20 +64,20 @@ def _said(key: Key | None, why: str) -> str:
 
 
 def _comment(text: str, indent: str = "") -> Iterator[str]:
-    plain = " ".join(text.split())
     yield from textwrap.wrap(
-        plain, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   "
+        " ".join(text.split()),
+        WIDTH,
+        initial_indent=f"{indent}# ",
+        subsequent_indent=f"{indent}#   ",
     )
 
 
 def _wrapped(line: str, indent: str, value: Any) -> Iterator[str]:
     """A list goes on in the next line."""
-    if not isinstance(value, list):
-        yield line
-    else:
-        yield from textwrap.wrap(
-            line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-        )
+    width = WIDTH if isinstance(value, list) else len(line)
+    yield from textwrap.wrap(
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
 
 
 def _flow(value: Any) -> str:

@@ -3,7 +3,6 @@
 Each kind has one search, which the kernel decides before anything is returned.
 """
 
-from concurrent.futures import Executor
 from typing import get_args, overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
@@ -23,20 +22,18 @@ def design(problem: SampledTracking, *, progress: Progress = silent) -> Tracking
 def design(
     problem: ContinuousTracking,
     *,
-    executor: Executor | None = None,
     progress: Progress = silent,
 ) -> FunnelDesign: ...
 def design(
     problem: OutputTube | SampledTracking | ContinuousTracking,
     *,
-    executor: Executor | None = None,
     progress: Progress = silent,
 ) -> OutputTubeDesign | TrackingDesign | FunnelDesign:
     """A funnel for the problem, proved, and a policy unless it needs none.
 
     `Design.save` writes them and the proof.
 
-    executor: shares work that splits. progress: called with (what was done, fraction done).
+    progress: called with (what was done, fraction done).
     Raises DataError on a problem that makes no sense, Infeasible if no funnel was found or proved,
     CertificateRejected if an assumption is not one that the kernel accepts.
     """
@@ -49,4 +46,4 @@ def design(
         case SampledTracking():
             return design_state_funnel(problem, progress=progress)
         case ContinuousTracking():
-            return design_funnel(problem, executor=executor, progress=progress)
+            return design_funnel(problem, progress=progress)

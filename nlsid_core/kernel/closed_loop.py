@@ -14,10 +14,10 @@ from itertools import pairwise, product
 from types import SimpleNamespace
 from typing import Any
 
-from .exact import definite, dot
-from .files import Node, Reader, Table, Terms, itself, limit, refuse_if, whole
+from .exact import definite, dot, unit
+from .files import Node, Reader, Table, Terms, limit, refuse_if, whole
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import expanded, positive, powers_of_two, read_squares
+from .positivity import positive, powers_of_two, read_squares
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -41,10 +41,10 @@ Motion = SimpleNamespace
 def read_motion(documents: dict[str, Node], digests: dict[str, str]) -> Motion:
     """The policy and the funnel: around one nominal, x₀ continuous, P ≻ 0, ρ > 0 at every knot."""
     made_for = {"vector_field": digests["vector_field"]}
-    table: Table = {"t": (None,), "x": itself, "u": itself, "K": itself, "limits": (None, 3)}
+    table: Table = {"t": (None,), "x": None, "u": None, "K": None, "limits": (None, 3)}
     policy = documents["policy"].document("policy", table, "continuous", made_for)
     made_for["policy"], node = digests["policy"], documents["funnel"]
-    table = {"t": _times(2, MAX_KNOTS), "x": itself, "P": itself, "rho": (None,)}
+    table = {"t": _times(2, MAX_KNOTS), "x": None, "P": None, "rho": (None,)}
     given = node.document("funnel", table, "continuous", made_for)
 
     t, rho, x = given["t"], given["rho"], _curve(given["x"], len(given["t"]) - 1, None)
@@ -83,7 +83,7 @@ def _read_field(node: Node, motion: Motion) -> None:
         "breaks": _times(0, MAX_SPANS),
         "valid": (None, None),
         "expansion": Node.text,
-        "pieces": itself,
+        "pieces": None,
     }
     given = node.document("vector_field", table)
     n, m, box, breaks = motion.n, motion.m, given["uncertain"], given["breaks"]
@@ -134,7 +134,7 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
     """
     rate = {"input": whole(0), "sign": whole(-1, 1)} if "input" in names else {}
     place = {"interval": whole(0), "vertex": whole(0), "level": whole(0, MAX_LEVEL)}
-    others = dict.fromkeys(f"columns squares {names}".split(), itself)
+    others = dict.fromkeys(f"columns squares {names}".split())
     table: Table = {**place, "index": whole(0), **others, **rate}
     if limited:
         table["mode"] = lambda entry: entry.wholes(limited)
@@ -187,15 +187,16 @@ class ClosedLoop:
 
     def __init__(self, motion: Motion, ring: Ring, part: Part, mode: Case) -> None:
         (k, level, index), x = part, ring.variables
-        self.motion, self.ring, self.k = motion, ring, k
+        self.motion, self.ring, self.k, self.level = motion, ring, k, level
         self.h = motion.t[k + 1] - motion.t[k]
         self.in_time = partial(ring.bernstein, level=level, index=index)
         self.rho = self.in_time(motion.rho[k : k + 2])
         rows = zip(motion.P[k], motion.P[k + 1], strict=True)
         self.Px = [ring.dot(self._curve(pair), x) for pair in rows]
         self.gap = self.rho - ring.dot(x, self.Px)
-        self.moved = self._curve(slopes(motion.x[k]))
-        states = [p + e for p, e in zip(self._curve(motion.x[k]), x, strict=True)]
+        nominal = self._curve(motion.x[k])
+        self.moved = list(map(self.slope, nominal))
+        states = [p + e for p, e in zip(nominal, x, strict=True)]
         self.known = [self.in_time(motion.t[k : k + 2]), *states]
 
         planned = enumerate(self._curve(motion.u[k]))  # ũ = u₀ - Kx̄
@@ -212,10 +213,7 @@ class ClosedLoop:
     @cached_property
     def drift(self) -> Polynomial:
         """dρ/ds + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄: what neither f nor a multiplier is in."""
-        motion, ring, k = self.motion, self.ring, self.k
-        bend = [slopes(rows)[0] for rows in zip(motion.P[k], motion.P[k + 1], strict=True)]
-        rise: Fraction = motion.rho[k + 1] - motion.rho[k]
-        return 2 * ring.dot(self.moved, self.Px) + rise - ring.form(bend, ring.variables)
+        return 2 * self.ring.dot(self.moved, self.Px) + self.slope(self.gap)
 
     def rates(self, corner: Corner, w: Sequence[Fraction]) -> list[Polynomial]:
         """f(t, x₀ + x̄, clip(ũ) + δ, w) at a corner of the box of δ."""
@@ -225,18 +223,19 @@ class ClosedLoop:
         return self.ring.substituted(self.motion.equations[self.k], values)
 
     def turning(self, i: int, f: Sequence[Polynomial]) -> Polynomial:
-        """dũ_i/ds = du₀/ds - (dK/ds)x̄ - K(h f - dx₀/ds), where ẋ = f."""
-        ring, gains = self.ring, self._gains(i)
-        (planned,) = self._curve(slopes([[u[i]] for u in self.motion.u[self.k]]))
-        turned = ring.dot(self._curve(slopes(gains)), ring.variables)
+        """dũ_i/ds = du₀/ds - (dK/ds)x̄ - K(h f - dx₀/ds), where ẋ = f and u_i is at no limit."""
         moved = [m - self.h * rate for m, rate in zip(self.moved, f, strict=True)]
-        return planned - turned + ring.dot(self._curve(gains), moved)
+        return self.slope(self.inputs[i]) + self.ring.dot(self._curve(self._gains(i)), moved)
 
     def taken(self, taus: Node, held: list[Polynomial], sides: Node) -> list[Polynomial]:
         """-τ q for everything that is nonnegative here, τ sums of squares in `sides`."""
         pairs = zip(taus.items(len(held), len(held)), held, strict=True)
         read = ((node.members("columns squares") | {"basis": sides}, q) for node, q in pairs)
-        return [-1 * (expanded(tau, self.ring) * q) for tau, q in read]
+        return [-1 * (read_squares(tau, self.ring).form * q) for tau, q in read]
+
+    def slope(self, p: Polynomial) -> Polynomial:
+        """The derivative along the interval, of which this part is 2^-level."""
+        return (1 << self.level) * self.ring.derivative(p)
 
     def _gains(self, i: int) -> list[list[Fraction]]:
         """Control points of row i of K."""
@@ -251,19 +250,11 @@ def read_multiplier(node: Node, rows: list[bytes], ring: Ring) -> Polynomial:
     """μ, of any sign: `shifts`, `start` and `end` of each monomial's coefficient, linear in s."""
     size, stated = len(rows), node.members("shifts start end")
     shifts = powers_of_two(stated["shifts"], size)
-    units = [Fraction(2) ** s * ring.monomial(row) for s, row in zip(shifts, rows, strict=True)]
-    start, end = (ring.dot(stated[name].wholes(size), units) for name in ("start", "end"))
-    return start + ring.bernstein([Fraction(0), Fraction(1)]) * (end - start)
-
-
-def slopes(points: Sequence[Sequence[Fraction]]) -> list[list[Fraction]]:
-    """Control points of a curve's derivative in s."""
-    degree = len(points) - 1
-    found = [
-        [degree * (b - a) for a, b in zip(before, after, strict=True)]
-        for before, after in pairwise(points)
-    ]
-    return found or [[Fraction(0)] * len(points[0])]
+    least, monomials, ends = min(shifts, default=0), list(map(ring.monomial, rows)), []
+    for name in ("start", "end"):
+        stated_ones = zip(stated[name].wholes(size), shifts, strict=True)
+        ends.append(ring.dot([value << s - least for value, s in stated_ones], monomials))
+    return Fraction(2) ** least * ring.dot([ring.bernstein(unit(j, 2)) for j in (0, 1)], ends)
 
 
 def read_hold(claim: Node, stated: dict[str, Any], motion: Motion) -> None:

@@ -8,12 +8,12 @@ sum of the absolute values of all its integers, and below 2^(width - 1) the pack
 `coefficients` refuses to otherwise, and `at_width` tries a larger width.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from math import comb, lcm
+from operator import mul
 from secrets import randbits
 from typing import TypeVar, Union
 
@@ -32,7 +32,7 @@ class TooNarrow(Exception):  # noqa: N818 - a signal to try again
     """The width of a ring does not hold a result; its argument is the width that does."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Polynomial:
     """Σ terms[monomial] / denominator; degree in x, order in s, norm: upper bounds."""
 
@@ -44,18 +44,16 @@ class Polynomial:
     norm: int
 
     def __add__(self, other: Scalar) -> "Polynomial":
-        return self.ring.weighted([(1, self), (1, self.ring.made(other))])
+        return self.ring.sum([self, self.ring.made(other)])
 
     def __sub__(self, other: Scalar) -> "Polynomial":
-        return self.ring.weighted([(1, self), (-1, self.ring.made(other))])
+        return self.ring.dot([1, -1], [self, self.ring.made(other)])
 
     def __rsub__(self, other: Scalar) -> "Polynomial":
-        return self.ring.weighted([(-1, self), (1, self.ring.made(other))])
+        return self.ring.dot([-1, 1], [self, self.ring.made(other)])
 
     def __mul__(self, other: Scalar) -> "Polynomial":
-        if isinstance(other, Polynomial):
-            return self.ring.times(self, other)
-        return self.ring.weighted([(other, self)])
+        return self.ring.dot([other], [self])
 
     __rmul__ = __mul__
 
@@ -92,47 +90,51 @@ class Ring:
 
     def made(self, value: Scalar) -> Polynomial:
         """A polynomial, or a number as one."""
-        return value if isinstance(value, Polynomial) else self.bernstein([Fraction(value)])
+        if isinstance(value, Polynomial):
+            return value
+        return Polynomial(self, {0: value.numerator}, value.denominator, 0, 0, abs(value.numerator))
 
     def bernstein(self, points: Sequence[Fraction], level: int = 0, index: int = 0) -> Polynomial:
         """Σ_j B_j(r) points[j] with r = (index + s) / 2^level."""
-        d = len(points) - 1
         common = lcm(*(point.denominator for point in points))
-        row = [point.numerator * (common // point.denominator) for point in points]
-        whole = [0] * (d + 1)
-        for k in range(d + 1):  # row[0] C(d, k) multiplies r^k, here times 2^(level d)
-            power = comb(d, k) * row[0] << level * (d - k)
-            for j in range(k + 1):
-                whole[j] += power * comb(k, j) * index ** (k - j)
-            row = [after - before for before, after in pairwise(row)]
-        packed = sum(c << (self.width * k) for k, c in enumerate(whole))
-        terms = {0: packed} if packed else {}
-        return Polynomial(self, terms, common << level * d, 0, d, sum(map(abs, whole)))
+        weights = [point.numerator * (common // point.denominator) for point in points]
+        d = len(points) - 1
+        basis, norms = _bernstein(d, level, index, self.width)
+        norm = sum(map(mul, map(abs, weights), norms))
+        return Polynomial(self, {0: sum(map(mul, weights, basis))}, common << level * d, 0, d, norm)
 
-    def weighted(self, parts: Sequence[tuple[Fraction | int, Polynomial]]) -> Polynomial:
-        """Σ weight part."""
-        common = lcm(*(p.denominator * weight.denominator for weight, p in parts))
-        terms: dict[int, int] = {}
-        norm = degree = order = 0
-        for weight, p in parts:
-            factor = weight.numerator * (common // (p.denominator * weight.denominator))
-            if factor:
-                norm += abs(factor) * p.norm
-                degree, order = max(degree, p.degree), max(order, p.order)
-                for key, value in p.terms.items():
-                    terms[key] = terms.get(key, 0) + value * factor
-        return Polynomial(self, terms, common, degree, order, norm)
+    def derivative(self, p: Polynomial) -> Polynomial:
+        """dp/ds."""
+        terms = {
+            key: sum(i * c << self.width * (i - 1) for i, c in enumerate(row) if i)
+            for key, row in self.coefficients(p)
+        }
+        return replace(p, terms=terms, order=max(0, p.order - 1), norm=p.order * p.norm)
 
     def sum(self, parts: Sequence[Polynomial]) -> Polynomial:
         """The sum of the parts."""
-        return self.weighted([(1, p) for p in parts])
+        return self.dot([1] * len(parts), parts)
 
     def dot(self, a: Sequence[Scalar], b: Sequence[Polynomial]) -> Polynomial:
-        """Σ_i a[i] b[i]."""
-        pairs = [(p, q) for p, q in zip(a, b, strict=True) if p]
-        return self.weighted(
-            [(1, p * q) if isinstance(p, Polynomial) else (p, q) for p, q in pairs]
-        )
+        """Σ_i a[i] b[i]; numbers that are 0 leave no trace."""
+        pairs = [(self.made(p), q) for p, q in zip(a, b, strict=True) if p]
+        common = lcm(*[p.denominator * q.denominator for p, q in pairs])
+        terms: dict[int, int] = {}
+        degree = order = norm = 0
+        for p, q in pairs:
+            factor = common // (p.denominator * q.denominator)
+            degree, order = max(degree, p.degree + q.degree), max(order, p.order + q.order)
+            norm += factor * p.norm * q.norm
+            if degree > MAX_DEGREE or norm.bit_length() > MAX_WIDTH:
+                raise Rejected(f"a product beyond degree {MAX_DEGREE} or too long", "too_large")
+            for left, value in p.terms.items():
+                weight = factor * value
+                for right, entry in q.terms.items():
+                    key = left + right
+                    terms[key] = terms.get(key, 0) + weight * entry
+                if len(terms) > MAX_TERMS:
+                    raise Rejected(f"a polynomial of more than {MAX_TERMS} terms", "too_large")
+        return Polynomial(self, terms, common, degree, order, norm)
 
     def product(self, M: Sequence[Sequence[Scalar]], p: Sequence[Polynomial]) -> list[Polynomial]:
         """M p."""
@@ -153,63 +155,48 @@ class Ring:
                 powers[exponents] = values[last] * power(lower)
             return powers[exponents]
 
-        return lambda p: self.weighted([(c, power(bytes(e))) for e, c in p])
+        return lambda p: self.dot([c for _, c in p], [power(bytes(e)) for e, _ in p])
 
     def substituted(self, ps: Sequence[Terms], values: Sequence[Polynomial]) -> list[Polynomial]:
         """Each of ps with a polynomial in the place of each variable."""
         return list(map(self.substitution(values), ps))
 
-    def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
-        """p q."""
-        degree, norm = p.degree + q.degree, p.norm * q.norm
-        if degree > MAX_DEGREE or norm.bit_length() > MAX_WIDTH:
-            raise Rejected(f"a product beyond degree {MAX_DEGREE} or too long", "too_large")
-        terms: dict[int, int] = {}
-        for left, a in p.terms.items():
-            for right, b in q.terms.items():
-                key = left + right
-                terms[key] = terms.get(key, 0) + a * b
-            if len(terms) > MAX_TERMS:
-                raise Rejected(f"a polynomial of more than {MAX_TERMS} terms", "too_large")
-        denominator = p.denominator * q.denominator
-        return Polynomial(self, terms, denominator, degree, p.order + q.order, norm)
+    def coefficients(self, p: Polynomial) -> Iterator[tuple[int, list[int]]]:
+        """Each monomial, and its whole coefficients of s^0, s^1 … over p.denominator.
 
-    def coefficients(self, p: Polynomial, cut: int = 0) -> dict[int, list[int]]:
-        """Each monomial's whole coefficients of s^0 … s^order, over p.denominator.
-
-        cut: bytes that are cut off each, which rounds down.
+        They go on to the last that is not 0.
         """
-        needed = p.norm.bit_length() + 1
-        if needed > self.width:
-            raise TooNarrow(-(-needed // STEP) * STEP)
-        size, count = self.width // 8, p.order + 1
-        return {
-            key: unpacked(value, size, count, cut=cut) for key, value in p.terms.items() if value
-        }
+        if p.norm.bit_length() >= self.width:
+            raise TooNarrow((p.norm.bit_length() // STEP + 1) * STEP)
+        half = 1 << self.width - 1
+        mask = 2 * half - 1
+        for key, value in p.terms.items():
+            row = []
+            while value:
+                row.append(((value + half) & mask) - half)
+                value = (value - row[-1]) >> self.width
+            yield key, row
 
-
-def packed(row: Sequence[int], width: int) -> int:
-    """Σ_k row[k] 256^(width k): lanes of `width` bytes, signed."""
-    half = 1 << (8 * width - 1)
-    lanes = b"".join([(entry + half).to_bytes(width, "little") for entry in row])
-    return int.from_bytes(lanes, "little") - _halves(width, len(row))
-
-
-def unpacked(line: int, width: int, count: int, first: int = 0, cut: int = 0) -> list[int]:
-    """The row of `packed` from `first` on, without `cut` bytes of each entry.
-
-    Every entry has to be below half of its lane.
-    """
-    half = 1 << (8 * (width - cut) - 1)
-    lanes = (line + _halves(width, count)).to_bytes(width * count, "little")
-    starts = range(width * first, width * count, width)
-    return [int.from_bytes(lanes[i + cut : i + width], "little") - half for i in starts]
+    def bernstein_coefficients(self, p: Polynomial, width: int) -> Iterator[tuple[int, int]]:
+        """Each monomial, and Σ_k C(order, k) b_k 2^(width k), b_k of its Bernstein coefficients."""
+        for key, row in self.coefficients(p):
+            lanes = 0
+            for i, coefficient in enumerate(row):  # of s^i (s + (1 - s))^(order - i)
+                lanes += (lanes << width) + (coefficient << width * i)
+            for _ in range(p.order + 1 - len(row)):
+                lanes += lanes << width
+            yield key, lanes
 
 
 @lru_cache(maxsize=64)
-def _halves(width: int, count: int) -> int:
-    """Half of the range of each of `count` lanes of `width` bytes."""
-    return int.from_bytes((bytes(width - 1) + b"\x80") * count, "little")
+def _bernstein(d: int, level: int, index: int, width: int) -> tuple[list[int], list[int]]:
+    """2^(level d) B_j(r), r = (index + s) / 2^level, packed, and bounds of their norms."""
+    r, top = index + (1 << width), 1 << level
+    shares = [comb(d, j) for j in range(d + 1)]
+    return (
+        [share * r**j * (top - r) ** (d - j) for j, share in enumerate(shares)],
+        [share * (index + 1) ** j * (top - index + 1) ** (d - j) for j, share in enumerate(shares)],
+    )
 
 
 def at_width(count: int, cases: Iterable[Case], decide: Callable[[Ring, Case], None]) -> None:

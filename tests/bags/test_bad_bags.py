@@ -1,15 +1,33 @@
-"""Every way a bag can be bad: a BagError that names the bag, what is wrong, and what to do."""
+"""Bad and hostile bags: an error that names the bag, what is wrong and what to do."""
 
+import os
+import random
+import resource
+import signal
+import struct
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from multiprocessing import get_context
 from pathlib import Path
+from shutil import rmtree
+from typing import Final
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
+import zstandard
+from mcap.writer import CompressionType, Writer
 
+from bags.recordings.bag import Bag
+from bags.recordings.mcap_file import McapFile
+from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import bag_digest, read_signals
-from nlsid_core.errors import BagError, DataError
+from bags.signals.signal import numeric_paths
+from bags.tools.convert import convert
+from bags.tools.info import bag_info
+from bags.tools.recover import recover
+from nlsid_core.errors import BagError, DataError, NlsidError
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -24,6 +42,7 @@ from tests.bag_messages import (
     odometry,
     speed_bag,
 )
+from tests.mcap_files import write_mcap
 
 RESOURCES = Path(__file__).parents[2].parent / "shared" / "data" / "rosbag2_resources"
 
@@ -237,3 +256,288 @@ def test_a_bad_path_is_refused_before_a_message_is_read(bag: Path) -> None:
 def test_the_wrong_format_bag_of_rosbag2_itself() -> None:
     bag = RESOURCES / "rosbag2_tests" / "resources" / "mcap" / "wrong_rmw_test"
     assert "wrong_format" in refused(bag, "/test_topic:data")
+
+
+# -- Bags made to break readers: paths that leave the bag, lies about sizes and counts, bombs, fuzz
+
+FILES: Final = 4_000
+SECONDS: Final = 10
+MEGABYTES: Final = 500
+WORKERS: Final = 2
+PART: Final = 500  # files per task
+
+
+def replaced(bag: Path, name: str) -> None:
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("trial.mcap", name))
+
+
+@pytest.mark.parametrize("name", ["../other/trial.mcap", "/etc/passwd", "a/../../other/trial.mcap"])
+def test_metadata_may_not_name_files_outside_the_bag(bag: Path, name: str) -> None:
+    speed_bag(bag.parent / "other", [0.0, 1.0], [0.0, 1.0])
+    (bag.parent / "other" / "other.mcap").rename(bag.parent / "other" / "trial.mcap")
+    replaced(bag, name)
+    with pytest.raises(BagError, match="which is outside the bag"):
+        read_signals(bag, [SPEED])
+
+
+def test_a_link_may_not_lead_outside_the_bag(bag: Path) -> None:
+    (bag / "trial.mcap").rename(bag.parent / "elsewhere.mcap")
+    (bag / "trial.mcap").symlink_to(bag.parent / "elsewhere.mcap")
+    with pytest.raises(BagError, match="which is outside the bag"):
+        read_signals(bag, [SPEED])
+    (bag / "trial.mcap").unlink()
+    (bag / "trial.mcap").symlink_to("trial.mcap")
+    with pytest.raises((BagError, OSError)):
+        read_signals(bag, [SPEED])
+
+
+@pytest.mark.parametrize("count", [-1, 2**62, 10**30])
+def test_huge_counts_in_metadata_cost_no_memory(bag: Path, count: int) -> None:
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(
+        metadata.read_text().replace("message_count: 50", f"message_count: {count}")
+    )
+    with pytest.raises(BagError, match="messages, the bag's index says"):
+        read_signals(bag, [SPEED])
+
+
+def test_a_type_made_of_itself_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "loop.mcap"
+    text = "pkg/A a\n" + "=" * 80 + "\nMSG: pkg/A\npkg/A a"
+    write_mcap(file, {"/x": ("pkg/msg/A", text)})
+    with pytest.raises(BagError):
+        read_signals(file, ["/x:a.a.a"])
+    with pytest.raises(NlsidError):
+        _read(file, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_ten_thousand_topics_are_listed_and_read(tmp_path: Path) -> None:
+    file = tmp_path / "many.mcap"
+    write_mcap(file, {f"/t{k}": ("std_msgs/msg/Float64", "float64 data") for k in range(10_000)})
+    with Bag(file) as bag:
+        assert len(bag.topics) == 10_000
+        assert bag.count("/t9999") == 1
+    assert read_signals(file, ["/t9999:data"])["/t9999:data"].values.tolist() == [0.5]
+
+
+def test_topics_with_no_name_or_odd_names_are_listed(tmp_path: Path) -> None:
+    file = tmp_path / "odd.mcap"
+    names = ["", "/a b", "/ü", "../../x", "/x\ny", "[red]"]
+    write_mcap(file, dict.fromkeys(names, ("std_msgs/msg/Float64", "float64 data")))
+    assert {topic.topic for topic in bag_info(file).topics} == set(names)
+    assert recover(file, tmp_path / "out").messages == len(names)
+    assert {p.name for p in tmp_path.iterdir()} == {"odd.mcap", "out"}
+
+
+@pytest.fixture(scope="module")
+def zeros() -> bytes:
+    """300 MB in a few kB."""
+    return zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
+
+
+@pytest.mark.parametrize("stated", [2**20, 2**31, 2**62])
+def test_a_decompression_bomb_is_refused_before_it_unpacks(
+    tmp_path: Path, zeros: bytes, stated: int
+) -> None:
+    file = tmp_path / "bomb.mcap"
+    file.write_bytes(bomb_file(zeros, stated))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with closing(McapFile(file, salvage=True)) as opened:
+        assert opened.contents.lost
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 200 * 1024
+
+
+def test_a_type_of_arrays_of_arrays_that_hold_nothing_is_refused(tmp_path: Path) -> None:
+    line = "=" * 80
+    parts = [
+        "pkg/A[1000] a",
+        line,
+        "MSG: pkg/A",
+        "pkg/B[1000] b",
+        line,
+        "MSG: pkg/B",
+        "uint8[0] c",
+    ]
+    file = tmp_path / "deep.mcap"
+    write_mcap(file, {"/x": ("pkg/msg/Deep", "\n".join(parts))})
+    with pytest.raises(NlsidError):
+        read_signals(file, ["/x:a[999].b[999].c[0]"])
+
+
+def bomb_file(packed: bytes, *stated: int) -> bytes:
+    """An MCAP file with chunks of those zeros, each stating its size."""
+    content = b"\x89MCAP0\r\n" + struct.pack("<BQII", 1, 8, 0, 0)
+    for size in stated:
+        chunk = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd"
+        chunk += struct.pack("<Q", len(packed)) + packed
+        content += struct.pack("<BQ", 6, len(chunk)) + chunk
+    return content
+
+
+def seeds(folder: Path) -> list[bytes]:
+    """Small bags of every layout: zstd, lz4, uncompressed, unchunked, custom types, a bomb."""
+    found = []
+    options: list[dict[str, object]] = [
+        {"compression": kind, "chunk_size": 600} for kind in CompressionType
+    ]
+    options.append({"use_chunking": False})
+    types = {
+        "/cmd": (CMD_TYPE, standard_types().generate_msgdef(CMD_TYPE, ros_version=2)[0]),
+        "/odom": (ODOM_TYPE, standard_types().generate_msgdef(ODOM_TYPE, ros_version=2)[0]),
+        "/x": (
+            "pkg/msg/X",
+            "string[] names\nfloat64[] data\npkg/Y[2] y\n"
+            + "=" * 80
+            + "\nMSG: pkg/Y\nint16 a\nstring<=8 b",
+        ),
+    }
+    for k, option in enumerate(options):
+        file = folder / f"seed_{k}.mcap"
+        with file.open("wb") as stream:
+            writer = Writer(stream, **option)  # type: ignore[arg-type]
+            writer.start(profile="ros2")
+            channels = {
+                topic: writer.register_channel(
+                    topic, "cdr", writer.register_schema(kind, "ros2msg", text.encode())
+                )
+                for topic, (kind, text) in types.items()
+            }
+            for n in range(12):
+                writer.add_message(channels["/cmd"], n, command(n + 1, float(n)), n)
+                data = b"\0\1\0\0" + struct.pack("<IIxxxxxxxx", 0, 1) + struct.pack("<d", n)
+                writer.add_message(channels["/x"], n, data, n)
+            writer.add_metadata("custom_data", {"a": "b"})
+            writer.finish()  # type: ignore[no-untyped-call]
+        found.append(file.read_bytes())
+    zeros = zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
+    return [*found, bomb_file(zeros, 300 * 2**20, 2**20)]
+
+
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """One to four changes: bits, bytes, lengths, cuts, copies, schema text."""
+    data = bytearray(content)
+    for _ in range(rng.randint(1, 4)):
+        kind, at = rng.randrange(7), rng.randrange(8, max(9, len(data) - 8))
+        if kind == 0:
+            data[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            data[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFF))
+        elif kind == 2:
+            value = rng.choice((0, 1, 2**16, 2**31 - 1, 2**32, 2**62, 2**64 - 1, len(data)))
+            data[at : at + 8] = struct.pack("<Q", value)
+        elif kind == 3:
+            del data[rng.randrange(8, len(data)) :]
+        elif kind == 4:
+            data[at:at] = data[at : at + rng.randrange(200)]
+        elif kind == 5:
+            del data[at : at + rng.randrange(1, 64)]
+        else:
+            words = (b"float64", b"string", b"uint8", b"data", b"[]", b"pkg/Y", b"names", b"zstd")
+            found = data.find(rng.choice(words))
+            if found >= 0:
+                text = rng.choice((b"[99999]", b"pkg/X", b"\xff\xfe", b"__x__", b"\n=="))
+                data[found : found + len(text)] = text
+        if len(data) < 16:
+            break
+    return bytes(data)
+
+
+def fuzz(folder: str, first: int, contents: list[bytes]) -> dict[str, int]:
+    """Outcomes of PART mutated files: data or one of our errors; anything else is raised."""
+    limit = MEGABYTES * 2**20
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    signal.signal(signal.SIGPROF, _too_long)
+    outcomes = {"data": 0, "error": 0}
+    home = Path(folder) / f"part_{first}"
+    home.mkdir()
+    for number in range(first, first + PART):
+        rng = random.Random(number)
+        file, out = home / f"{number}.mcap", home / f"{number}.out"
+        file.write_bytes(mutated(rng.choice(contents), rng))
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of processor time
+        for step in STEPS:
+            try:
+                step(file, out)
+            except NlsidError:
+                outcomes["error"] += 1
+            except BaseException as error:
+                kept = Path(folder) / f"bad_{number}.mcap"
+                kept.write_bytes(file.read_bytes())
+                raise AssertionError(f"file {number}, {kept}: {error!r}") from error
+            else:
+                outcomes["data"] += 1
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        left = {entry.name for entry in home.iterdir()}
+        assert left <= {file.name, out.name}, left
+        for entry in out.iterdir() if out.is_dir() else ():
+            entry.unlink()
+        if out.is_dir():
+            out.rmdir()
+        file.unlink()
+    return outcomes
+
+
+def _info(file: Path, _: Path) -> None:
+    bag_info(file)
+    bag_info(file, messages=True)
+
+
+def _read(file: Path, _: Path) -> None:
+    with Bag(file, unfinished=True) as bag:
+        for topic in list(bag.topics)[:4]:
+            kind, types = bag.types_on(topic)
+            for entry in list(numeric_paths(kind, types))[:3]:
+                read_signals(bag, [f"{topic}:{entry[0]}"])
+
+
+def _recover(file: Path, out: Path) -> None:
+    recover(file, out)
+
+
+def _convert(file: Path, out: Path) -> None:
+    with Bag(file, unfinished=True) as bag:
+        convert([bag], out)
+    assert bag_info(out, messages=True).ending is None
+    rmtree(out)
+
+
+STEPS: Final[tuple[Callable[[Path, Path], None], ...]] = (_info, _read, _convert, _recover)
+
+
+def _too_long(_signal: int, _frame: object) -> None:
+    raise TimeoutError(f"more than {SECONDS} s of processor time")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_thousands_of_mutated_files_give_data_or_our_error_in_bounded_time_and_memory(
+    tmp_path: Path,
+) -> None:
+    contents = seeds(tmp_path)
+    outside = set(os.listdir(tmp_path))  # noqa: PTH208
+    with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
+        parts = [
+            pool.submit(fuzz, str(tmp_path), first, contents) for first in range(0, FILES, PART)
+        ]
+        outcomes = [part.result() for part in parts]
+    total = {key: sum(found[key] for found in outcomes) for key in ("data", "error")}
+    assert total["data"] + total["error"] == FILES * len(STEPS)
+    assert total["data"] > 0.05 * FILES
+    assert total["error"] > 0.05 * FILES
+    assert {p.name for p in tmp_path.iterdir() if not p.name.startswith("part_")} == outside
+
+
+def test_a_few_mutated_files_give_data_or_our_error(tmp_path: Path) -> None:
+    contents = seeds(tmp_path)
+    for number in range(60):
+        rng = random.Random(-number)
+        file = tmp_path / "mutated.mcap"
+        file.write_bytes(mutated(rng.choice(contents), rng))
+        for step in STEPS[:3]:
+            try:
+                step(file, tmp_path / "out")
+            except NlsidError as error:
+                assert str(file) in str(error)  # noqa: PT017

@@ -17,11 +17,6 @@ from tests.bags.deciding import decide
 
 
 @pytest.fixture
-def funnel(f1tenth_chain: Path) -> Path:
-    return f1tenth_chain / documents.FUNNEL
-
-
-@pytest.fixture
 def bundle(funnel: Path) -> Bundle:
     return Bundle.load(funnel)
 

@@ -24,14 +24,13 @@ from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
-from bags.signals.grid import read_dataset
-from bags.signals.sampling import Grid
 from bags.signals.signal import SignalPath
+from nlsid import Grid, Status, read_bags
 from nlsid_core import files
 from nlsid_core.errors import DataError
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
+from tests.bag_messages import put
 from tests.verbs import nlsid
 
 CONFIG = config_file("f1tenth.yaml")
@@ -277,12 +276,11 @@ def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
             if message.topic == "/cmd_vel" and message.log_time_ns > last:
                 continue
             kind, _ = source.types_on(message.topic)
-            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
-            target.write(message.topic, kind, message.data, **times)
+            put(target, message.log_time_ns, message.topic, kind, message.data)
     signals = {"responses": [SPEED], "excitations": ["/cmd_vel:twist.linear.x"]}
     grid = Grid(0.025, 0.1)
-    [whole] = read_dataset([trial("05")], **signals, grid=grid)  # type: ignore[arg-type]
-    [fewer] = read_dataset([bag], **signals, grid=grid)  # type: ignore[arg-type]
+    [whole] = read_bags([trial("05")], **signals, grid=grid)  # type: ignore[arg-type]
+    [fewer] = read_bags([bag], **signals, grid=grid)  # type: ignore[arg-type]
     assert documents.load_model(chain / documents.MODEL).u.path.endswith("|hold(0.1 s)")
     replayed = replay(chain, bag)
     judged = len(replayed.judged) + len(documents.load_model(chain / documents.MODEL))
@@ -413,7 +411,7 @@ def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
     write_faulty_copy(trial("05"), tmp_path / "bag", str(path), FAULTS["scaled by 0.6"])
     signals = ["/odom:twist.twist.linear.x", "/odom:pose.pose.position.x"]
     before, after = (
-        read_dataset([bag], responses=signals, excitations=["/cmd_vel:twist.linear.x"])
+        read_bags([bag], responses=signals, excitations=["/cmd_vel:twist.linear.x"])
         for bag in (trial("05"), tmp_path / "bag")
     )
     original, copy = before.trajectories[0], after.trajectories[0]
@@ -481,10 +479,10 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
     "verb",
     [
         ("monitor", "DIR", "BAG"),
-        ("check", "DIR"),
-        ("bag", "info", "BAG"),
+        pytest.param(("check", "DIR"), marks=pytest.mark.slow),
+        pytest.param(("bag", "info", "BAG"), marks=pytest.mark.slow),
         ("bag", "signals", "BAG", "--json"),
-        ("fleet", "monitor", "DIR", "BAG"),
+        pytest.param(("fleet", "monitor", "DIR", "BAG"), marks=pytest.mark.slow),
     ],
 )
 def test_the_status_is_the_same_where_nobody_reads_what_is_said(
@@ -513,8 +511,7 @@ def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_
     with Bag(trial("05")) as source, BagWriter(tmp_path / "short") as target:
         for message in list(source.messages())[:9]:
             kind, _ = source.types_on(message.topic)
-            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
-            target.write(message.topic, kind, message.data, **times)
+            put(target, message.log_time_ns, message.topic, kind, message.data)
     picture = tmp_path / "monitor.png"
     picture.write_bytes(b"of another run")
     arguments = ["monitor", str(chain), str(tmp_path / "short"), "--out", str(picture)]

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import (
+from nlsid import (
+    Dataset,
     Degrees,
     FilterMapFilter,
     Fit,
@@ -19,12 +17,15 @@ from nlsid_core.identification import (
     Rie,
     Rse,
     Sem,
+    Trajectory,
+    check,
     identify,
-    validate,
 )
+from nlsid_core import files
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import validate
 from nlsid_core.identification.prediction import simulate_trial
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
-from nlsid_core.proofs import check
 from tests import repeated
 from tests.conftest import synthetic_dataset
 from tests.identified_bags import saturating

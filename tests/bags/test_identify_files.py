@@ -13,10 +13,9 @@ import yaml
 from bags.chain.config import SplitConfig, load_config
 from bags.chain.steps import read_trials, split
 from bags.designs import documents
-from bags.signals.grid import read_dataset, skipped_samples
-from bags.signals.sampling import Grid
+from bags.signals.grid import skipped_samples
+from nlsid import Dataset, Grid, Trajectory, read_bags
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.models import (
     BlockCascade,
@@ -95,10 +94,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_coupled_bags(tmp_path_factory.mktemp("coupled"))
-
-
-def bags_in(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir())
 
 
 def one_digit_changed(text: str, after: str) -> str:
@@ -230,15 +225,13 @@ def test_stretches_of_one_bag_are_not_repeats_of_each_other(tmp_path: Path) -> N
     speeds = np.random.default_rng(1).standard_normal(100)
     speeds[40:60] = np.nan
     bag = speed_bag(tmp_path / "run", speeds, np.arange(100.0), custom={"repeat_group": "a"})
-    data = read_dataset([bag], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True))
+    data = read_bags([bag], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True))
     assert [len(trial) for trial in data] == [40, 40]
     assert not data.repeats()
     assert skipped_samples(data) == 20
     nothing = speed_bag(tmp_path / "none", np.full(9, np.nan), np.arange(9.0))
     with pytest.raises(DataError, match=r"is nan in message 0 .*\(9 of 9"):
-        read_dataset(
-            [nothing], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True)
-        )
+        read_bags([nothing], responses=[SPEED], excitations=[COMMAND], grid=Grid(split_gaps=True))
 
 
 @pytest.mark.parametrize(

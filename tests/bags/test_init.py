@@ -21,7 +21,6 @@ from bags.chain.identification_config import section_of
 from bags.chain.training import decoded
 from bags.commands.init import said_briefly
 from bags.designs import documents
-from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
@@ -36,6 +35,7 @@ from nlsid_core.identification.choosing import HeldOut
 from tests.bag_messages import (
     CMD_TYPE,
     COMMAND,
+    JOINT_TYPE,
     SPEED,
     START_NS,
     command,
@@ -43,6 +43,8 @@ from tests.bag_messages import (
     joints,
     number_bag,
     odometry,
+    put,
+    serialised,
     speed_bag,
     twist,
 )
@@ -87,9 +89,8 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     assert replayed.count("inside") == 8
 
 
-def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
-    nlsid("init", tmp_path, *f1tenth()[:6], "--yes")
-    lines = (tmp_path / "robot.yaml").read_text().splitlines()
+def test_every_key_of_the_written_file_has_a_comment(axes: tuple[Path, str]) -> None:
+    lines = axes[0].read_text().splitlines()
     keys = [k for k, line in enumerate(lines) if re.match(r" *[a-z_]+:", line)]
     assert len(keys) >= 15
     assert not [lines[k] for k in keys if not lines[k - 1].lstrip().startswith("#")]
@@ -293,15 +294,9 @@ def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> No
             for k in range(400):
                 force = float(rng.uniform(-1.0, 1.0)) if k % 10 == 0 else force
                 stamp_ns = START_NS + 50_000_000 * k
-                times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
                 measured = way + 1e-4 * rng.standard_normal()
-                writer.write("/cmd_vel", CMD_TYPE, command(stamp_ns, force), **times)
-                writer.write(
-                    "/joint_states",
-                    "sensor_msgs/msg/JointState",
-                    joints(stamp_ns, [measured]),
-                    **times,
-                )
+                put(writer, stamp_ns, "/cmd_vel", CMD_TYPE, command(stamp_ns, force))
+                put(writer, stamp_ns, "/joint_states", JOINT_TYPE, joints(stamp_ns, [measured]))
                 way += 0.05 * speed
                 speed += 0.05 * (force - speed)
     said = nlsid("init", config.parent, bags, "--yes", "-u", CMD, "-y", position)
@@ -422,6 +417,7 @@ def test_a_command_that_never_varies_is_an_answer_and_no_configuration(
     assert not config.exists()
 
 
+@pytest.mark.slow
 def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) -> None:
     """Steps of 20, 22 and 22 ms in turn: on a grid of the median a monitor judges 4 samples."""
     stamps = START_NS + np.cumsum([20_000_000, 22_000_000, 22_000_000] * 100)
@@ -465,10 +461,18 @@ def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: 
         choose(found, ["/speed_c:data"])
 
 
-def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(tmp_path: Path) -> None:
-    bag, config = tmp_path / "bag", tmp_path / "robot.yaml"
-    two_axes(bag)
-    said = nlsid("init", config.parent, bag, "--yes")
+@pytest.fixture(scope="module")
+def axes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The configuration that init writes for two axes, and what it says."""
+    folder = tmp_path_factory.mktemp("axes")
+    two_axes(folder / "bag")
+    return folder / "robot.yaml", nlsid("init", folder, folder / "bag", "--yes")
+
+
+def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(
+    axes: tuple[Path, str],
+) -> None:
+    config, said = axes
     [chosen] = load_config(config).signals.response
     other = "b" if chosen.path.startswith("/speed_a") else "a"
     assert f"there are others like it: /speed_{other}:data follows /cmd_{other}:data (+" in said
@@ -489,16 +493,14 @@ def test_many_bags_are_said_as_their_folder(tmp_path: Path) -> None:
 
 def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
     commands = np.repeat(np.random.default_rng(2).uniform(-1.0, 1.0, (20, 2)), 10, axis=0)
-    types, kind = standard_types(), "geometry_msgs/msg/Twist"
+    kind = "geometry_msgs/msg/Twist"
     with BagWriter(tmp_path / "bag") as writer:
         for k, (forward, turn) in enumerate(commands):
-            times = dict.fromkeys(("log_time_ns", "publish_time_ns"), START_NS + k * 25_000_000)
+            at = START_NS + k * 25_000_000
             message = twist(forward)
             message.angular.z = turn + 0.5 * forward
-            writer.write("/cmd_vel", kind, bytes(types.serialize_cdr(message, kind)), **times)
-            writer.write(
-                "/odom", "nav_msgs/msg/Odometry", odometry(times["log_time_ns"], 0.0), **times
-            )
+            put(writer, at, "/cmd_vel", kind, serialised(kind, message))
+            put(writer, at, "/odom", "nav_msgs/msg/Odometry", odometry(at, 0.0))
     with pytest.raises(BagError, match=r"no number follows another; .*always the same: /odom:"):
         choose(look([tmp_path / "bag"]))
 
@@ -632,9 +634,8 @@ def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: P
         for k, value in enumerate(pumped.tolist()):
             stamp = START_NS + k * 500_000_000
             level += 0.1 * (value - level)
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
-            writer.write("/pump", CMD_TYPE, command(stamp, value), **times)
-            writer.write("/level", "sensor_msgs/msg/JointState", joints(stamp, [level]), **times)
+            put(writer, stamp, "/pump", CMD_TYPE, command(stamp, value))
+            put(writer, stamp, "/level", JOINT_TYPE, joints(stamp, [level]))
     said = nlsid(
         "init", tmp_path, bag, "-u", "/pump:twist.linear.x", "-y", "/level:position[name=joint_0]"
     )
@@ -700,6 +701,7 @@ def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path)
     assert reason in refused
 
 
+@pytest.mark.slow
 def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_path: Path) -> None:
     """The trials that are not held back stand still: only with the moving one is there a model."""
     rng = np.random.default_rng(0)

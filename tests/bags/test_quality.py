@@ -1,14 +1,23 @@
-"""Quality of service in copies of bags: kept, and such that every reader finds every message."""
+"""Bags that are written: split, compressed, with quality of service, as every reader reads them."""
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 import yaml
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -18,14 +27,252 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.typesys import Stores, get_typestore
 
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import read_definitions
+from bags.recordings.message_types import decode
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
 from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, Recent
 from bags.tools.copies import Into
 from bags.tools.recover import recover, repair
 from nlsid_core.errors import BagError
-from tests.bag_messages import START_NS, converted, speed_bag
+from tests.bag_messages import (
+    CMD,
+    CMD_TYPE,
+    ODOM,
+    ODOM_TYPE,
+    PERIOD_NS,
+    START_NS,
+    command,
+    converted,
+    odometry,
+    speed_bag,
+)
 from tests.conftest import SHARED
+from tests.mcap_files import three_readers
+
+
+def test_rosbags_reads_back_every_byte_type_hash_and_custom_datum(tmp_path: Path) -> None:
+    bag = speed_bag(tmp_path / "trial", [0.1, 0.2], [0.3, 0.4], custom={"repeat_group": "step"})
+    with Reader(bag) as reader:
+        assert reader.message_count == 4
+        assert (reader.start_time, reader.duration) == (START_NS, PERIOD_NS + 1)
+        assert {c.topic: c.msgtype for c in reader.connections} == {ODOM: ODOM_TYPE, CMD: CMD_TYPE}
+        metadata: Any = reader.storage.metadata
+        assert metadata.custom == {"repeat_group": "step"}
+        assert metadata.ros_distro == "jazzy"
+        read = [(c.topic, stamp, data) for c, stamp, data in reader.messages()]
+    expected = [
+        (CMD, START_NS, command(START_NS, 0.3)),
+        (ODOM, START_NS, odometry(START_NS, 0.1)),
+        (CMD, START_NS + PERIOD_NS, command(START_NS + PERIOD_NS, 0.4)),
+        (ODOM, START_NS + PERIOD_NS, odometry(START_NS + PERIOD_NS, 0.2)),
+    ]
+    assert read == expected
+    with AnyReader([bag]) as reader_with_types:  # recomputes every type hash from the schemas
+        assert len(list(reader_with_types.messages())) == 4
+
+
+def test_mcap_reads_profile_times_and_metadata_record(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "trial", custom={"source": "test"}) as bag:
+        bag.write(CMD, CMD_TYPE, command(7, 0.5), log_time_ns=9, publish_time_ns=7)
+    with (tmp_path / "trial" / "trial.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        [(schema, channel, message)] = reader.iter_messages()
+        assert schema is not None
+        assert (schema.name, schema.encoding) == (CMD_TYPE, "ros2msg")
+        assert (channel.topic, channel.message_encoding) == (CMD, "cdr")
+        assert (message.log_time, message.publish_time) == (9, 7)
+        [record] = reader.iter_metadata()
+        assert (record.name, record.metadata) == ("custom_data", {"source": "test"})
+
+
+def test_a_topic_without_messages_is_listed(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "quiet") as bag:
+        bag.add_topic(CMD, CMD_TYPE)
+    with Reader(tmp_path / "quiet") as reader:
+        assert [(c.topic, c.msgcount) for c in reader.connections] == [(CMD, 0)]
+        assert reader.message_count == 0
+
+
+def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
+    (tmp_path / "trial").mkdir()
+    for in_place in (False, True):
+        with pytest.raises(BagError, match="trial exists already"):
+            BagWriter(tmp_path / "trial", in_place=in_place)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "trial"]
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_after_an_exception_only_a_bag_in_place_keeps_what_was_written(
+    tmp_path: Path, in_place: bool
+) -> None:
+    with (
+        pytest.raises(BagError, match="is not known"),
+        BagWriter(tmp_path / "trial", in_place=in_place) as bag,
+    ):
+        write_until_it_fails(bag)
+    assert [path.name for path in tmp_path.iterdir()] == ["trial"] * in_place
+    if in_place:
+        with Reader(tmp_path / "trial") as reader:
+            assert reader.message_count == 1
+
+
+def test_a_folder_that_appears_while_writing_is_not_replaced(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "trial")
+    (tmp_path / "trial").mkdir()
+    with pytest.raises(BagError, match="appeared while"):
+        bag.close()
+    assert list(tmp_path.iterdir()) == [tmp_path / "trial"]
+
+
+def test_a_second_type_on_a_topic_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "trial") as bag:
+        bag.add_topic(CMD, CMD_TYPE)
+        with pytest.raises(BagError, match=r"/cmd_vel holds 'geometry_msgs/msg/TwistStamped'"):
+            bag.write(CMD, ODOM_TYPE, b"", log_time_ns=0, publish_time_ns=0)
+
+
+def test_an_unknown_type_and_a_negative_time_are_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "trial") as bag:
+        with pytest.raises(BagError, match="'my_robot/msg/Arm' is not known"):
+            bag.add_topic("/arm", "my_robot/msg/Arm")
+        with pytest.raises(BagError, match="times -1, 0 ns"):
+            bag.write(CMD, CMD_TYPE, b"", log_time_ns=-1, publish_time_ns=0)
+
+
+def test_a_closed_chunk_is_on_disk(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "trial", in_place=True)
+    bag.write(CMD, CMD_TYPE, command(1, 0.5), log_time_ns=1, publish_time_ns=1)
+    assert _stamps_on_disk(bag.path) == []
+    bag.close_chunk()
+    assert _stamps_on_disk(bag.path) == [1]
+    bag.write(CMD, CMD_TYPE, command(2, 0.5), log_time_ns=2, publish_time_ns=2)
+    assert _stamps_on_disk(bag.path) == [1]
+    bag.close()
+    assert _stamps_on_disk(bag.path) == [1, 2]
+
+
+def test_a_killed_writer_loses_at_most_the_last_chunk(tmp_path: Path) -> None:
+    script = (
+        "import sys, time\n"
+        "from bags.recordings.writer import BagWriter\n"
+        "bag = BagWriter(sys.argv[1], in_place=True)\n"
+        "while True:\n"
+        "    now = time.time_ns()\n"
+        f"    bag.write('{CMD}', '{CMD_TYPE}', b'\\0\\1\\0\\0' + bytes(64), log_time_ns=now,"
+        " publish_time_ns=now)\n"
+        "    if bag.counts[sys.argv[2]] % 20 == 0:\n        bag.close_chunk()\n"
+        "    print(now, flush=True)\n"
+        "    time.sleep(0.001)\n"
+    )
+    root = Path(__file__).parents[2]
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / "trial"), CMD],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=root,
+    )
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    time.sleep(0.7)
+    os.kill(process.pid, signal.SIGKILL)
+    written = [int(line) for line in (first + process.communicate()[0]).split()]
+    kept = _stamps_on_disk(tmp_path / "trial")
+    assert kept == written[: len(kept)]
+    assert len(written) - len(kept) <= 20
+
+
+def _stamps_on_disk(bag: Path) -> list[int]:
+    """Log times of the messages in complete chunks of a file that may be unfinished."""
+    stamps: list[int] = []
+    with (bag / f"{bag.name}.mcap").open("rb") as stream:
+        try:
+            stamps.extend(
+                record.log_time
+                for record in StreamReader(stream, validate_crcs=True).records
+                if isinstance(record, Message)
+            )
+        except EndOfFile:
+            return stamps
+    return stamps
+
+
+def write_until_it_fails(bag: BagWriter) -> None:
+    bag.write(CMD, CMD_TYPE, command(0, 0.5), log_time_ns=0, publish_time_ns=0)
+    bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
+
+
+# -- Bags in several files, compressed or not, of custom types: as we, rosbags and mcap read them
+
+ARM = "my_robot/msg/Arm"
+
+
+@pytest.fixture
+def my_robot(tmp_path: Path) -> Path:
+    """A package's folder with two message definitions, one made of the other."""
+    folder = tmp_path / "share" / "my_robot" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "Arm.msg").write_text("std_msgs/Header header\nJoint[] joints\nuint8 OK=1\n")
+    (folder / "Joint.msg").write_text("string name\ngeometry_msgs/Vector3 place\nfloat64[2] q\n")
+    return folder.parent
+
+
+@pytest.mark.parametrize("given", ["package", "share", "files"])
+def test_a_custom_type_given_as_msg_files_reads_back(
+    my_robot: Path, tmp_path: Path, given: str
+) -> None:
+    paths = {
+        "package": [my_robot],
+        "share": [my_robot.parent],
+        "files": sorted((my_robot / "msg").iterdir()),
+    }[given]
+    definition = read_definitions(paths)[ARM]
+    assert definition.is_stamped
+    # an Arm by hand: header, one joint "a", a place and two numbers
+    data = (
+        b"\0\1\0\0" + b"\1\0\0\0\2\0\0\0" + b"\1\0\0\0\0\0\0\0" + b"\1\0\0\0" + b"\2\0\0\0a\0\0\0"
+    )
+    data += b"\0" * (-(len(data) - 4) % 8)
+    data += np.array([1.0, 2.0, 3.0, 0.25, -0.5]).tobytes()
+    with BagWriter(tmp_path / "run") as bag:
+        bag.add_topic("/arm", ARM, definition=definition)
+        bag.write("/arm", ARM, data, log_time_ns=1, publish_time_ns=1)
+    assert three_readers(tmp_path / "run", "/arm") == [[data]] * 3
+    with Bag(tmp_path / "run") as source:
+        msgtype, types = source.types_on("/arm")
+    for arm in (
+        decode(data, msgtype, types),
+        AnyReader([tmp_path / "run"]),
+    ):
+        if isinstance(arm, AnyReader):
+            with arm as reader:
+                [connection] = reader.connections
+                arm = reader.deserialize(data, connection.msgtype)
+        joint = arm.joints[0]  # type: ignore[attr-defined]
+        assert (joint.name, joint.place.y, joint.q.tolist()) == ("a", 2.0, [0.25, -0.5])
+    metadata = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())
+    [topic] = metadata["rosbag2_bagfile_information"]["topics_with_message_count"]
+    assert topic["topic_metadata"]["type_description_hash"] == definition.type_hash
+
+
+def test_definitions_that_are_none_or_lack_something_are_refused(
+    my_robot: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(BagError, match="holds no message definitions; give a PACKAGE/msg/Type"):
+        read_definitions([tmp_path / "nowhere"])
+    loose = tmp_path / "Arm.msg"
+    loose.write_text("float64 x\n")
+    with pytest.raises(BagError, match=r"a definition's place is PACKAGE/msg/Type.msg"):
+        read_definitions([loose])
+    with pytest.raises(BagError, match="Joint"):
+        read_definitions([my_robot / "msg" / "Arm.msg"])
+    (my_robot / "msg" / "Bad.msg").write_text("float64[ x\n")
+    with pytest.raises(BagError, match="'my_robot/msg/Bad' cannot be used"):
+        read_definitions([my_robot])
+
+
+# -- Quality of service in copies of bags: kept, and such that every reader finds every message
 
 RESOURCES = SHARED / "rosbag2_resources"
 STRING = "std_msgs/msg/String"

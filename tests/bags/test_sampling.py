@@ -16,16 +16,15 @@ from bags.recordings.bag import Bag
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
-from bags.signals.grid import filled_samples, read_dataset
+from bags.signals.grid import filled_samples
 from bags.signals.reader import read_signals
-from bags.signals.sampling import LOST, MOST_LOST, Grid, Sample, Sampler
+from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler
 from bags.tools.listing import bag_signals
-from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.designs import AnyDesign, Design
+from nlsid import Design, Grid, OutputTube, Polynomial, Status, identify, read_bags
+from nlsid_core.design import design_output_tube
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError
-from nlsid_core.identification import Polynomial, identify
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from tests.bag_messages import (
     CMD,
     COMMAND,
@@ -245,7 +244,7 @@ def test_messages_give_the_same_bits_as_identification_reads(
 ) -> None:
     bag = drive(tmp_path / "drive")
     yaw = f"{ODOM}:pose.pose.orientation.yaw{turn or '|unwrap'}"
-    [trial] = read_dataset(
+    [trial] = read_bags(
         [bag],
         responses=[yaw, SPEED],
         excitations=[COMMAND],
@@ -334,7 +333,7 @@ def test_signals_of_several_topics_and_products_give_the_same_bits(
     bag = drive(tmp_path / "drive")
     steering = f"{CMD}:twist.linear.x|delay(0.03 s)|lag(0.1 s)"
     yaw = f"{ODOM}:pose.pose.orientation.yaw|unwrap"
-    [trial] = read_dataset(
+    [trial] = read_bags(
         [bag],
         responses=[SPEED] if resample == "none" else [SPEED, f"{CMD}:twist.linear.x"],
         excitations=[f"{steering} * {SPEED}", f"{yaw}|derivative(0.1 s)"],
@@ -365,7 +364,7 @@ def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_
     bag = drive(tmp_path / "drive", stamped=False)
     signals = {"responses": [SPEED], "excitations": [f"{CMD}:linear.x"]}
     with pytest.raises(BagError) as caught:
-        read_dataset([bag], **signals, grid=Grid(max_gap=0.1))  # type: ignore[arg-type]
+        read_bags([bag], **signals, grid=Grid(max_gap=0.1))  # type: ignore[arg-type]
     for part in (
         f"{SPEED} has a header stamp",
         f"{CMD}:linear.x has a log time",
@@ -373,7 +372,7 @@ def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_
     ):
         assert part in str(caught.value)
     grid = Grid(0.025, 0.1, "log")
-    [trial] = read_dataset([bag], **signals, grid=grid)  # type: ignore[arg-type]
+    [trial] = read_bags([bag], **signals, grid=grid)  # type: ignore[arg-type]
     assert trial.u_paths == (f"{CMD}:linear.x|clock(log)|hold(0.1 s)",)
     assert len(trial) == 190
     with pytest.raises(BagError, match=r"/cmd_vel .* has no header stamp; .*`clock: log`"):
@@ -413,7 +412,7 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
 ) -> None:
     """The whole way, on the numbers that identification read."""
     bags = [turning_robot(tmp_path / f"run_{k}", k) for k in range(3)]
-    data = read_dataset(
+    data = read_bags(
         bags,
         responses=[f"{ODOM}:pose.pose.orientation.yaw|unwrap|derivative(0.1 s)"],
         excitations=[f"{CMD}:linear.x"],
@@ -446,7 +445,7 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     speed_bag(lossy, [None if k in lost else speed for k, speed in enumerate(y)], u)
     grid = Grid(max_gap=0.08, resample="linear")
     data, gappy = (
-        read_dataset([bag], responses=[SPEED], excitations=[COMMAND], grid=grid)
+        read_bags([bag], responses=[SPEED], excitations=[COMMAND], grid=grid)
         for bag in (whole, lossy)
     )
     assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))

@@ -24,19 +24,14 @@ from bags.viewing.drawn import HalfWidths
 from bags.viewing.page import MOST_READERS, PAGE, serve_page
 from bags.viewing.replay import Recording
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
+from nlsid import Status
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from tests.browser import CHROMIUM, MISSING, Page, browser
 
 LOCAL = "127.0.0.1"
 GOOD = {"margin": 0.5, "assumption": 0.1, "nominal": 1.0, "measured": 1.1, "half_width": 0.4}
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-
-
-@pytest.fixture
-def funnel(f1tenth_chain: Path) -> Path:
-    return f1tenth_chain / documents.FUNNEL
 
 
 @pytest.fixture

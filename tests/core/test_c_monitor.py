@@ -11,14 +11,10 @@ from typing import Any
 import pytest
 
 from bags.samples import f1tenth
-from bags.signals.grid import read_dataset
-from bags.signals.sampling import Grid
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, identify, read_bags
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
-from nlsid_core.identification import Polynomial, identify
 from nlsid_core.running.c_table import c_table, write_table
-from nlsid_core.running.reading import Status
 from tests.core.kernel.tube_claims import design
 
 CORE = Path(__file__).parents[2] / "examples" / "rclcpp_monitor"
@@ -42,7 +38,7 @@ def trials() -> Dataset:
     """F1TENTH's, as shipped."""
     speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
     grid = Grid(max_gap=0.1)
-    return read_dataset(f1tenth(), responses=[speed], excitations=[command], grid=grid)
+    return read_bags(f1tenth(), responses=[speed], excitations=[command], grid=grid)
 
 
 @pytest.fixture(scope="module")

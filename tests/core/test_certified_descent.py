@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nlsid import Dataset, Degrees, LeastSquares, Polynomial, Rie, Sem, Trajectory, identify
 from nlsid_core import proofs
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Degrees, LeastSquares, Polynomial, Rie, Sem, identify
 from nlsid_core.identification.polynomial.implicit_descent import ImplicitSet
 from nlsid_core.identification.polynomial.implicit_rie import least_squares_coefficients
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows

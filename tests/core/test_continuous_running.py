@@ -11,15 +11,13 @@ import pytest
 from bags.designs.wiring import read_at, wiring_of
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
+from nlsid import Design, Monitor, Status, VectorField
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.designs import AnyDesign, Design
-from nlsid_core.dynamics import VectorField
+from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 from tests.continuous_stage import stage, write_run
 

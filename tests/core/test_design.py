@@ -7,26 +7,21 @@ from typing import Any
 
 import pytest
 
-from bags.designs.documents import load
-from nlsid_core import documents, files
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import (
+from nlsid import (
     ContinuousTracking,
+    Dataset,
+    Design,
+    Fit,
     OutputTube,
-    OutputTubeDesign,
     SampledTracking,
+    check,
     design,
     integrate_nominal,
+    load,
 )
-from nlsid_core.designs import (
-    COMPOSITION,
-    FUNNEL,
-    MODEL,
-    POLICY,
-    PROOF,
-    AnyDesign,
-    Design,
-)
+from nlsid_core import documents, files
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.designs import COMPOSITION, FUNNEL, MODEL, POLICY, PROOF, AnyDesign
 from nlsid_core.errors import (
     CertificateMismatch,
     CertificateRejected,
@@ -34,9 +29,7 @@ from nlsid_core.errors import (
     DocumentError,
     OptionError,
 )
-from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.proofs import check
 from tests.tracked import assumption, designed, tracked
 
 PROFILE = ((0.0, 0.0), (7.0, 0.5))
@@ -64,6 +57,8 @@ def test_the_verb_solves_what_each_problem_says(tube: OutputTubeDesign, train: D
         ({"inlet": 0.1, "profile": None}, "inlet is 0.1; it should be 0 without a profile"),
         ({"horizon": 0.0}, "horizon is 0.0; it should be a finite number above 0"),
         ({"safety_factor": 0.99}, "safety_factor is 0.99; it should be a finite number, at least"),
+        ({"reaction_time": 0.0}, "reaction_time is 0.0; it should be "),
+        ({"false_alarms": 0.0}, "false_alarms is 0.0; it should be "),
         ({"inlet": -1e-9}, "inlet is -1e-09; it should be a finite number, at least 0"),
         ({"profile": [(0.0, 0.0)]}, "profile is .* it should be two or more corners"),
         ({"profile": [(1.0, 0.0), (0.0, 1.0)]}, "times should increase"),

@@ -1,4 +1,4 @@
-"""One home for the nouns, and one `load` for whatever a file declares."""
+"""One home for the nouns, what funnels of every kind share, and one `load` for all files."""
 
 from pathlib import Path
 from typing import Any
@@ -7,15 +7,20 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.documents import load
 from nlsid_core.dynamics import VectorField, constant_on, cubic_through, linear_through
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
+from nlsid_core.funnels.protocol import Funnel
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
 from nlsid_core.funnels.tube import Measured, Tube, TubeFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.protocol import AnyPolicy, Policy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
+from tests.continuous_stage import stage
+from tests.tracked import designed
 
 
 def random_funnel(n: int = 3, knots: int = 6) -> ContinuousFunnel:
@@ -175,3 +180,41 @@ def test_outside_its_times_a_funnel_says_so() -> None:
         funnel.value(funnel.tf + 1e-6, np.zeros((1, 3)))
     with pytest.raises(ShapeError, match=r"should have shape \(N, 3\)"):
         funnel.value(funnel.t0, np.zeros(3))
+
+
+# -- What funnels and policies of every kind have in common: sizes, widths, one `load` each
+
+
+def pairs() -> list[tuple[AnyPolicy, SampledFunnel | ContinuousFunnel]]:
+    """One of each kind that holds a state."""
+    sampled, (_, policy, funnel) = designed(), stage()
+    return [(sampled.policy, sampled.funnel), (policy, funnel)]
+
+
+def test_every_kind_answers_the_same_questions(design: OutputTubeDesign) -> None:
+    for policy, funnel in pairs():
+        common: Funnel = funnel
+        plan: Any = policy
+        for when in (0, common.last):
+            widths = common.widths(when)
+            assert common.size(when, np.zeros(len(widths))) <= 1e-12
+            assert not common.size(when, np.full(len(widths), np.nan)) <= 1.0
+            for i, width in enumerate(widths):
+                inside = np.zeros(len(widths))
+                inside[i] = width
+                assert common.size(when, 1.001 * inside) > 1.0, "beyond its width on an axis"
+        assert common.made_for == (plan.made_for, files.digest(plan.document()))
+        _covers(plan, len(common.widths(0)))
+        assert plan.last <= common.last
+    assert design.policy is not None
+    tube, planned = design.funnel, design.policy.plan(design.model)
+    assert tube.made_for == (design.policy.made_for, files.digest(design.policy.document()))
+    _covers(planned, len(design.model))
+    assert planned.last <= tube.last
+    assert tube.start_size(np.zeros(len(design.model))) == 0.0
+    assert not tube.start_size(np.full(len(design.model), np.nan)) <= 1.0
+
+
+def _covers(plan: Policy, n: int) -> None:
+    low, high = plan.covers(0, np.zeros(n))
+    assert np.all(low <= high)

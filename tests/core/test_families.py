@@ -8,29 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlsid_core import documents, files
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import CertificateRejected, DataError
-from nlsid_core.identification import (
+from nlsid import (
     CellRow,
+    Dataset,
     Degrees,
     Feedback,
     FilterMapFilter,
     Fit,
-    Method,
-    ModelClass,
     Network,
     Polynomial,
     Rie,
     Rse,
     Sem,
-    describe,
+    Trajectory,
     identify,
-    methods_of,
-    simulate_trial,
 )
+from nlsid_core import documents, files
+from nlsid_core.errors import CertificateRejected, DataError
+from nlsid_core.identification import Method, ModelClass, describe, methods_of, simulate_trial
 from nlsid_core.identification.prediction import history, learns, one_step_residual
-from nlsid_core.proofs import check
+from tests.decided import decided
 
 PERIOD, START = 0.1, 20
 STEPS = 4  # of an iterated method
@@ -116,10 +113,10 @@ def test_a_proof_holds_for_its_model_only_and_is_as_fast_as_asked_for(
     model, path = tmp_path / "model.json", tmp_path / "model.proof.json"
     files.write_document(model, fit.model.document())
     files.write_document(path, proof.document(fit.model, "model.json"))
-    assert check(path).margin > 0.0
+    assert decided(path).margin > 0.0
     files.write_document(model, fit.model.document() | {"period": 2.0 * PERIOD})
     with pytest.raises(CertificateRejected):
-        check(path)
+        decided(path)
 
 
 @pytest.mark.parametrize(("name", "method"), GRID)

@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nlsid_core.design import ContinuousTracking, design, integrate_nominal
+from nlsid import ContinuousTracking, Nominal, design, integrate_nominal
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis, NoFunnel
 from nlsid_core.design.continuous.finer import FEW, LOST, Unproved, coarse, halved, lost, most_knots
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import MOST_KNOTS, Setting, prepare
-from nlsid_core.dynamics import Nominal
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
 
@@ -86,7 +85,7 @@ def test_a_funnel_whose_numbers_overflow_is_not_proved() -> None:
     setting = prepared(at_rest(41))
     rho = np.geomspace(1e-180, 1e-3, 41)
     funnel = ContinuousFunnel(setting.policy.x, setting.P, rho, setting.policy.vector_field, "")
-    assert prove_pieces(setting.steps, setting.policy, funnel).unproved
+    assert prove_pieces(setting.steps, funnel).unproved
 
 
 def test_a_shape_that_is_wider_before_the_end_than_equations_reach_is_no_refusal() -> None:

@@ -7,22 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
+from nlsid import ContinuousTracking, Goal, Nominal, VectorField, check, integrate_nominal
 from nlsid_core import files as documents
-from nlsid_core.design import (
-    ContinuousTracking,
-    Goal,
-    compose_funnels,
-    design_funnel,
-    integrate_nominal,
-)
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.design import compose_funnels, design_funnel
 from nlsid_core.errors import CertificateMismatch, DataError, Infeasible
-from nlsid_core.proofs import check
 from tests.core.kernel import refusals
+from tests.decided import decided
 from tests.marks import slow_among
+from tests.verbs import nlsid
 
 Files = dict[str, Any]
 
@@ -79,14 +72,10 @@ def test_three_stages_are_one_funnel_and_each_is_still_its_own(
 
 
 def test_the_command_line_composes_and_checks(proofs: list[Path], tmp_path: Path) -> None:
-    runner = CliRunner()
     stages = [option for proof in proofs[:2] for option in ("--compose", str(proof))]
-    made = runner.invoke(app, ["funnel", str(tmp_path), *stages])
-    assert made.exit_code == 0, made.output
-    assert "8 files" in made.output
-    checked = runner.invoke(app, ["check", str(tmp_path / "composition.proof.json")])
-    assert checked.exit_code == 0
-    assert "PROVED composition of 2 funnels" in checked.output
+    assert "8 files" in nlsid("funnel", tmp_path, *stages)
+    checked = nlsid("check", tmp_path / "composition.proof.json")
+    assert "PROVED composition of 2 funnels" in checked
 
 
 def test_stages_are_not_replaced_by_others(proofs: list[Path], tmp_path: Path) -> None:
@@ -197,12 +186,12 @@ def test_a_forged_composition_is_refused_for_what_it_is(
     forged = json.loads(json.dumps(files))
     forge(forged)
     with refusals.refused(reason):
-        check(rebound(forged, tmp_path))
+        decided(rebound(forged, tmp_path))
 
 
 def test_binding_the_files_again_as_they_are_changes_nothing(files: Files, tmp_path: Path) -> None:
     again = json.loads(json.dumps(files))
-    assert check(rebound(again, tmp_path)).margin > 0
+    assert decided(rebound(again, tmp_path)).margin > 0
 
 
 def test_a_stage_goal_may_not_be_shrunk(files: Files, tmp_path: Path) -> None:
@@ -210,7 +199,7 @@ def test_a_stage_goal_may_not_be_shrunk(files: Files, tmp_path: Path) -> None:
     goal = forged["stage3.proof.json"]["claim"]["goal"]
     goal["P"] = (1.02 * np.array(goal["P"])).tolist()
     with refusals.refused("not_definite"):
-        check(rebound(forged, tmp_path))
+        decided(rebound(forged, tmp_path))
 
 
 def test_another_file_in_a_stages_place_is_refused_by_its_digest(
@@ -222,7 +211,7 @@ def test_another_file_in_a_stages_place_is_refused_by_its_digest(
     with pytest.raises(
         CertificateMismatch, match=r"stage1: stage1\.funnel\.json is not the funnel"
     ):
-        check(tmp_path / "composition.proof.json")
+        decided(tmp_path / "composition.proof.json")
     (tmp_path / "stage1.proof.json").write_bytes(documents.encode(files["stage2.proof.json"]))
     with pytest.raises(CertificateMismatch, match=r"stage1\.proof\.json is not the stage1"):
-        check(tmp_path / "composition.proof.json")
+        decided(tmp_path / "composition.proof.json")

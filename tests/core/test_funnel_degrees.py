@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
-from nlsid_core.design import ContinuousTracking, design, integrate_nominal
-from nlsid_core.dynamics import VectorField
+from nlsid import ContinuousTracking, VectorField, check, design, integrate_nominal
 from nlsid_core.errors import DataError
-from nlsid_core.proofs import check
 
 
 def springs(x: Any, u: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.proofs import check
 from tests.core.kernel import refusals
+from tests.decided import decided
 from tests.funnel_files import Files, write
 from tests.marks import slow_among
 
@@ -157,7 +158,7 @@ def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
     forged = json.loads(json.dumps(files))
     forge(forged)
     with refusals.refused(reason):
-        check(write(forged, tmp_path, rebind=True))
+        decided(write(forged, tmp_path, rebind=True))
 
 
 @pytest.mark.parametrize(
@@ -170,18 +171,18 @@ def test_a_forged_file_is_refused_by_its_digest(
     forged = json.loads(json.dumps(files))
     forge(forged)
     with pytest.raises(CertificateMismatch, match="is not the"):
-        check(write(forged, tmp_path, rebind=False))
+        decided(write(forged, tmp_path, rebind=False))
 
 
 def test_writing_the_files_again_as_they_are_changes_nothing(files: Files, tmp_path: Path) -> None:
-    assert check(write(files, tmp_path, rebind=True)).margin > 0
+    assert decided(write(files, tmp_path, rebind=True)).margin > 0
 
 
 def test_a_file_with_other_white_space_is_another_file(files: Files, tmp_path: Path) -> None:
     path = write(files, tmp_path, rebind=True)
     (tmp_path / "policy.json").write_text(json.dumps(files["policy.json"]))
     with pytest.raises(CertificateMismatch, match=r"policy\.json is not the policy"):
-        check(path)
+        decided(path)
 
 
 @pytest.mark.slow
@@ -190,4 +191,4 @@ def test_no_proof_is_found_for_a_funnel_that_is_one_percent_too_wide() -> None:
     design = design_funnel(ContinuousTracking(field, nominal, goal=goal_matrix(), **weights))
     knots = len(design.funnel.t)
     wide = replace(design.funnel, rho=design.funnel.rho * np.linspace(1.01, 1, knots))
-    assert prove_pieces(LSteps(field), design.policy, wide).unproved
+    assert prove_pieces(LSteps(field, design.policy), wide).unproved

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from benchmarks.thesis.soundness import Simulation
-from nlsid_core import proofs
-from nlsid_core.design import (
+from nlsid import (
     ContinuousTracking,
-    FunnelDesign,
+    Monitor,
+    Status,
+    VectorField,
     design,
     integrate_nominal,
     plan_motion,
 )
-from nlsid_core.dynamics import VectorField
+from nlsid_core import proofs
+from nlsid_core.design import FunnelDesign
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.running.held import Held, slowest
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 from tests.core.kernel import refusals
 from tests.falling_pendulum import tracking
@@ -163,6 +163,7 @@ def test_errors_of_0_are_none() -> None:
     assert (found.funnel.rho == design(tracking()).funnel.rho).all()
 
 
+@pytest.mark.slow
 def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
     def rate(x: Any, u: Any) -> Any:
         return [x[1], 5 * x[0] + u[0]]

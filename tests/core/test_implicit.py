@@ -1,13 +1,21 @@
-"""Implicit models: solving for the next state, Jacobians, simulation, documents."""
+"""Implicit models: one step, many samples, Jacobians, whole trials, documents."""
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
-from nlsid_core.models import ImplicitModel, monotone
+from nlsid_core.identification.polynomial.rollout import Rollout, simulate_together
+from nlsid_core.models import ImplicitModel, Signal, monotone
+from nlsid_core.models.implicit_step import SingleStep
 from nlsid_core.models.polynomials import Polynomials
+from tests import implicit_models
 from tests.implicit_models import coupled, cubic_spring, lagged, quintic
+from tests.marks import slow_among
 
 EVERY = {
     "quintic": quintic,
@@ -101,14 +109,6 @@ def test_only_separable_models_come_apart() -> None:
     assert lagged().separated() is None
 
 
-@pytest.mark.parametrize("name", EVERY)
-def test_a_document_round_trips(name: str) -> None:
-    document = EVERY[name]().document()
-    text = files.encode(document)
-    again = ImplicitModel.from_document(files.parse_document(text)).document()
-    assert files.digest(again) == files.digest(document)
-
-
 def test_wrong_sizes_and_documents_are_refused() -> None:
     model = coupled()
     with pytest.raises(ShapeError, match="e should have 1 polynomials"):
@@ -130,3 +130,115 @@ def test_wrong_sizes_and_documents_are_refused() -> None:
     document["shift"]["coefficients"] = [[1.0, 2.0]]
     with pytest.raises((DocumentError, ShapeError)):
         ImplicitModel.from_document(document)
+
+
+# -- One sample of an implicit model on plain numbers: the same as the step of whole arrays
+
+STEPPED: dict[str, Callable[[], ImplicitModel]] = {
+    "quintic": implicit_models.quintic,
+    "coupled": implicit_models.coupled,
+    "lagged": implicit_models.lagged,
+    "cubic spring": implicit_models.cubic_spring,
+    "linear": lambda: implicit_models.linear(np.array([[0.6, 0.3], [-0.2, 0.5]])),
+}
+
+
+@pytest.mark.parametrize("name", STEPPED)
+@pytest.mark.parametrize("size", slow_among([0.3, 3.0, 300.0], {300.0}))
+def test_a_single_step_is_the_step_of_whole_arrays(name: str, size: float) -> None:
+    """Also far away, where Newton's full steps fail and the model's own solver takes over."""
+    model, rng = STEPPED[name](), np.random.default_rng(0)
+    single = SingleStep(model)
+    for _ in range(50):
+        x = size * rng.normal(size=(3, len(model)))
+        w = size * rng.normal(size=len(model.inputs))
+        expected = model.step(x, np.tile(w, (3, 1)))
+        assert single(x, w) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+# -- Implicit models over whole trials: what their own steps give, at microseconds a sample
+
+INPUT = (Signal("u", "V"),)
+
+
+def recorded(model: ImplicitModel, window: tuple[tuple[int, int], ...]) -> ImplicitModel:
+    """The model as one of recorded signals."""
+    return replace(
+        model, y=tuple(Signal(f"y{i}", "m") for i in range(model.unknowns)), u=INPUT, window=window
+    )
+
+
+MODELS = {
+    "two lags": recorded(implicit_models.lagged(1.2, -0.5), ((0, 0),)),
+    "a product with the input": recorded(implicit_models.cubic_spring(), ((0, 1),)),
+    "two outputs": recorded(implicit_models.coupled(), ((0, 1),)),
+    "far from a contraction": recorded(implicit_models.quintic(), ((0, 2),)),
+}
+
+
+def trial_of(model: ImplicitModel, samples: int, seed: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    y = rng.uniform(-1.0, 1.0, (samples, model.unknowns))
+    u = rng.uniform(-2.0, 2.0, samples)
+    return Trajectory(t=0.1 * np.arange(samples), y=y, u=u, name=f"trial {seed}")
+
+
+def stepped(model: ImplicitModel, trial: Trajectory) -> FloatArray:
+    """The model's own steps, one after the other."""
+    h, n_v = model.history, model.unknowns
+    x = np.concatenate([trial.y[h - k] for k in range(1, model.lags + 1)])
+    outputs = [*trial.y[:h]]
+    for w in model.windows(trial.u):
+        x = model.step(x[None], w[None])[0]
+        outputs.append(x[:n_v])
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_all_samples_together_are_the_models_own_steps(name: str) -> None:
+    model = MODELS[name]
+    trials = [trial_of(model, samples, samples) for samples in (40, 7, 150)]
+    found = simulate_together(model, trials)
+    assert Rollout(model, trials).solved(model.h.coefficients) is not None, "by Newton's method"
+    for trial, outputs in zip(trials, found, strict=True):
+        np.testing.assert_allclose(outputs, stepped(model, trial), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_jacobian_is_that_of_the_equations(name: str) -> None:
+    model = MODELS[name]
+    rollout = Rollout(model, [trial_of(model, 9, 0), trial_of(model, 8, 1)])
+    weights = rollout.weights(model.h.coefficients)
+    y = np.random.default_rng(2).uniform(-1.0, 1.0, rollout.measured.shape)
+    direction = np.where(rollout.free[:, None], np.random.default_rng(3).normal(size=y.shape), 0.0)
+    step = 1e-6
+    moved = [rollout.residual(y + s * step * direction, weights)[0] for s in (1, -1)]
+    change = (moved[0] - moved[1]) / (2.0 * step)
+    jacobian = rollout.linearised(rollout.residual(y, weights)[1])
+    np.testing.assert_allclose(jacobian.solve(change[:, :, None])[:, :, 0], direction, atol=1e-7)
+
+
+def test_a_model_that_diverges_is_infinite_from_there() -> None:
+    model = MODELS["two lags"]
+    coefficients = np.array(model.h.coefficients)
+    cubic = model.h.exponents[:, 0] == 3
+    coefficients[cubic] = 0.0
+    coefficients[model.h.exponents[:, 1] == 1] = -30.0
+    wild = replace(model, h=Polynomials(model.h.exponents, coefficients))
+    trial = trial_of(model, 60, 0)
+    (outputs,) = simulate_together(wild, [trial])
+    first = int(np.argmax(~np.isfinite(outputs[:, 0])))
+    assert 20 < first < 60, "3 y(t) = 30 y(t-1) + … passes 1e30 after about thirty samples"
+    assert np.isinf(outputs[first:]).all()
+
+
+def test_where_newton_does_not_settle_the_samples_are_stepped() -> None:
+    """v + 9v⁵ = 4x³ + w from outputs of 30: not a contraction there."""
+    quintic = MODELS["far from a contraction"]
+    coefficients = np.where(quintic.h.exponents[:, [1]] == 3, -40.0, quintic.h.coefficients)
+    steep = replace(quintic, h=Polynomials(quintic.h.exponents, coefficients))
+    trial = trial_of(steep, 400, 5)
+    far = replace(trial, y=30.0 * trial.y)
+    assert Rollout(steep, [far]).solved(coefficients) is None
+    (outputs,) = simulate_together(steep, [far])
+    np.testing.assert_allclose(outputs[:20], stepped(steep, far)[:20], rtol=1e-9)

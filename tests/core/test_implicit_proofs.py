@@ -1,4 +1,4 @@
-"""Claims about implicit model files: every convex set of thesis Chapter 2, and its forgeries."""
+"""Implicit models in the convex sets of thesis Chapter 2: exact proofs, and their forgeries."""
 
 import json
 from collections.abc import Callable
@@ -9,12 +9,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from examples import not_a_contraction
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+from nlsid_core.errors import (
+    CertificateMismatch,
+    CertificateRejected,
+    DataError,
+    Infeasible,
+    ShapeError,
+    SolverError,
+)
+from nlsid_core.identification.proofs import conditions
+from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.stable_sets import prove_implicit
 from nlsid_core.models import ImplicitModel
+from nlsid_core.polynomial import variables
 from nlsid_core.proofs import check, proof_document
+from nlsid_core.sos import Program, SumOfSquares, forms_of, solve
+from tests.decided import decided
 from tests.implicit_models import coupled, cubic_spring, lagged, linear, quintic
 
 DELTA = 0.1
@@ -148,7 +161,7 @@ def test_a_forgery_of_any_set_is_rejected(
     model, proof = map(copied, made[name])
     change(model, proof)
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -158,7 +171,7 @@ def test_a_proof_of_another_model_is_a_mismatch(
     model, proof = map(copied, made[name])
     model["h"]["coefficients"][0][0] = float(np.nextafter(model["h"]["coefficients"][0][0], 9.0))
     with pytest.raises(CertificateMismatch):
-        check(write(tmp_path, model, proof, rebound=False))
+        decided(write(tmp_path, model, proof, rebound=False))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
@@ -173,10 +186,10 @@ def test_a_local_proof_is_about_its_own_box(
     else:
         proof["claim"]["box"] = [[-100.0, 100.0] for _ in proof["claim"]["box"]]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
     del proof["claim"]["box"]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
@@ -187,7 +200,7 @@ def test_a_multiplier_of_the_wrong_size_or_place_is_rejected(
         model, proof = map(copied, made[name])
         change(proof["proof"]["inequalities"]["stable"]["multipliers"])
         with pytest.raises(CertificateRejected):
-            check(write(tmp_path, model, proof))
+            decided(write(tmp_path, model, proof))
 
 
 def _shrunk(multipliers: list[Json]) -> None:
@@ -219,7 +232,7 @@ def test_a_storage_that_is_not_positive_is_rejected(
         for entry in [entry for row in proof["proof"]["M"] for entry in row]:
             entry["coefficients"] = [-c for c in entry["coefficients"]]
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
 
 
 @settings(deadline=None, max_examples=10)
@@ -270,4 +283,58 @@ def test_a_document_that_would_take_forever_is_refused(
     model, proof = map(copied, made["derivatives, 2.11"])
     change(model, proof)
     with pytest.raises(CertificateRejected):
-        check(write(tmp_path, model, proof))
+        decided(write(tmp_path, model, proof))
+
+
+# -- The convex sets of stable models: what they contain, what they exclude, exact proofs
+
+FORMS = 4
+
+
+def feasible(*parts: SumOfSquares | Inequality, names: tuple[str, ...]) -> bool:
+    """Whether a solver finds the decisions; the sizes here leave no doubt either way."""
+    constraints = tuple(
+        constraint(part, name="a set") if isinstance(part, Inequality) else part for part in parts
+    )
+    try:
+        solve(Program((*names, *forms_of(FORMS)), constraints))
+    except (Infeasible, SolverError):
+        return False
+    return True
+
+
+def test_example_2_3_1_gives_the_published_slope_and_an_exact_proof(tmp_path: Path) -> None:
+    computed, published = not_a_contraction.example()
+    assert computed == pytest.approx(published, abs=5e-4)
+    model, proof = not_a_contraction.model, not_a_contraction.proof()
+    path = tmp_path / "example.proof.json"
+    files.write_document(tmp_path / "model.json", model.document())
+    files.write_document(path, proof.document(model, "model.json"))
+    assert "for every state and input" in check(path).statement
+    steeper = model.document()
+    steeper["h"]["coefficients"][-1] = [-0.6]
+    files.write_document(tmp_path / "model.json", steeper)
+    document = proof.document(model, "model.json")
+    document["claim"]["about"]["model"]["digest"] = files.digest(steeper)
+    files.write_document(path, proof_document(document["claim"], document["proof"]))
+    with pytest.raises(CertificateRejected):
+        check(path)
+
+
+def test_a_cubic_map_needs_a_domain_and_gets_one() -> None:
+    """f = 0.5 x + x³/4 with linear e is not contracting globally, but for |x| ≤ 0.7 it is."""
+    (x,) = variables("x")
+    e, f = np.array([1.0 * x]), np.array([0.5 * x + 0.25 * x**3])
+    P, parts = np.eye(1), (conditions.slopes(e, ["x"]), conditions.slopes(f, ["x"]))
+    domain = conditions.box(["x"], [(-0.7, 0.7)])
+    assert not feasible(conditions.derivatives(*parts, P, delta=0.01), names=("x",))
+    inside = conditions.derivatives(*parts, P, delta=0.01, domain=domain)
+    assert feasible(inside, names=("x",))
+    wide = conditions.box(["x"], [(-2.0, 2.0)])
+    outside = conditions.derivatives(*parts, P, delta=0.01, domain=wide)
+    assert not feasible(outside, names=("x",))
+
+
+def test_sizes_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ShapeError, match="2 names and the ends of 1"):
+        conditions.box(["x", "u"], [(0.0, 1.0)])

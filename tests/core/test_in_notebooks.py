@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid import compare, identify, standard_errors, to_control
-from nlsid_core.data.trajectory import Dataset
+from nlsid import Dataset, Fit, Polynomial, compare, identify, standard_errors, to_control
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import Fit, Polynomial
 from nlsid_core.models import DifferenceEquation
 
 LONGEST = 2000  # characters of what a cell's last line prints

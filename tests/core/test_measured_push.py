@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
+from nlsid import ContinuousTracking, Dataset, Trajectory, VectorField, design, plan_motion
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import ContinuousTracking, design, plan_motion
-from nlsid_core.dynamics import VectorField, measured_push
+from nlsid_core.dynamics import measured_push
 from nlsid_core.errors import DataError
 
 PERIOD, PUSH = 0.02, 0.06  # s, m/s²: what the equations leave out

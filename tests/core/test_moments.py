@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nlsid import Dataset, Degrees
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification import Degrees
 from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moment_rie import (
     Layout,

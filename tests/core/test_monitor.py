@@ -1,18 +1,19 @@
-"""The tube holds in simulation when its assumption does, and the monitor says when it does not."""
+"""The tube holds in simulation when its assumption does; the monitor and its alarm say when not."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
+from nlsid import Dataset, Monitor, OutputTube, Status
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.funnels.tube import Tube
+from nlsid_core.running.alarm import State, state_of
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading
 from nlsid_core.running.stage import Stage
 from tests.conftest import PERIOD
 
@@ -223,3 +224,27 @@ def test_parts_that_do_not_belong_together_are_refused(
     )
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor([Stage(design.model, other.policy, design.funnel)])
+    with pytest.raises(CertificateMismatch, match="another model"):
+        Monitor([Stage(replace(design.model, c=1.0), design.policy, design.funnel)])
+
+
+# -- Alerts: a low margin warns, and what is outside is never anything else
+
+ROWS = [
+    (Status.INSIDE, 0.5, 0.0, State.INSIDE),
+    (Status.INSIDE, 0.1, 0.0, State.INSIDE),
+    (Status.INSIDE, 0.3, 0.3, State.INSIDE),
+    (Status.INSIDE, 0.29, 0.3, State.WARNING),
+    (Status.INSIDE, math.nan, 0.1, State.WARNING),
+    (Status.INSIDE, math.nan, 0.0, State.INSIDE),
+    *((Status.OUTSIDE, -0.1, margin, State.OUTSIDE) for margin in (0.0, 0.5, 1.0)),
+    (Status.ASSUMPTION_VIOLATED, 0.1, 0.5, State.ASSUMPTION_VIOLATED),
+    (Status.UNKNOWN, math.nan, 0.5, State.UNKNOWN),
+]
+
+
+@pytest.mark.parametrize(("status", "margin", "warning_margin", "said"), ROWS)
+def test_only_a_sample_inside_is_ever_warned_of(
+    status: Status, margin: float, warning_margin: float, said: State
+) -> None:
+    assert state_of(Reading(0.0, status, margin), warning_margin) is said

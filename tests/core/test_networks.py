@@ -8,24 +8,26 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.signal import lfilter
 
-from nlsid_core import documents, proofs
-from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, design
-from nlsid_core.errors import CertificateRejected, DataError, DocumentError, ShapeError
-from nlsid_core.identification import (
+from nlsid import (
     CellRow,
+    Dataset,
     Feedback,
     FilterMapFilter,
     Fit,
     Follower,
     LeastSquares,
     Network,
+    OutputTube,
     Polynomial,
     Sem,
+    Trajectory,
+    design,
     identify,
-    prove_stability,
 )
+from nlsid_core import documents, proofs
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import CertificateRejected, DataError, DocumentError, ShapeError
+from nlsid_core.identification import prove_stability
 from nlsid_core.identification.network.cells import Row
 from nlsid_core.identification.network.feedback import Layout
 from nlsid_core.identification.network.filters import Cascade

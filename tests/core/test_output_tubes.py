@@ -2,27 +2,23 @@
 
 import re
 import sys
-import tracemalloc
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import binomtest
 
 from bags.designs.provenance import of_funnel
+from nlsid import Dataset, Monitor, OutputTube, Status, Trajectory
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.design import design_output_tube
 from nlsid_core.design.tube import calibrated, energy, innovations
 from nlsid_core.design.tube_program import finsler
-from nlsid_core.errors import CertificateMismatch, DataError, OptionError
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import history, simulate_trial
 from nlsid_core.models import BlockCascade, DifferenceEquation
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading
 from nlsid_core.running.stage import Stage
 from nlsid_core.running.stepping import Stepper
 from nlsid_core.running.tubes import BEYOND, WATCHED
@@ -164,26 +160,12 @@ def test_a_run_that_starts_at_a_wrong_measurement_is_inside_or_breaks_the_assump
 
 
 @pytest.mark.slow
-def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
-    monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
-    run(monitor, trial)
-    tracemalloc.start()
-    before = tracemalloc.get_traced_memory()[0]
-    for lap in range(1, 6):
-        readings = run(monitor, replace(trial, t=trial.t + lap * 25.0))
-        assert all(r.status is not Status.UNKNOWN for r in readings)
-    grown = tracemalloc.get_traced_memory()[0] - before - 1_000_000
-    tracemalloc.stop()
-    assert grown < 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear", "following"])
-def test_two_hundred_thousand_samples_take_no_more_memory_at_the_end(name: str) -> None:
+def test_nothing_ends_a_run_and_forty_thousand_samples_take_no_more_memory(name: str) -> None:
     monitor, trial = monitor_of(name), trial_of(name, 1000)
     rows = list(zip(trial.t.tolist(), trial.y, trial.u, strict=True))
-    blocks = np.zeros(200)
-    for lap in range(200):
+    blocks = np.zeros(40)
+    for lap in range(40):
         for t, y, u in rows:
             assert monitor.update(t + lap * 25.0, y, u).status is not Status.UNKNOWN or lap == 0
         blocks[lap] = sys.getallocatedblocks()
@@ -346,17 +328,6 @@ def test_an_energy_is_over_and_the_fading_tube_lasts() -> None:
     assert "covers 40 samples" in readings[43].reason
 
 
-def test_a_funnel_of_another_model_is_refused() -> None:
-    with pytest.raises(CertificateMismatch, match="another model"):
-        Monitor([Stage(MODELS["monotone"](), None, design("linear").funnel)])
-
-
-def test_a_funnel_reads_back_as_it_was_written() -> None:
-    for name in ("two_outputs", "implicit_box"):
-        funnel = design(name).funnel
-        assert TubeFunnel.from_document(funnel.document()).document() == funnel.document()
-
-
 # -- design ----------------------------------------------------------------------------------
 
 
@@ -396,16 +367,6 @@ def test_a_next_trial_sets_off_any_alarm_as_rarely_as_the_rank_bound_says(
     low, _ = binomtest(alarmed, splits).proportion_ci(0.95)
     assert low <= rank / 10
     assert alarmed, "a bound that nothing comes near would be met by levels that are never reached"
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"safety_factor": 0.5}, {"reaction_time": 0.0}, {"horizon": -1.0}, {"false_alarms": 0.0}],
-)
-def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None:
-    model = MODELS["linear"]()
-    with pytest.raises(OptionError):
-        OutputTube(model, Dataset(dataset(model, 0, 2).trajectories), **options)
 
 
 @pytest.mark.slow

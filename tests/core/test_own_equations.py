@@ -7,26 +7,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
-from bags.designs.documents import load
 from bags.pictures.tubes import draw_tube
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import Simulation
-from nlsid_core.arrays import FloatArray
-from nlsid_core.design import (
+from nlsid import (
     ContinuousTracking,
     Goal,
+    NlsidError,
+    Nominal,
+    check,
     design,
-    design_funnel,
     integrate_nominal,
+    load,
     plan_motion,
 )
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import design_funnel
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
-from nlsid_core.dynamics import Nominal, PiecewisePolynomial, Rates
-from nlsid_core.errors import DataError, Infeasible, NlsidError, ShapeError
-from nlsid_core.proofs import check
+from nlsid_core.dynamics import PiecewisePolynomial, Rates
+from nlsid_core.errors import DataError, Infeasible, ShapeError
+from tests.verbs import nlsid
 
 MASSES = {"arm": 2.0}  # in kg; a rate that asks for another mass is wrong
 PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"
@@ -66,10 +67,9 @@ def test_the_page_writes_a_problem_for_the_command_line(
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
     (code,) = (block for block in blocks if "spring.json" in block)
     exec(code, {})
-    ended = CliRunner().invoke(app, ["funnel", "spring", "--problem", "spring.json"])
-    assert ended.exit_code == 0, ended.output
-    assert "is applied every 0.0452548" in ended.output
-    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in ended.output
+    said = nlsid("funnel", "spring", "--problem", "spring.json")
+    assert "is applied every 0.0452548" in said
+    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in said
 
 
 @pytest.mark.slow
@@ -295,21 +295,6 @@ def test_a_jump_of_rounding_is_none() -> None:
         assert Nominal(x, PiecewisePolynomial(t, u)).u.is_continuous() is not kept
     with pytest.raises(DataError, match=r"x0 jumps by 1e-09 at 0\.5 s"):
         Nominal(PiecewisePolynomial(t, u - 0.1), x)
-
-
-def lagging(x: Any, u: Any, w: Any) -> Any:
-    """A position whose speed lags its command, and is pushed."""
-    return [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]
-
-
-@pytest.mark.slow
-def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
-    t = np.linspace(0, 3, 45)
-    still = integrate_nominal(
-        lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
-    )
-    found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
-    assert found.found.tried.startswith("found with a quarter of R; as it is: none at")
 
 
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:

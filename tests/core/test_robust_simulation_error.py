@@ -8,8 +8,7 @@ from benchmarks.thesis.rie import (
     IdentificationErrorBound,
     robust_identification_error,
 )
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Degrees, Polynomial
+from nlsid import Dataset, Degrees, Polynomial, Trajectory
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.newton import (
     Descent,

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bags.monitoring.watch import Watch
+from nlsid import Dataset, Design, Monitor, OutputTube, Status
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTube, OutputTubeDesign, design_output_tube
-from nlsid_core.designs import Design
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import factor
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
@@ -30,8 +29,6 @@ from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.grid import Grid
-from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Status
 from nlsid_core.running.stage import Stage
 from tests.tracked import PERIOD, STEPS, designed, run
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from bags.designs.provenance import of_proof
+from nlsid import SampledTracking, check
 from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import plan_motion
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
-from nlsid_core.proofs import check
 from tests.core.kernel import refusals
+from tests.decided import decided
 from tests.forged_tracking import CONTRADICTIONS, FORGERIES, forged
 from tests.marks import slow_among
 from tests.tracked import (
@@ -104,7 +104,7 @@ def adversary(
 def test_a_forged_funnel_is_refused_though_every_digest_fits(what: str, tmp_path: Path) -> None:
     proof = write(forged(designed(), what), tmp_path)
     with pytest.raises(CertificateRejected) as refusal:
-        check(proof)
+        decided(proof)
     assert not isinstance(refusal.value, CertificateMismatch)  # refused for what it says
 
 
@@ -113,7 +113,7 @@ def test_an_assumption_that_contradicts_what_was_measured_is_named(
     what: str, tmp_path: Path
 ) -> None:
     proof = write(forged(designed(), what), tmp_path)
-    assert check(proof)
+    assert decided(proof)
     assert not of_proof(write(designed(), tmp_path / "true")).wrong
     assert of_proof(proof).wrong
 
@@ -122,7 +122,7 @@ def test_a_policy_swapped_without_new_digests_is_a_mismatch(tmp_path: Path) -> N
     proof = write(designed(), tmp_path)
     files.write_document(tmp_path / "policy.json", designed(goal=0.3).policy.document())
     with pytest.raises(CertificateMismatch, match="policy"):
-        check(proof)
+        decided(proof)
 
 
 @pytest.mark.parametrize("key", ["x_range", "u_range"])
@@ -133,12 +133,12 @@ def test_a_model_without_its_data_box_is_refused(key: str, tmp_path: Path) -> No
     del document[key]
     files.write_document(tmp_path / "model.json", document)
     with pytest.raises(CertificateMismatch):
-        check(proof)
+        decided(proof)
     whole = files.load_document(proof)
     whole["claim"]["about"]["model"]["digest"] = files.digest(document)
     files.write_document(proof, proofs.proof_document(whole["claim"], whole["proof"]))
     with pytest.raises(CertificateRejected, match=key):
-        check(proof)
+        decided(proof)
 
 
 def test_a_model_made_to_keep_the_checker_busy_is_refused_at_once(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_a_model_made_to_keep_the_checker_busy_is_refused_at_once(tmp_path: Path
     huge = resigned(design, model=replace(design.model, exponents=exponents))
     proof = write(huge, tmp_path)
     with refusals.refused("too_large"):
-        check(proof)
+        decided(proof)
 
 
 def test_a_missing_step_is_refused(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_a_missing_step_is_refused(tmp_path: Path) -> None:
     proof = copy.deepcopy(design.proof)
     del proof["steps"][3]
     with pytest.raises(CertificateRejected, match="steps"):
-        check(write(replace(design, certificate=design.certificate | {"proof": proof}), tmp_path))
+        decided(write(replace(design, certificate=design.certificate | {"proof": proof}), tmp_path))
 
 
 def test_commissioning_on_the_fitting_bags_is_refused_before_anything_is_written() -> None:

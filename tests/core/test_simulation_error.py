@@ -8,19 +8,11 @@ import pytest
 from scipy.signal import lfilter
 
 from benchmarks.recorded import heat_exchanger, single
+from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Trajectory, check, identify
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import SolverError
-from nlsid_core.identification import (
-    Degrees,
-    Polynomial,
-    Rse,
-    Sem,
-    identify,
-    prove_stability,
-    trail,
-)
+from nlsid_core.identification import prove_stability, trail
 from nlsid_core.identification.methods import newton, rse
 from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
@@ -34,7 +26,6 @@ from nlsid_core.identification.starts import companion, reduced, reflected
 from nlsid_core.identification.trail import tried
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
 from tests.marks import slow_among
 from tests.state_affine_rows import EXACT, near_identity, problem

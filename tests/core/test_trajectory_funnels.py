@@ -1,6 +1,5 @@
 """Funnels around trajectories: nouns, lemmas, proofs for every t, and what is refused."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -8,9 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import one_dimensional, pendulum
@@ -29,7 +26,6 @@ from nlsid_core.dynamics import (
     Nominal,
     PiecewisePolynomial,
     VectorField,
-    constant_on,
     cubic_through,
     linear_through,
 )
@@ -40,7 +36,9 @@ from nlsid_core.kernel.files import Rejected
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.proofs import check
 from tests import funnel_problem
+from tests.decided import decided
 from tests.funnel_files import saved, write
+from tests.verbs import nlsid
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +90,9 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
 def test_alternation_ends_where_the_sweep_does() -> None:
     field, nominal = hanging()
     design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
-    steps = LSteps(field)
-    start = exponential_start(steps, design.policy, design.funnel.P)
-    found = alternate_rho(steps, design.policy, start, stop=0.002)
+    steps = LSteps(field, design.policy)
+    start = exponential_start(steps, design.funnel.P)
+    found = alternate_rho(steps, start, stop=0.002)
     assert found.volumes[0] < found.volumes[-1]
     assert found.volumes[-1] == pytest.approx(design.funnel.volume_integral(), rel=0.01)
 
@@ -102,10 +100,7 @@ def test_alternation_ends_where_the_sweep_does() -> None:
 def test_p_grows_beyond_rho_and_is_proved() -> None:
     field, nominal = hanging(9)
     rho = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
-    with ThreadPoolExecutor(2) as threads:
-        P = design_funnel(
-            ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"), executor=threads
-        )
+    P = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2), shape="P"))
     assert P.funnel.volume_integral() > rho.funnel.volume_integral()
     assert np.min(P.found.proved.margins) > 0
 
@@ -186,11 +181,11 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     forged = saved(design, tmp_path)
     forged["vector_field.json"]["valid"] = [[0, -0.1, 0.1]]
     with pytest.raises(CertificateRejected, match="where its dynamics are valid"):
-        check(write(forged, tmp_path))
+        decided(write(forged, tmp_path))
     forged = saved(design, tmp_path)
     forged["funnel.proof.json"]["proof"]["kappa"][1][1] = -1.0
     with pytest.raises(CertificateRejected, match="kappa should be positive"):
-        check(write(forged, tmp_path))
+        decided(write(forged, tmp_path))
 
 
 @pytest.mark.slow
@@ -268,18 +263,6 @@ def test_piecewise_polynomials_meet_their_samples() -> None:
         PiecewisePolynomial(np.array([0.0, 1.0, 1.0]), np.zeros((2, 2, 1)))
 
 
-def test_value_volume_and_outline_agree() -> None:
-    x = constant_on([0.0, 1.0], [[1.0, 2.0]])
-    funnel = ContinuousFunnel(x, np.array([np.diag([4.0, 1.0])] * 2), np.array([1.0, 4.0]), "", "")
-    assert funnel.volume(0.0) == pytest.approx(np.pi / 2)
-    assert funnel.volume(1.0) == pytest.approx(2 * np.pi)
-    points = funnel.outline(0.5, (0, 1))
-    assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
-    assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
-    assert ellipsoid_inside([1, 2], np.eye(2), funnel.nominal(1.0), funnel.shape(1.0)) is not None
-    assert ellipsoid_inside(funnel.nominal(1.0), funnel.shape(1.0), [1, 2], np.eye(2)) is None
-
-
 # -- command line ----------------------------------------------------------------------------
 
 
@@ -291,15 +274,10 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     problem_file = tmp_path / "problem.json"
     asked = funnel_problem.document(field, nominal, goal, Q=np.eye(2), R=np.eye(1))
     files.write_document(problem_file, asked)
-    runner = CliRunner()
-    made = runner.invoke(app, ["funnel", str(tmp_path), "--problem", str(problem_file)])
-    assert made.exit_code == 0, made.output
-    assert "pieces of time decided" in made.output
-    assert "found and proved in" in made.output
+    made = nlsid("funnel", tmp_path, "--problem", problem_file)
+    assert "pieces of time decided" in made
+    assert "found and proved in" in made
     assert ContinuousFunnel.load(tmp_path / "funnel.json").tf == 2.0
     assert (tmp_path / "funnel.png").is_file()
-    checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
-    assert checked.exit_code == 0
-    assert "PROVED funnel" in checked.output
-    neither = runner.invoke(app, ["funnel", str(tmp_path)])
-    assert neither.exit_code != 0
+    assert "PROVED funnel" in nlsid("check", tmp_path / "funnel.proof.json")
+    nlsid("funnel", tmp_path, status=None)

@@ -1,17 +1,21 @@
-"""Riccati and Lyapunov equations along a motion, continuous and discrete, against known answers."""
+"""Motions and their feedback: Riccati and Lyapunov equations against known answers."""
 
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
+from scipy.linalg import companion, expm, solve_continuous_are, solve_discrete_are
+from scipy.optimize import minimize
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import discrete_tvlqr, integrate_nominal, lyapunov, tvlqr
+from nlsid_core.design.riccati import _by_doubling, solve_riccati
+from nlsid_core.design.sampled.motion import NEARNESS, RESERVE, SMOOTHNESS, plan_motion
 from nlsid_core.dynamics import Nominal, VectorField, constant_on
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.policies.continuous import ContinuousPolicy
+from tests.tracked import pendulum
 
 A = np.array([[0.0, 1.0], [2.0, -0.3]])
 B = np.array([[0.0], [1.5]])
@@ -77,7 +81,7 @@ def test_the_cost_to_go_is_what_it_costs_and_no_other_gain_is_cheaper() -> None:
 
 def test_the_recursion_tends_to_the_differential_equation() -> None:
     gaps = []
-    for knots in (201, 401):
+    for knots in (51, 101):
         field, nominal = driven(knots)
         continuous = tvlqr(field, nominal, Q=Q, R=R, S_final=np.eye(2)).S
         h = 1 / (knots - 1)
@@ -146,3 +150,84 @@ def test_weights_that_are_none_are_named_by_both(weights: Any, reason: str) -> N
 def test_matrices_that_do_not_fit_are_named() -> None:
     with pytest.raises(ShapeError, match=r"they are \(2, 2\), \(1, 2, 1\)"):
         discrete_tvlqr(A, [B], Q=Q, R=R, P_final=np.eye(2))
+
+
+# -- The Riccati equation: both ways give the solution, and one of them where the other cannot
+
+
+def residual(
+    X: FloatArray, A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+) -> float:
+    """Of X = A'XA + Q - (A'XB + S)(R + B'XB)⁻¹(B'XA + S'), over the largest entry of X."""
+    cross = A.T @ X @ B + S
+    right = A.T @ X @ A + Q - cross @ np.linalg.solve(R + B.T @ X @ B, cross.T)
+    return float(np.abs(X - right).max() / np.abs(X).max())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_doubling_agrees_with_ordered_eigenvalues(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 9)), int(rng.integers(1, 4))
+    A = rng.normal(size=(n, n)) * rng.choice([0.2, 0.5, 1.0])
+    B = rng.normal(size=(n, m))
+    joint = rng.normal(size=(n + m, n + m))
+    joint = joint @ joint.T + 0.1 * np.eye(n + m)
+    Q, S, R = joint[:n, :n], joint[:n, n:], joint[n:, n:]
+    X = _by_doubling(A, B, Q, R, S)
+    assert residual(X, A, B, Q, R, S) < 1e-9
+    np.testing.assert_allclose(X, solve_discrete_are(A, B, Q, R, s=S), rtol=1e-6, atol=1e-8)
+
+
+def test_a_pole_near_zero_is_no_obstacle() -> None:
+    """The car's speed with four lags, of which one has nothing to do: a pole at 0.027."""
+    a = np.array([2.74105474, -2.52227791, 0.80017418, -0.01969405])
+    b = np.array([0.13118925, -0.22536555, 0.10870322, -0.04824889, 0.03446403])
+    A, C = companion(np.concatenate([[1.0], -a])).T, np.eye(1, 4)
+    B = (b[1:] + a * b[0])[:, None]
+    X = solve_riccati(A, B, C.T @ C, np.eye(1))
+    assert residual(X, A, B, C.T @ C, np.eye(1), np.zeros((4, 1))) < 1e-9
+    closed = A - B @ np.linalg.solve(np.eye(1) + B.T @ X @ B, B.T @ X @ A)
+    assert np.abs(np.linalg.eigvals(closed)).max() < 1.0
+
+
+def test_an_unstable_state_that_no_input_reaches_has_no_solution() -> None:
+    with pytest.raises(Infeasible, match="Riccati"):
+        solve_riccati(np.diag([2.0, 0.5]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1))
+
+
+# -- A motion of a measured state is the one that a slower solver finds
+
+
+def test_a_planned_motion_is_the_one_that_scipy_finds_more_slowly() -> None:
+    """The same transcription of 15 samples by SLSQP, in units of the box."""
+    model, steps = pendulum(), 15
+    half_x, half_u = model.x_range[:, 1], model.u_range[:, 1]
+    ends = np.array([[0.0, 0.0], [0.1, 0.0]]) / half_x
+
+    def parts(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return z[: 2 * (steps + 1)].reshape(-1, 2), z[2 * (steps + 1) :].reshape(-1, 1)
+
+    def cost(z: np.ndarray) -> float:
+        x, u = parts(z)
+        smooth = SMOOTHNESS * steps * float(np.sum(np.diff(u, axis=0) ** 2))
+        return (NEARNESS * float(np.sum(x**2)) + float(np.sum(u**2)) + smooth) / 2
+
+    def defects(z: np.ndarray) -> np.ndarray:
+        x, u = parts(z)
+        steps_missed = model(x[:-1] * half_x, u * half_u) / half_x - x[1:]
+        return np.concatenate([steps_missed.ravel(), x[0] - ends[0], x[-1] - ends[1]])
+
+    start = np.zeros(3 * steps + 2)
+    found = minimize(
+        cost,
+        start,
+        method="SLSQP",
+        constraints={"type": "eq", "fun": defects},
+        bounds=[(-1.0 + RESERVE, 1.0 - RESERVE)] * len(start),
+        options={"maxiter": 300},
+    )
+    assert found.success
+    x, u = plan_motion(model, [0.0, 0.0], [0.1, 0.0], steps=steps)
+    ours = np.concatenate([(x / half_x).ravel(), (u / half_u).ravel()])
+    assert cost(ours) <= found.fun * (1 + 1e-5)
+    np.testing.assert_allclose(ours, found.x, atol=2e-3)

@@ -17,14 +17,13 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from bags.designs.documents import load
 from bags.designs.wiring import wiring_of
 from examples import cart_pole
+from nlsid import Status, load
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import COMPOSITION, FUNNEL
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.plants import advanced
-from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of, stamp_of
 from tests.continuous_stage import composed

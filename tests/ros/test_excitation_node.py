@@ -15,9 +15,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from std_msgs.msg import String
 
-from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_origin
-from bags.signals.sampling import Grid
+from nlsid import Grid, read_bags
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.designs import VECTOR_FIELD
@@ -216,7 +215,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         assert json.loads(custom["experiment"])["repeat"] == number
         assert int(custom["/joint_commands received"]) >= 230
         assert custom["/joint_commands lost"] == "0"
-    data = read_dataset(
+    data = read_bags(
         trials,
         responses=[RESPONSE],
         excitations=[COMMAND],

@@ -14,9 +14,9 @@ from std_msgs.msg import String
 from bags.chain.shipped import config_file
 from bags.designs import documents
 from bags.samples import f1tenth
+from nlsid import check
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.proofs import check
 from nlsid_ros import qos
 from tests.bag_messages import START_NS, speed_bag
 from tests.ros.processes import Bench, ros_test, stop

@@ -27,13 +27,12 @@ from bags.designs.bundle import Bundle
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.samples import f1tenth
+from nlsid import OutputTube, Status, design
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import OutputTube, design
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import Signal
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of, stamp_of
 from tests import implicit_models

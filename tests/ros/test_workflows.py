@@ -31,11 +31,11 @@ from bags.samples import f1tenth
 from bags.setup.candidates import look
 from bags.setup.proposing import Chosen, propose
 from bags.setup.written import yaml_text
+from nlsid import Status
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of, stamp_of
 from tests.ros.processes import ROOT, STARTED, Bench, process, ros_test, stop

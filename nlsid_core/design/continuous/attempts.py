@@ -33,7 +33,6 @@ from nlsid_core.progress import Progress
 
 HALVINGS = 6  # of intervals where P is far from linear
 FINER = ("knots", "remainder")  # what is less where knots are closer
-FASTER = 0.25  # of the default R
 MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
 AT_LIMIT = 0.99  # of ρ's cap: an input reaches its limit
 NARROW = 0.5  # of half-widths without limits: with less, few limited inputs may saturate
@@ -81,18 +80,14 @@ def with_knots(problem: ContinuousTracking) -> Setting:
 
 
 def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
-    """As it is; with more knots where that stopped it; around what w reaches; with another R; with
+    """As it is; with more knots where that stopped it; around what w reaches.
 
-    inputs that saturate. A given policy keeps its knots, its R, and what it does at its limits.
+    A given policy keeps its knots.
     """
     listed: list[Attempt] = [("as it is", lambda _: setting)]
     if problem.policy is None:
         listed += HALVINGS * [("with more knots", partial(_finer, problem))]
     listed.append(("around what w reaches", partial(_pushed, problem)))
-    if problem.policy is None and problem.R is None and setting.steps.field.m > 0:
-        listed.append(("with a quarter of R", partial(_weighed, problem)))
-    if problem.policy is None and 0 < len(_limits(problem)) <= MOST_LIMITED:
-        listed.append(("with inputs that saturate", partial(_saturated, problem)))
     return listed
 
 
@@ -184,14 +179,3 @@ def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
             return None
         setting = prepare(replace(problem, nominal=motion_of(setting).halved(found.coarse)))
     return None
-
-
-def _weighed(problem: ContinuousTracking, tried: list[Tried]) -> Setting:
-    """With a quarter of R, around the motion as it was given."""
-    first = tried[0].setting
-    return prepare(replace(problem, nominal=motion_of(first), R=FASTER * first.weights[1]))
-
-
-def _saturated(problem: ContinuousTracking, tried: list[Tried]) -> Setting:
-    """With every mode of its inputs, around the motion as it was given."""
-    return prepare(replace(problem, nominal=motion_of(tried[0].setting)), saturated=True)

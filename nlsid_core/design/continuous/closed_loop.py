@@ -179,31 +179,6 @@ def rate_polynomial(
     return add(c, negative(multiply(loop.squares(0), loop.gap(), n)))
 
 
-def error_at_end(
-    field: VectorField,
-    policy: ContinuousPolicy,
-    funnel: ContinuousFunnel,
-    pieces: Pieces,
-    end: int,
-) -> FloatArray:
-    """(B, n, M) coefficients of f(x₀ + Tz, u) - ẋ₀ at one end of each piece.
-
-    M: monomials in z of degree 0 up to the largest that occurs.
-    """
-    loop = _Loop(field, policy, funnel, pieces, end=end)
-    x_rate = loop.nominal_rate()
-    h = np.diff(funnel.t)[pieces.interval]
-    rows = []
-    for i, rate in enumerate(loop.field_times_h()):
-        error = add(rate, {0: -x_rate[:, :, i][:, :, None]})
-        parts = [
-            error[q][:, 0] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
-            for q in range(field.degree + 1)
-        ]
-        rows.append(np.concatenate(parts, axis=1) / h[:, None])
-    return np.stack(rows, axis=1)
-
-
 class _Loop:
     """The variables t, x, u, w of the field in z and s, one batch entry per piece.
 

@@ -1,7 +1,6 @@
 """`design_funnel`: a problem in; policy, funnel and its proof out."""
 
 import time
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -50,12 +49,10 @@ class ContinuousSearch:
 FunnelDesign: TypeAlias = Design[VectorField, ContinuousPolicy, ContinuousFunnel, ContinuousSearch]
 
 
-def design_funnel(
-    problem: ContinuousTracking, *, executor: Executor | None = None, progress: Progress = silent
-) -> FunnelDesign:
+def design_funnel(problem: ContinuousTracking, *, progress: Progress = silent) -> FunnelDesign:
     """The funnel that the problem describes.
 
-    executor: shares the independent L-steps. Raises DataError on input that cannot be right,
+    Raises DataError on input that cannot be right,
     Infeasible if no funnel was found or proved: it says what each attempt gave.
     """
     started = time.perf_counter()
@@ -74,13 +71,7 @@ def design_funnel(
     if problem.shape == "P":
         started = time.perf_counter()
         try:
-            funnel, proved, steps_taken = enlarge_shape(
-                setting,
-                funnel,
-                margin=margin,
-                executor=executor,
-                progress=progress,
-            )
+            funnel, proved, steps_taken = enlarge_shape(setting, funnel, margin, progress)
             history += steps_taken
         except Infeasible as refusal:  # what is proved already stays
             history.append((f"shape rho kept: {refusal}", funnel.volume_integral()))
@@ -104,7 +95,7 @@ def decided(setting: Setting, funnel: ContinuousFunnel, found: ContinuousSearch)
     multiplier = ellipsoid_inside(end, funnel.shape(funnel.tf), goal.centre, goal.P)
     if multiplier is None:
         raise Infeasible("the funnel's end is not inside the goal")
-    proof = proof_of(setting.steps, policy, funnel, proved) | {"goal_multiplier": multiplier}
+    proof = proof_of(setting.steps, funnel, proved) | {"goal_multiplier": multiplier}
     claim = {"kind": KIND, "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()}}
     if setting.hold is not None:
         claim |= setting.hold.claim()

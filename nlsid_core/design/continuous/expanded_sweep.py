@@ -89,7 +89,7 @@ def swept(
         duals = ends[k + 1].start if k + 2 < K else None
         try:
             if expansion is None:
-                instants = [section_at(steps, policy, P, k, s) for s in shares]
+                instants = [section_at(steps, P, k, s) for s in shares]
                 rho[k], ends[k] = largest_before(steps, instants, after, cap, wanted.on(k), duals)
             else:
                 guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
@@ -141,7 +141,7 @@ def _expanded(
     while True:
         try:
             steps.local[k] = expansion.around(policy, P, k, (box, after), held)
-            instants = [section_at(steps, policy, P, k, s) for s in shares]
+            instants = [section_at(steps, P, k, s) for s in shares]
             if looks and duals is not None:
                 most = min(LARGER * box, cap)
                 rho = estimated_before(steps, instants, after, most, wanted, duals)
@@ -168,4 +168,4 @@ def with_field(setting: Setting) -> Setting:
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = steps.like(field, policy)
     proving.kappa = None if steps.kappa is None else steps.kappa.copy()
-    return replace(setting, steps=proving, policy=policy)
+    return replace(setting, steps=proving)

@@ -133,7 +133,7 @@ class Changes:
     curving: tuple[int, ...]
 
     @classmethod
-    def of(cls, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel) -> "Changes":
+    def of(cls, steps: LSteps, funnel: ContinuousFunnel) -> "Changes":
         """Of this funnel; steps: with widths, of any size."""
         field, K = steps.field, len(funnel.t) - 1
         corners = _corners(field)
@@ -143,7 +143,7 @@ class Changes:
         found: tuple[list[list[FloatArray]], list[list[FloatArray]]] = ([], [])
         rows = []
         intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
-        for batch in _batches(steps, policy, intervals, no_basis, unit, signs=(1,)):
+        for batch in _batches(steps, intervals, no_basis, unit, signs=(1,)):
             pieces, entry = batch.pieces, batch.entry
             corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
             order = np.lexsort((corner, entry, vertex, *pieces.mode.T, pieces.interval))
@@ -151,7 +151,7 @@ class Changes:
             stated = pieces.interval, entry, batch.taken, batch.shoved
             rows.append(tuple(part[first] for part in stated))
             for end in (0, 1):
-                c, *_ = _at_end(steps, policy, funnel, batch, end)
+                c, *_ = _at_end(steps, funnel, batch, end)
                 at_corners = [part[order].reshape(len(first), count, -1) for part in c]
                 found[end].append([signs.T @ part / count for part in at_corners])
         together = [
@@ -219,7 +219,6 @@ def fastest(
 
 def prove_rates(
     steps: LSteps,
-    policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     rates: FloatArray,
     basis: IntArray,
@@ -234,9 +233,9 @@ def prove_rates(
     found: list[Json] = []
     while waiting:
         written: dict[Part, list[Json | None]] = {}
-        for batch in _batches(steps, policy, waiting, basis[used], widths):
-            of = _witnessed(steps, policy, funnel, batch, rates)
-            c = rate_polynomial(steps.field, policy, funnel, of, of.room(rates, widths))
+        for batch in _batches(steps, waiting, basis[used], widths):
+            of = _witnessed(steps, funnel, batch, rates)
+            c = rate_polynomial(steps.field, steps.policy, funnel, of, of.room(rates, widths))
             rows = rate_documents(funnel, of.pieces, c, basis, used)
             places = zip(of.entry.tolist(), of.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
@@ -254,14 +253,13 @@ def prove_rates(
             else:
                 raise Infeasible(
                     "the input's rate is not shown to keep its bound from "
-                    f"{unsolved(policy, (part,))}: try more knots there"
+                    f"{unsolved(steps.policy, (part,))}: try more knots there"
                 )
     return found
 
 
 def _batches(
     steps: LSteps,
-    policy: ContinuousPolicy,
     parts: list[Part],
     basis: IntArray,
     widths: FloatArray,
@@ -269,7 +267,7 @@ def _batches(
     signs: tuple[int, ...] = (-1, 1),
 ) -> Iterator[InputRates]:
     """Every rate on these parts of time, as many as fit at once."""
-    field, n = steps.field, steps.program.n
+    field, policy, n = steps.field, steps.policy, steps.program.n
     own = _pushing(field, 1 + n + field.m, len(field.uncertain))
     boxes = [
         ((a + b) / 2,) if pushes else (a, b)
@@ -345,13 +343,13 @@ def _pushes(field: VectorField, first: int, pushing: list[bool]) -> FloatArray:
 
 
 def _at_end(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, of: InputRates, end: int
+    steps: LSteps, funnel: ContinuousFunnel, of: InputRates, end: int
 ) -> tuple[list[FloatArray], FloatArray]:
     """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and z by x̄, (B, n, n)."""
     pieces, n, curving = of.pieces, funnel.n, curving_states(steps.field)
     T, inverse = frames_of(funnel, pieces.interval, _ends(pieces)[end], curving)
     framed = replace(of, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)))
-    c = rate_polynomial(steps.field, policy, funnel, framed, np.zeros(len(pieces)), end)
+    c = rate_polynomial(steps.field, steps.policy, funnel, framed, np.zeros(len(pieces)), end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
     none = [np.zeros((len(pieces), size)) for size in sizes]
     return [c[q][:, 0] if q in c else none[q] for q in range(4)], inverse
@@ -359,7 +357,6 @@ def _at_end(
 
 def _witnessed(
     steps: LSteps,
-    policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     of: InputRates,
     rates: FloatArray,
@@ -371,7 +368,7 @@ def _witnessed(
     room = np.diff(funnel.t)[k] * of.room(rates, steps.widths)
     one = int(np.flatnonzero(~pieces.basis.any(axis=1))[0])
     for end in (0, 1):
-        c, inverse = _at_end(steps, policy, funnel, of, end)
+        c, inverse = _at_end(steps, funnel, of, end)
         shown = least_rates([-part for part in c], curving)
         found = shown.gram(pieces.basis)
         found[:, one, one] += room

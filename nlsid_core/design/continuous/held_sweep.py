@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
@@ -82,7 +83,7 @@ class HeldSteps(LSteps):
 
 def with_widths(setting: Setting, field: VectorField) -> LSteps:
     """The setting's L-steps, of this field, with what an input is off: nothing yet."""
-    policy = setting.policy
+    policy = replace(setting.policy, vector_field=files.digest(field.document()))
     return setting.steps.like(field, policy, np.zeros((len(policy.t) - 1, field.m)))
 
 
@@ -102,7 +103,7 @@ def changes_by_size(setting: Setting, expansion: Expansion | None) -> dict[float
             ]
             field = field_of(cubics, policy.t)
         outer = ContinuousFunnel(policy.x, P, rho, "", "")
-        found[size] = Changes.of(with_widths(setting, field), policy, outer)
+        found[size] = Changes.of(with_widths(setting, field), outer)
     return found
 
 

@@ -54,11 +54,9 @@ class Section:
     interval: int
 
 
-def section_at(
-    steps: "LSteps", policy: ContinuousPolicy, P: FloatArray, k: int, s: float
-) -> Section:
+def section_at(steps: "LSteps", P: FloatArray, k: int, s: float) -> Section:
     """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) is linear there."""
-    t = policy.t
+    policy, t = steps.policy, steps.policy.t
     h = t[k + 1] - t[k]
     here = (1 - s) * P[k] + s * P[k + 1]
     control = policy.x.control[k]
@@ -109,30 +107,28 @@ class LSteps:
     def __init__(
         self,
         field: VectorField,
-        policy: ContinuousPolicy | None = None,
+        policy: ContinuousPolicy,
         *,
         nonlinear: tuple[int, ...] | None = None,
         pushed: bool | None = None,
         widths: FloatArray | None = None,
     ) -> None:
         refuse_degree(field)
-        self.field = field
-        self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
-        limited = policy is not None and len(policy.limits) > 0
+        self.field, self.policy = field, policy
+        self.pushed = field.is_pushed if pushed is None else pushed
         taken = field.curved_states if self.pushed else field.nonlinear_states
         self.nonlinear = taken if nonlinear is None else nonlinear
         self.local: dict[int, Cubic] = {}
         self._pushes: dict[int, FloatArray] = {}
-        self.limits = np.zeros((0, 3)) if policy is None else policy.limits
-        self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
+        self.limits = policy.limits
+        self.modes: IntArray = policy.modes()
         self.widths = widths
         self.tightness: FloatArray | None = None
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
-        self._reduced = not limited
         self.kappa: FloatArray | None = None
         self.solved = 0
-        if self.pushed and policy is not None:
+        if self.pushed:
             self.kappa = np.ones((len(policy.t) - 1, len(field.uncertain)))
             self.vertices = field.uncertain.mean(axis=1)[None]
         else:
@@ -166,7 +162,7 @@ class LSteps:
     def multiplied(self) -> tuple[int, ...]:
         """The states with which the program's basis has all products; they come last."""
         n, some = self.field.n, 0 < len(self.nonlinear) < self.field.n
-        return self.nonlinear if some and self._reduced else tuple(range(n))
+        return self.nonlinear if some and not len(self.limits) else tuple(range(n))
 
     def pushes(self, section: Section) -> FloatArray:
         """(n, n_w) what each w adds to ẋ there; only where w does nothing else."""
@@ -212,6 +208,16 @@ class LSteps:
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
         """(cases, N) -Ẇ/ρ at the program's points, in each mode, from the vector field."""
         x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
+        along = x_bar @ section.shape.P
+        W_rate = 2 * np.einsum("ni,cni->cn", along, self.moves(section, rho, cases))
+        W_rate += np.einsum("ij,ij->i", x_bar @ section.shape.rate, x_bar)
+        if self.kappa is not None:
+            W_rate += self.from_pushes(section, x_bar).sum(axis=1)
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+
+    def moves(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
+        """(cases, N, n) dx̄/dt at the program's points; w that is bounded is in its centre."""
+        x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
         w = np.empty((*u.shape[:2], self.vertices.shape[1]))
         for place, case in enumerate(cases):
@@ -225,20 +231,19 @@ class LSteps:
         X = np.tile(section.x + x_bar, (len(cases), 1))
         W = w.reshape(len(X), w.shape[2])
         rate = self.rate(section, X, u.reshape(len(X), u.shape[2]), W) - section.x_rate
-        along = x_bar @ section.shape.P
-        W_rate = 2 * np.einsum("ni,cni->cn", along, rate.reshape(len(cases), *x_bar.shape))
-        W_rate += np.einsum("ij,ij->i", x_bar @ section.shape.rate, x_bar)
-        if self.kappa is not None:
-            W_rate += self.from_pushes(section, x_bar).sum(axis=1)
-        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+        return rate.reshape(len(cases), *x_bar.shape)
 
     def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
         """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""
         assert self.kappa is not None
         kappa = self.kappa[section.interval]
         along = x_bar @ section.shape.P @ self.pushes(section)
-        radius = np.ptp(self.field.uncertain, axis=1) / 2
-        return np.asarray((kappa * along**2 + 1 / kappa) * radius)
+        return np.asarray((kappa * along**2 + 1 / kappa) * self.radius)
+
+    @property
+    def radius(self) -> FloatArray:
+        """(n_w,) half of what each w may be."""
+        return np.asarray(np.ptp(self.field.uncertain, axis=1) / 2)
 
     def _from_defect(self, section: Section, rho: float) -> FloatArray:
         """What the nominal's defect adds to -Ẇ/ρ along z that enter linearly, of degree 1.
@@ -316,14 +321,28 @@ class LSteps:
         self, section: Section, rho: float, duals: list[SphereSolution], cases: Sequence[int]
     ) -> list[float]:
         """The upper bound of φ for each of these cases."""
-        found = []
-        for case, g in zip(cases, self.values(section, rho, cases), strict=True):
-            if len(self.limits):
-                y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
+        left = self.left(section, rho, duals, cases)
+        return [float(g @ duals[case].y) for case, g in zip(cases, left, strict=True)]
+
+    def left(
+        self,
+        section: Section,
+        rho: float,
+        found: Sequence[SphereSolution],
+        cases: Sequence[int],
+        radius: float = 1.0,
+    ) -> FloatArray:
+        """(cases, N) `values` less what holds in the mode, with the multipliers that were found.
+
+        radius: √ρ over that of which they are the solutions; of modes, else it has no effect.
+        """
+        values = self.values(section, rho, cases)
+        if len(self.limits):
+            y = np.hstack([np.ones((len(self.program.points), 1)) / radius, self.program.points])
+            for g, case in zip(values, cases, strict=True):
                 q = self.in_mode(section, rho, case)
-                g = g - np.einsum("ln,na,lab,nb->n", q, y, duals[case].tau, y)
-            found.append(float(g @ duals[case].y))
-        return found
+                g -= np.einsum("ln,na,lab,nb->n", q, y, found[case].tau, y)
+        return values
 
 
 @lru_cache(maxsize=16)

@@ -69,7 +69,6 @@ class Proved:
 
 def prove_pieces(
     steps: LSteps,
-    policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     ends: list[Ends] | None = None,
     *,
@@ -92,15 +91,17 @@ def prove_pieces(
     waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1) if k not in over]
     unproved: list[Part] = []
     while waiting:
-        solved = [_solved(steps, policy, funnel, part, known) for part in waiting]
+        solved = [_solved(steps, funnel, part, known) for part in waiting]
         unproved += [part for part, good in zip(waiting, solved, strict=True) if not good]
         waiting = [part for part, good in zip(waiting, solved, strict=True) if good]
         if not waiting:
             break
-        pieces = rounded(_pieces(steps, policy, funnel, waiting, known))
+        pieces = rounded(_pieces(steps, funnel, waiting, known))
         margins = np.full(len(pieces), np.nan)
         for chosen in batches(pieces):
-            margins[chosen] = piece_margins(steps.field, policy, funnel, pieces.select(chosen))
+            margins[chosen] = piece_margins(
+                steps.field, steps.policy, funnel, pieces.select(chosen)
+            )
         by_part = np.asarray(np.isfinite(margins).reshape(len(waiting), -1).all(axis=1))
         keep = np.repeat(by_part, steps.cases)
         if keep.any():
@@ -114,7 +115,6 @@ def prove_pieces(
 
 def _solved(
     steps: LSteps,
-    policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     part: Part,
     known: dict[tuple[int, float], list[SphereSolution]],
@@ -125,7 +125,7 @@ def _solved(
     for s in part.ends():
         rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
         if (k, s) not in known:
-            section = section_at(steps, policy, funnel.P, k, s)
+            section = section_at(steps, funnel.P, k, s)
             near = next((known[k, end] for end in part.ends() if (k, end) in known), None)
             try:
                 known[k, s] = steps.solve(section, rho, near)
@@ -139,7 +139,6 @@ def _solved(
 
 def _pieces(
     steps: LSteps,
-    policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
     parts: list[Part],
     known: dict[tuple[int, float], list[SphereSolution]],
@@ -157,7 +156,7 @@ def _pieces(
             s = part.ends()[end]
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
-            section = section_at(steps, policy, funnel.P, i, s)
+            section = section_at(steps, funnel.P, i, s)
             T += [np.sqrt(rho_here) * section.shape.base] * steps.cases
             rho += [rho_here] * steps.cases
             rows += known[i, s]
@@ -166,7 +165,7 @@ def _pieces(
         tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
         tau = tau.reshape(len(rows), -1, n + 1, n + 1)
         blank = replace(blank, tau=np.stack([tau, tau], axis=1))
-        c = closed_loop_polynomial(steps.field, policy, funnel, blank, end)
+        c = closed_loop_polynomial(steps.field, steps.policy, funnel, blank, end)
         at_end = {q: part[:, 0] for q, part in c.items()}
         mu = np.zeros((len(rows), len(full)))
         gram = np.zeros((len(rows), len(basis), len(basis)))
@@ -247,21 +246,17 @@ def end_proof(
     target: dict[int, FloatArray],
     scale: float,
     m: float,
-    *,
-    constant: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, target/scale ≥ m on the sphere, all of m used up.
+    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, where target/scale ≥ m on the sphere.
 
-    constant: the share of m that stays a constant; the rest makes Q positive definite.
+    All of m is used up.
     """
     n = program.n
     basis = proof_basis(program)
     Q = np.zeros((len(basis), len(basis)))
     home = positions(program.basis, basis)
     Q[np.ix_(home, home)] = program.gram(solution) * scale
-    spread = (1 - constant) * _spread(program)
-    spread[0] += constant
-    Q[np.diag_indices(len(basis))] += scale * m * spread
+    Q[np.diag_indices(len(basis))] += scale * m * _spread(program)
     linear = np.array([j not in program.chosen for j in range(n)])
     first = target.get(1, np.zeros(n))
     for j in np.flatnonzero(linear).tolist():
@@ -341,15 +336,13 @@ def stacked(parts: Sequence[Pieces]) -> Pieces:
     return replace(parts[0], **whole)
 
 
-def proof_of(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, proved: Proved
-) -> Json:
+def proof_of(steps: LSteps, funnel: ContinuousFunnel, proved: Proved) -> Json:
     """The witnesses of all pieces as a proof states them; the kernel has not decided them yet."""
     pieces, n = proved.pieces, funnel.n
     margin = stated_margin(proved.margins)
     written: list[Json] = [{}] * len(pieces)
     for chosen in batches(pieces):
-        found = documents(steps.field, policy, funnel, pieces.select(chosen), margin)
+        found = documents(steps.field, steps.policy, funnel, pieces.select(chosen), margin)
         for i, document in zip(chosen.tolist(), found, strict=True):
             written[i] = document
     used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))

@@ -113,16 +113,16 @@ def _held(
     for scale in SCALES:
         try:
             rho, field = held_sweep(setting, expansion, table, scale * free, progress)
-            policy = replace(policy, vector_field=files.digest(field.document()))
+            steps = with_widths(setting, field)
+            policy = steps.policy
             outer = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, "")
-            steps = with_widths(replace(setting, policy=policy), field)
             rates: FloatArray = np.zeros(widths.shape)
             widths = hold.widths(policy, rates)
             if hold.period:
-                rates, widths = fastest(Changes.of(steps, policy, outer), policy, hold)
+                rates, widths = fastest(Changes.of(steps, outer), policy, hold)
             steps.widths = widths
             bounded = replace(hold, rates=rates)
-            held = replace(setting, steps=steps, policy=policy, hold=bounded)
+            held = replace(setting, steps=steps, hold=bounded)
             wanted = replace(wanted_of(held, rho, widths), expected=hold.period > 0)
             return _proved(held, wanted, progress)
         except (Infeasible, DataError) as error:
@@ -177,7 +177,7 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
         digest = files.digest(policy.document())
         funnel = ContinuousFunnel(policy.x, setting.P, made.rho, policy.vector_field, digest)
         refuse_unmonitorable(funnel)
-        shown = prove_pieces(steps, policy, funnel, made.ends, kept=kept, most=most)
+        shown = prove_pieces(steps, funnel, made.ends, kept=kept, most=most)
         if not shown.unproved:
             return Found(made.setting, funnel, shown, wanted.margin)
         left = np.isin(intervals, [part.interval for part in shown.unproved])

@@ -48,13 +48,17 @@ class Setting:
     """
 
     steps: LSteps
-    policy: ContinuousPolicy
     P: FloatArray
     rho_final: float
     goal: Goal
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
+
+    @property
+    def policy(self) -> ContinuousPolicy:
+        """The policy of the L-steps."""
+        return self.steps.policy
 
     def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
         """The members of a proof about how fast the input changes in the funnel.
@@ -66,14 +70,14 @@ class Setting:
         rates = self.hold.rates
         return {
             "rates": rates.tolist(),
-            "rate_pieces": prove_rates(self.steps, self.policy, funnel, rates, basis),
+            "rate_pieces": prove_rates(self.steps, funnel, rates, basis),
             "sides": affine(funnel.n).tolist(),
         }
 
     def margin(self, rho: float) -> float:
         """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
         last = len(self.policy.t) - 2
-        end = section_at(self.steps, self.policy, self.P, last, 1.0)
+        end = section_at(self.steps, self.P, last, 1.0)
         if self.expansion is not None:
             around = partial(self.expansion.around, self.policy, self.P, last)
             try:
@@ -124,7 +128,7 @@ def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
     if held is not None:
         held.refuse(field, policy)
     rho_final = final_level(policy, S, wanted, expansion)
-    return Setting(steps, policy, S, rho_final, wanted, (Q, R), expansion, held)
+    return Setting(steps, S, rho_final, wanted, (Q, R), expansion, held)
 
 
 def default_weights(

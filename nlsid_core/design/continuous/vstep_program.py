@@ -15,8 +15,8 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import SolverError
 
 MAX_ITERATIONS = 40  # some 10 are usual
-GAP = 1e-2  # relative to Σ|cost|: L-steps judge what is found
-FEASIBLE = 1e-4  # of c's values, relative to the largest: L-steps judge this too
+GAP = 5e-2  # relative to Σ|cost|: L-steps judge what is found
+FEASIBLE = 1e-3  # of c's values, relative to the largest: L-steps judge this too
 STEP_TO_BOUNDARY = 0.95
 CENTRING_POWER = 3  # Mehrotra's
 

@@ -130,7 +130,7 @@ def stated_squares(
 
 def polynomial(values: Mapping[tuple[int, ...], Fraction], ring: Ring) -> Polynomial:
     """The kernel's polynomial with these coefficients."""
-    return ring.weighted([(value, ring.monomial(e)) for e, value in values.items()])
+    return ring.dot(list(values.values()), list(map(ring.monomial, values)))
 
 
 def half_widths(S: FloatArray, radius: FloatArray, widens: float) -> FloatArray:

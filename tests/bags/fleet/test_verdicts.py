@@ -35,12 +35,6 @@ from tests.verbs import nlsid
 CONFIG = Path("config/f1tenth.yaml")
 
 
-@pytest.fixture
-def design(f1tenth_chain: Path) -> Path:
-    """F1TENTH's design."""
-    return f1tenth_chain / documents.FUNNEL
-
-
 def held_against(funnel: Path, bags: Mapping[str, Path]) -> FleetVerdict:
     """The bags of a fleet, judged in this process."""
     design = documents.load(funnel)
@@ -58,10 +52,10 @@ def judged(spent: float, month: str = "2026-01") -> Row:
     return Row(f"bag_{spent}_{month}", "inside", start=start, numbers={"spent": spent})
 
 
-def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
-    proved = documents.load(design)
+def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(funnel: Path) -> None:
+    proved = documents.load(funnel)
     bags = {path.name: path for path in f1tenth()[:6]}
-    found = held_against(design, bags)
+    found = held_against(funnel, bags)
     for row, path in zip(found.rows, bags.values(), strict=True):
         alone = replay_bag(proved, path, centre=Centre.COMMAND)
         assert alone.worst is not None
@@ -76,9 +70,9 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
 
 
 @pytest.mark.slow
-def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) -> None:
+def test_bags_that_made_the_design_are_not_counted_for_the_next(funnel: Path) -> None:
     bags = {path.name: path for path in f1tenth()}
-    found = held_against(design, bags)
+    found = held_against(funnel, bags)
     tests = load_config(CONFIG).split.test
     assert {row.bag for row in found.others} == set(tests)
     assert "probability 1/9 = 0.112 at most" in found.ranks[0]
@@ -92,7 +86,7 @@ def test_ranks_of_a_thousand_bags_say_two_things() -> None:
 
 
 def test_the_command_says_who_was_outside_and_that_one_was_not_read(
-    design: Path, tmp_path: Path
+    funnel: Path, tmp_path: Path
 ) -> None:
     drive(tmp_path / "fleet" / "robot_1" / "other.mcap", samples=117)
     (tmp_path / "fleet" / "robot_2").mkdir()
@@ -100,10 +94,10 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
     table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
     given = ["--out", str(table), "--manifest", str(kept)]
-    said = nlsid("fleet", "monitor", design.parent, pattern, *given, status=1)
+    said = nlsid("fleet", "monitor", funnel.parent, pattern, *given, status=1)
     assert "robot_2/cut: " in said
     worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
-    assert f"nlsid view {design.parent} {worst}" in said
+    assert f"nlsid view {funnel.parent} {worst}" in said
     assert "is no MCAP, SQLite or ROS 1 file" in said
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
@@ -113,14 +107,14 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     assert kept.exists()
 
 
-def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: Path) -> None:
+def test_a_recording_that_two_bags_have_is_counted_once(funnel: Path, tmp_path: Path) -> None:
     """Byte for byte, and with other bytes but the same messages."""
     original = drive(tmp_path / "a" / "drive.mcap", samples=117)
     for folder in "bc":
         (tmp_path / folder).mkdir()
     (tmp_path / "b" / "drive.mcap").write_bytes(original.read_bytes())
     drive(tmp_path / "c" / "drive.mcap", samples=117, writer={"chunk_size": 2**20})
-    found = held_against(design, named_bags([tmp_path / "*" / "*.mcap"]))
+    found = held_against(funnel, named_bags([tmp_path / "*" / "*.mcap"]))
     assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
@@ -136,7 +130,7 @@ def test_bags_of_the_design_that_are_not_recognised_are_said(
 
 
 def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
-    design: Path, tmp_path: Path
+    funnel: Path, tmp_path: Path
 ) -> None:
     """Size, time of change, tag and end of the file: a copy is what has the same samples."""
     pytest.importorskip("obstore")
@@ -149,19 +143,19 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
     tails = {file.name: file.read_bytes()[-MARK_BYTES:] for file in web.iterdir()}
     assert tails["a.mcap"] == tails["b.mcap"]
     with web_server(web) as url:
-        found = held_against(design, named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]))
+        found = held_against(funnel, named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]))
     rows = {row.bag: row for row in found.rows}
     assert rows["b"].numbers["judged"] > 0
     assert "copy" not in (rows["a"].verdict, rows["b"].verdict)
     assert (rows["c"].verdict, rows["c"].reason) == ("copy", "the same recording as a")
 
 
-def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: Path) -> None:
+def test_names_of_objects_cannot_write_to_the_terminal(funnel: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet" / "robot[red]"
     drive(fleet / "a[bold][/red]\x1b[2J.mcap", samples=117)
     (fleet / "b[").mkdir()  # the rest of the name is after a slash
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
-    where = [str(design.parent), str(fleet)]
+    where = [str(funnel.parent), str(fleet)]
     check, monitor = ["check", *where, "--config", str(CONFIG)], ["monitor", *where]
     for given in (check, monitor):
         said = nlsid("fleet", *given, status=2)  # one was not read
@@ -261,10 +255,10 @@ def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
 
 
 def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
-    spoiled: Path, design: Path, tmp_path: Path
+    spoiled: Path, funnel: Path, tmp_path: Path
 ) -> None:
     pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
-    given = (str(design.parent), pattern, "--manifest", kept)
+    given = (str(funnel.parent), pattern, "--manifest", kept)
     lines = fleet_command("monitor", *given, status=1)
     said = "\n".join(lines)
     assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
@@ -371,7 +365,7 @@ def test_a_part_of_a_bag_with_gaps_may_be_named_before_it_is_known() -> None:
 
 @pytest.mark.parametrize("verb", slow_among(["check", "monitor"], {"monitor"}))
 def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
-    design: Path, tmp_path: Path, verb: str
+    funnel: Path, tmp_path: Path, verb: str
 ) -> None:
     """Cut off, busy for ever, busy for a while, vanished, too slow: each with its reason."""
     pytest.importorskip("obstore")
@@ -389,7 +383,7 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
 
     with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
         named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=1.0)
-        found = checked(named) if verb == "check" else held_against(design, named).rows
+        found = checked(named) if verb == "check" else held_against(funnel, named).rows
     rows = {row.bag: row for row in found}
     assert [row.bag for row in found] == sorted(rows) == sorted(named)
     said = {name: f"{row.reason} {row.said}" for name, row in rows.items()}

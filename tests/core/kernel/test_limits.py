@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 
 import pytest
 
@@ -21,12 +21,17 @@ def deciding(claim: Claim, limits: Limits) -> Deciding:
 
 
 @pytest.mark.parametrize(
-    ("limits", "reason"),
-    [(Limits(seconds=1), "more than 1 s of processor time"), (Limits(memory=60), "memory")],
+    ("made", "size", "limits", "reason"),
+    [
+        (network, 100, Limits(seconds=1), "more than 1 s of processor time"),
+        (equal_hashes, 12, Limits(memory=60), "memory"),
+    ],
 )
-def test_a_claim_that_takes_too_much_is_ended_with_the_reason(limits: Limits, reason: str) -> None:
+def test_a_claim_that_takes_too_much_is_ended_with_the_reason(
+    made: Callable[[int], Claim], size: int, limits: Limits, reason: str
+) -> None:
     with pytest.raises(CertificateRejected, match=reason):
-        deciding(network(100), limits).wait()
+        deciding(made(size), limits).wait()
 
 
 def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:
@@ -40,11 +45,9 @@ def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:
 def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:
     """2^14 of them took 27 s, as all were in one place of a dictionary."""
     document, about = equal_hashes(9)
-    started = time.process_time()
     with pytest.raises(kernel.Rejected) as refused:
         kernel.decide(files.encode(document), lambda name: files.encode(about[name]))
     assert refused.value.reason in kernel.REASONS
-    assert time.process_time() >= started  # how long it took is `benchmarks.kernel`'s to say
     ring = Ring(11, 64)
     packed = {ring.key([1] + [0] * 10), ring.key([0] * 10 + [2])}
     assert len({hash(key) for key in packed}) == 2

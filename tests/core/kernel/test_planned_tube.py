@@ -17,6 +17,7 @@ from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from tests.core.kernel import oracle_tube as oracle
 from tests.core.kernel.refusals import refused
 from tests.core.kernel.tube_claims import claim
+from tests.decided import decided
 
 NAMES = {"model": MODEL, "policy": POLICY, "funnel": FUNNEL}
 
@@ -276,14 +277,14 @@ def test_a_changed_digit_in_any_number_of_any_file_is_rejected(
         mutant = original[:i] + str(int(original[i]) + 1) + original[i + 1 :]
         (design_folder / name).write_text(mutant)
         with pytest.raises(CertificateRejected):
-            proofs.check(design_folder / FUNNEL_PROOF)
+            decided(design_folder / FUNNEL_PROOF)
 
 
 @pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
 def test_a_missing_file_is_rejected_by_name(design_folder: Path, name: str) -> None:
     (design_folder / name).unlink()
     with pytest.raises(CertificateMismatch, match=name):
-        proofs.check(design_folder / FUNNEL_PROOF)
+        decided(design_folder / FUNNEL_PROOF)
 
 
 # -- the oracle ------------------------------------------------------------------------------

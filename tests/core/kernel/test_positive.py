@@ -140,13 +140,12 @@ def test_a_zero_at_one_end_of_s_is_nonnegative_and_not_positive() -> None:
         decide(c, witness, strict=False)
         with refused("not_positive"):
             decide(c, witness)
+    for tiny in (Fraction(1, 2**1074), -Fraction(1, 10**30)):  # of no product: no lane is so small
+        with refused("not_positive"):
+            decide([one + oracle.P(1, {(3,): tiny})], witness)
     below = [nothing - oracle.P.constant(1, Fraction(1, 10**30)), one]
     with pytest.raises(Rejected):
         decide(below, witness, strict=False)
-
-
-def _squared(exponents: list[int]) -> dict[oracle.Key, Fraction | int]:
-    return {tuple(2 * e for e in exponents): 1}
 
 
 def test_the_same_square_does_not_balance_two_cross_terms() -> None:

@@ -28,6 +28,7 @@ from tests.core.kernel.stability_claims import (
     state_affine,
 )
 from tests.core.kernel.stability_forgeries import CHANGES
+from tests.decided import decided
 from tests.marks import slow_among
 
 NAMES = list(MODELS)
@@ -319,7 +320,7 @@ def test_a_changed_digit_in_a_model_is_refused(tmp_path: Path, name: str) -> Non
     for i in digits[:: max(1, len(digits) // 20)]:
         model.write_text(original[:i] + str(int(original[i]) + 1) + original[i + 1 :])
         with refused("mismatch"):
-            proofs.check(path)
+            decided(path)
 
 
 @pytest.mark.parametrize("file", ["../model.json", "/etc/hostname", "a/b.json", "", "..\\x"])
@@ -329,7 +330,7 @@ def test_a_file_name_that_leaves_the_folder_is_refused(tmp_path: Path, file: str
     document["claim"]["about"]["model"]["file"] = file
     files.write_document(path, document)
     with refused("malformed"):
-        proofs.check(path)
+        decided(path)
 
 
 @pytest.mark.parametrize("place", [("claim",), ("proof",), ("claim", "about"), ("claim", "kind")])
@@ -342,7 +343,7 @@ def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str,
     del inner[place[-1]]
     files.write_document(path, document)
     with refused("malformed"):
-        proofs.check(path)
+        decided(path)
 
 
 @pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split"}))
