@@ -14,7 +14,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_107,
     ("bags",): 11_914,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_365,
+    ("tests",): 22_285,
     ("benchmarks", "examples"): 3_797,
 }
 ARGUMENTS, FIELDS = 6, 8
