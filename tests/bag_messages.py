@@ -72,6 +72,11 @@ def joints(stamp_ns: int, position: Iterable[float]) -> bytes:
     return serialised(JOINT_TYPE, message)
 
 
+def put(bag: BagWriter, at_ns: int, topic: str, msgtype: str, data: bytes) -> None:
+    """A message that was logged and published at this time."""
+    bag.write(topic, msgtype, data, log_time_ns=at_ns, publish_time_ns=at_ns)
+
+
 def speed_bag(
     path: Path,
     speeds: Iterable[float | None],
@@ -90,10 +95,9 @@ def speed_bag(
     with BagWriter(path, custom=custom) as bag:
         for k, (stamp, (speed, value)) in enumerate(zip(stamps, pairs, strict=True)):
             log = start_ns + k * PERIOD_NS
-            times = {"log_time_ns": log, "publish_time_ns": log}
-            bag.write(CMD, CMD_TYPE, command(stamp, value), **times)
+            put(bag, log, CMD, CMD_TYPE, command(stamp, value))
             if speed is not None:
-                bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
+                put(bag, log, ODOM, ODOM_TYPE, odometry(stamp, speed))
     return path
 
 
@@ -104,10 +108,9 @@ def number_bag(path: Path, values: Mapping[str, FloatArray], *, period: float) -
     with BagWriter(path) as writer:
         for k, row in enumerate(zip(*values.values(), strict=True)):
             stamp_ns = START_NS + round(1e9 * period * k)
-            times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
             for topic, value in zip(values, row, strict=True):
                 if not np.isnan(value):
-                    writer.write(topic, kind, serialised(kind, number(float(value))), **times)
+                    put(writer, stamp_ns, topic, kind, serialised(kind, number(float(value))))
     return path
 
 

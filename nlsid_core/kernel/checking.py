@@ -14,7 +14,6 @@ from .files import (
     Read,
     Rejected,
     digest,
-    itself,
     limit,
     parse,
     plain,
@@ -108,7 +107,7 @@ def _decided(document: Node, read: Read) -> Verdict:
         "version 1 left; make the proof again, by what wrote it",
         "left",
     )
-    parts = document.document("proof", {"claim": itself, "proof": itself})
+    parts = document.document("proof", {"claim": None, "proof": None})
     kind = parts["claim"].kind()
     refuse_if(kind in LEFT, f"kind {kind} left with version 0.3", "left")
     refuse_if(kind not in KINDS, f"claim {kind!r} is unknown; known: {', '.join(KINDS)}", "unknown")

@@ -15,9 +15,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from .exact import definite, dot, unit
-from .files import Node, Reader, Table, Terms, itself, limit, refuse_if, whole
+from .files import Node, Reader, Table, Terms, limit, refuse_if, whole
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import expanded, positive, powers_of_two, read_squares
+from .positivity import positive, powers_of_two, read_squares
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE = 7, 3
@@ -41,10 +41,10 @@ Motion = SimpleNamespace
 def read_motion(documents: dict[str, Node], digests: dict[str, str]) -> Motion:
     """The policy and the funnel: around one nominal, x₀ continuous, P ≻ 0, ρ > 0 at every knot."""
     made_for = {"vector_field": digests["vector_field"]}
-    table: Table = {"t": (None,), "x": itself, "u": itself, "K": itself, "limits": (None, 3)}
+    table: Table = {"t": (None,), "x": None, "u": None, "K": None, "limits": (None, 3)}
     policy = documents["policy"].document("policy", table, "continuous", made_for)
     made_for["policy"], node = digests["policy"], documents["funnel"]
-    table = {"t": _times(2, MAX_KNOTS), "x": itself, "P": itself, "rho": (None,)}
+    table = {"t": _times(2, MAX_KNOTS), "x": None, "P": None, "rho": (None,)}
     given = node.document("funnel", table, "continuous", made_for)
 
     t, rho, x = given["t"], given["rho"], _curve(given["x"], len(given["t"]) - 1, None)
@@ -83,7 +83,7 @@ def _read_field(node: Node, motion: Motion) -> None:
         "breaks": _times(0, MAX_SPANS),
         "valid": (None, None),
         "expansion": Node.text,
-        "pieces": itself,
+        "pieces": None,
     }
     given = node.document("vector_field", table)
     n, m, box, breaks = motion.n, motion.m, given["uncertain"], given["breaks"]
@@ -134,7 +134,7 @@ def in_order(node: Node, names: str, needed: Sequence[Key], limited: int) -> lis
     """
     rate = {"input": whole(0), "sign": whole(-1, 1)} if "input" in names else {}
     place = {"interval": whole(0), "vertex": whole(0), "level": whole(0, MAX_LEVEL)}
-    others = dict.fromkeys(f"columns squares {names}".split(), itself)
+    others = dict.fromkeys(f"columns squares {names}".split())
     table: Table = {**place, "index": whole(0), **others, **rate}
     if limited:
         table["mode"] = lambda entry: entry.wholes(limited)
@@ -231,7 +231,7 @@ class ClosedLoop:
         """-τ q for everything that is nonnegative here, τ sums of squares in `sides`."""
         pairs = zip(taus.items(len(held), len(held)), held, strict=True)
         read = ((node.members("columns squares") | {"basis": sides}, q) for node, q in pairs)
-        return [-1 * (expanded(tau, self.ring) * q) for tau, q in read]
+        return [-1 * (read_squares(tau, self.ring).form * q) for tau, q in read]
 
     def slope(self, p: Polynomial) -> Polynomial:
         """The derivative along the interval, of which this part is 2^-level."""

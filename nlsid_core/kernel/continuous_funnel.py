@@ -26,7 +26,7 @@ from .closed_loop import (
     read_multiplier,
 )
 from .exact import Rows, at_most, dot, identity, inverse_forms, scaled, semidefinite, unit
-from .files import Node, Read, Table, bound_files, itself, limit, refuse_if
+from .files import Node, Read, Table, bound_files, limit, refuse_if
 from .polynomials import Polynomial
 
 SENTENCE = (
@@ -54,14 +54,14 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
 
 def decide_funnel(claim: Node, proof: Node, read: Read) -> tuple[text.Verdict, Motion]:
     """The verdict, and the funnel that it is about."""
-    parts = claim.members("kind about", "goal hold error")
+    parts = claim.members("kind about goal? hold? error?")
     documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
     motion = read_motion(documents, digests)
     held = "hold" in parts
     names = "basis multiplier pieces" + " rates rate_pieces" * held
     names += " sides" * bool(held or motion.limits) + " kappa?" * bool(motion.box)
     ends: Table = {"margin": (), **({"goal_multiplier": ()} if "goal" in parts else {})}
-    stated = proof.read({**ends, **dict.fromkeys(names.split(), itself)})
+    stated = proof.read({**ends, **dict.fromkeys(names.split())})
     proof.require({"the margin should be positive": stated["margin"] > 0}, "not_below")
     read_hold(claim, stated, motion)
 

@@ -27,7 +27,8 @@ MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a ma
 VERSION = 2  # of proofs and of all documents they are about
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
-Reader: TypeAlias = "Callable[[Node], Any] | tuple[int | None, ...]"  # of a member, or its shape
+# Of a member: what reads it, or its shape; None if it is read elsewhere, or no claim is about it.
+Reader: TypeAlias = "Callable[[Node], Any] | tuple[int | None, ...] | None"
 Members = dict[str, Any]  # of an object, as they were read
 Table = dict[str, Reader]  # the members of an object; `name?` may be missing
 NOTHING: dict[str, str] = {}
@@ -75,25 +76,27 @@ class Node:
             joint = " " if wanted.startswith("should ") else ": "
             refuse_if(not holds, f"{self.where}{joint}{wanted}", reason)
 
-    def members(self, required: str, optional: str = "") -> dict[str, "Node"]:
-        """An object with exactly these members (names separated by spaces)."""
-        wanted, allowed = required.split(), optional.split()
+    def members(self, names: str) -> dict[str, "Node"]:
+        """An object with exactly these members, separated by spaces; `name?` may be missing."""
         self.require({"should be an object": type(self.value) is dict})
-        missing = {f"'{name}' is missing": False for name in wanted if name not in self.value}
-        others = sorted(set(self.value).difference(wanted, allowed))
-        self.require(missing | {f"unknown member {plain(name)!r}": False for name in others})
+        wanted, allowed = names.split(), names.replace("?", "").split()
+        missing = {f"'{n}' is missing": n[-1] == "?" or n in self.value for n in wanted}
+        others = {f"unknown member {plain(n)!r}": n in allowed for n in sorted(self.value)}
+        self.require(missing | others)
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
     def read(self, table: Table) -> Members:
         """The members of an object, by their readers or of their shapes; None for a missing one."""
-        optional = [name[:-1] for name in table if name[-1] == "?"]
-        parts = self.members(" ".join(n for n in table if n[-1] != "?"), " ".join(optional))
-        readers = {name.rstrip("?"): reader for name, reader in table.items()}
-        found = {name: parts[name].by(how) for name, how in readers.items() if name in parts}
-        return {**dict.fromkeys(optional), **found}
+        parts = self.members(" ".join(table))
+        readers = {name.rstrip("?"): how for name, how in table.items()}
+        return {
+            name: parts[name].by(how) if name in parts else None for name, how in readers.items()
+        }
 
     def by(self, how: Reader) -> Any:
-        """What a reader finds, or an array of a shape."""
+        """What a reader finds, an array of a shape, or the node itself."""
+        if how is None:
+            return self
         return self.array(*how) if isinstance(how, tuple) else how(self)
 
     def document(
@@ -176,7 +179,9 @@ class Node:
         if not kinds.issuperset(map(type, value)):
             wanted = "numbers" if Fraction in kinds else "whole numbers"
             raise Rejected(f"{self.where} should hold {wanted} only")
-        return list(map(Fraction, value)) if Fraction in kinds else list(value)
+        if Fraction in kinds:
+            return [e if type(e) is Fraction else Fraction(e) for e in value]
+        return list(value)
 
     def monomials(
         self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] | None = None
@@ -212,11 +217,6 @@ class Node:
         return Node(self.value["kind"], f"{self.where} kind").text()
 
 
-def itself(node: Node) -> Node:
-    """A member that is read elsewhere, or that no claim is about."""
-    return node
-
-
 def no_more(node: Node) -> None:
     """A reader of what left: nothing makes it since version 0.3."""
     raise Rejected(f"{node.where} is not decided since version 0.3", "left")
@@ -227,9 +227,9 @@ def whole(least: int, most: int = MAX_WHOLE) -> Reader:
     return lambda node: node.whole(least, most)
 
 
-def each(reader: Callable[[Node], Any], least: int, most: int = MAX_ENTRIES) -> Reader:
+def each(reader: Reader, least: int, most: int = MAX_ENTRIES) -> Reader:
     """A reader of a list of `least` to `most` entries."""
-    return lambda node: list(map(reader, node.items(least, most)))
+    return lambda node: [entry.by(reader) for entry in node.items(least, most)]
 
 
 def one_of(*texts: str, reason: str = "malformed", former: Sequence[str] = ()) -> Reader:
@@ -320,7 +320,8 @@ def _float64(text: str) -> Fraction:
 
 
 def _whole(text: str) -> int:
-    value = int(text) if len(text) <= 20 else 2**64
-    if abs(value) > MAX_WHOLE:
+    if len(text) < 16:  # most are
+        return int(text)
+    if len(text) > 20 or abs(int(text)) > MAX_WHOLE:
         raise ValueError(f"{text[:24]} is a whole number beyond 2^53")
-    return value
+    return int(text)

@@ -12,7 +12,7 @@ from . import text
 from .closed_loop import Motion
 from .continuous_funnel import decide_funnel, inside
 from .exact import scaled
-from .files import Node, Read, Rejected, bound_files, itself, limit, refuse_if
+from .files import Node, Read, Rejected, bound_files, limit, refuse_if
 
 MAX_STAGES = 100
 SENTENCE = (
@@ -54,10 +54,10 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
 
 def _decide_stage(node: Node, read: Read) -> tuple[text.Verdict, Motion]:
     """A continuous funnel whose input is not held into the next stage: that is not covered."""
-    stage = node.document("proof", {"claim": itself, "proof": itself})
+    stage = node.document("proof", {"claim": None, "proof": None})
     claim = stage["claim"]
     claim.require({"a stage should claim a funnel": claim.kind() == "continuous_funnel"})
-    held = "hold" in claim.members("kind about", "goal hold error")
+    held = "hold" in claim.members("kind about goal? hold? error?")
     claim.require({"an input held into the next stage is not covered": not held}, "not_valid")
     return decide_funnel(claim, stage["proof"], read)
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .files import Node, Table, Terms, each, itself, no_more, one_of
+from .files import Node, Table, Terms, each, no_more, one_of
 
 MAX_STATES, MAX_WINDOW = 30, 60  # of x, and of w
 
@@ -13,8 +13,8 @@ IMPLICIT: Table = {
     "states": each(Node.text, 1, MAX_STATES),
     "inputs": each(Node.text, 0, MAX_WINDOW),
     "monotonicity": (),
-    "h": itself,
-    **dict.fromkeys(("shift?", "y?", "u?", "window?", "training?", "bags?"), itself),
+    "h": None,
+    **dict.fromkeys(("shift?", "y?", "u?", "window?", "training?", "bags?")),
     "centre?": no_more,
 }
 

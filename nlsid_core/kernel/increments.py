@@ -138,7 +138,7 @@ def positive(model: Model, multipliers: Node | None, gaps: Sequence[tuple[str, M
 
 def _leaves(node: Node, E: Hull, box: Box, depth: int = 0) -> Iterator[tuple[Box, Node]]:
     """The N of every leaf of the tree, and its part of the box."""
-    parts = node.members("", "N ends split parts")
+    parts = node.members("N? ends? split? parts?")
     if "ends" in parts:
         no_more(parts["ends"])
     if set(parts) == {"N"}:

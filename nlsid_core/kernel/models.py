@@ -16,7 +16,7 @@ from typing import Any
 
 from . import text
 from .exact import Matrix, identity, unit
-from .files import Node, Table, each, itself, limit, one_of, refuse_if
+from .files import Node, Table, each, limit, one_of, refuse_if
 from .implicit_models import derivative, read_implicit
 from .increments import MAX_POWER, Box, Entries, Hull, Linear, Model
 from .signals import ranges, read_signal, signals
@@ -42,7 +42,7 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
 
 def _recorded(node: Node, kind: str, table: Table) -> dict[str, Any]:
     """The members of a model of recorded signals; what made it is not read."""
-    heads: Table = {"period": (), "training": itself, "bags": itself, "equation?": Node.text}
+    heads: Table = {"period": (), "training": None, "bags": None, "equation?": Node.text}
     given = node.document("model", {**heads, **table}, kind)
     node.require({"the period should be positive": given["period"] > 0})
     return given
@@ -74,8 +74,8 @@ def _read_affine(node: Node) -> Model:
         "y": signals("outputs", 1),
         "u": signals("inputs", 1),
         "window": lambda entry: entry.wholes(None, 2),
-        "G": each(itself, 2),
-        "p": itself,
+        "G": each(None, 2),
+        "p": None,
         **dict.fromkeys(("y_offset", "y_scale", "u_offset", "u_scale"), (None,)),
         "u_range": (None, 2),
         "on_out_of_range": one_of("clip", "refuse"),
@@ -212,7 +212,7 @@ def _read_cells(node: Node) -> Model:
         "y": signals("outputs", 1),
         "u": signals("inputs"),
         "maps": each(_slopes, 1, MAX_MAPS),
-        **dict.fromkeys(("into", "next", "output", "start_samples"), itself),
+        **dict.fromkeys(("into", "next", "output", "start_samples")),
         "start": (None,),
     }
     given = _recorded(node, "cell_network", table)

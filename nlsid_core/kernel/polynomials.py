@@ -8,7 +8,7 @@ sum of the absolute values of all its integers, and below 2^(width - 1) the pack
 `coefficients` refuses to otherwise, and `at_width` tries a larger width.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -92,7 +92,8 @@ class Ring:
         """A polynomial, or a number as one."""
         if isinstance(value, Polynomial):
             return value
-        return Polynomial(self, {0: value.numerator}, value.denominator, 0, 0, abs(value.numerator))
+        whole, denominator = value.as_integer_ratio()
+        return Polynomial(self, {0: whole} if whole else {}, denominator, 0, 0, abs(whole))
 
     def bernstein(self, points: Sequence[Fraction], level: int = 0, index: int = 0) -> Polynomial:
         """Σ_j B_j(r) points[j] with r = (index + s) / 2^level."""
@@ -100,14 +101,14 @@ class Ring:
         weights = [point.numerator * (common // point.denominator) for point in points]
         d = len(points) - 1
         basis, norms = _bernstein(d, level, index, self.width)
-        norm = sum(map(mul, map(abs, weights), norms))
-        return Polynomial(self, {0: sum(map(mul, weights, basis))}, common << level * d, 0, d, norm)
+        packed, norm = sum(map(mul, weights, basis)), sum(map(mul, map(abs, weights), norms))
+        return Polynomial(self, {0: packed} if packed else {}, common << level * d, 0, d, norm)
 
     def derivative(self, p: Polynomial) -> Polynomial:
         """dp/ds."""
         terms = {
             key: sum(i * c << self.width * (i - 1) for i, c in enumerate(row) if i)
-            for key, row in self.coefficients(p).items()
+            for key, row in self.coefficients(p)
         }
         return replace(p, terms=terms, order=max(0, p.order - 1), norm=p.order * p.norm)
 
@@ -161,22 +162,31 @@ class Ring:
         """Each of ps with a polynomial in the place of each variable."""
         return list(map(self.substitution(values), ps))
 
-    def coefficients(self, p: Polynomial, cut: int = 0) -> dict[int, list[int]]:
-        """Each monomial's whole coefficients of s^0, s^1 … over p.denominator, to the last but 0.
+    def coefficients(self, p: Polynomial) -> Iterator[tuple[int, list[int]]]:
+        """Each monomial, and its whole coefficients of s^0, s^1 … over p.denominator.
 
-        cut: bits that are cut off each, which rounds down.
+        They go on to the last that is not 0.
         """
         if p.norm.bit_length() >= self.width:
             raise TooNarrow((p.norm.bit_length() // STEP + 1) * STEP)
-        half, found = 1 << self.width - 1, {}
+        half = 1 << self.width - 1
         mask = 2 * half - 1
         for key, value in p.terms.items():
-            row = found[key] = list[int]()
+            row = []
             while value:
-                lowest = ((value + half) & mask) - half
-                row.append(lowest >> cut)
-                value = (value - lowest) >> self.width
-        return found
+                row.append(((value + half) & mask) - half)
+                value = (value - row[-1]) >> self.width
+            yield key, row
+
+    def bernstein_coefficients(self, p: Polynomial, width: int) -> Iterator[tuple[int, int]]:
+        """Each monomial, and Σ_k C(order, k) b_k 2^(width k), b_k of its Bernstein coefficients."""
+        for key, row in self.coefficients(p):
+            lanes = 0
+            for i, coefficient in enumerate(row):  # of s^i (s + (1 - s))^(order - i)
+                lanes += (lanes << width) + (coefficient << width * i)
+            for _ in range(p.order + 1 - len(row)):
+                lanes += lanes << width
+            yield key, lanes
 
 
 @lru_cache(maxsize=64)

@@ -14,19 +14,9 @@ from typing import Any
 
 from . import text
 from .exact import at_most, identity, inverse_forms, product, transposed
-from .files import (
-    Members,
-    Node,
-    Read,
-    Table,
-    bound_files,
-    itself,
-    limit,
-    one_of,
-    refuse_if,
-)
+from .files import Members, Node, Read, Table, bound_files, limit, one_of, refuse_if
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import expanded, positive, read_squares
+from .positivity import positive, read_squares
 from .sampled_step import Sample, nonnegative, read_step, stretch, triangular
 from .signals import apart, ranges, signals
 
@@ -97,7 +87,8 @@ def _prove_chain(
 def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polynomial:
     """-σ (radius² - size), σ a sum of squares: not positive where size <= radius²."""
     stated = node.members("columns squares") | {"basis": basis}
-    return expanded(stated, size.ring) * (size - radius**2)
+    sigma: Polynomial = read_squares(stated, size.ring).form
+    return sigma * (size - radius**2)
 
 
 def _prove_box(
@@ -122,11 +113,11 @@ def _prove_box(
 def _read_model(node: Node) -> Members:
     """The members of a model; its map; the box and names of all signals; variables of a step."""
     table: Table = {
-        **dict.fromkeys(("equation", "noise", "disturbance", "bags"), itself),
+        **dict.fromkeys(("equation", "noise", "disturbance", "bags")),
         "period": (),
         "x": signals("states", 1, MAX_SIGNALS),
         "u": signals("inputs", 1, MAX_SIGNALS),
-        **dict.fromkeys(("exponents", "coefficients", "x_range", "u_range"), itself),
+        **dict.fromkeys(("exponents", "coefficients", "x_range", "u_range")),
     }
     given = node.document("model", table, "state_map", former=LEFT_MODELS)
     x, u = given["x"], given["u"]
@@ -148,7 +139,7 @@ def _read_model(node: Node) -> Members:
 def _read_policy(node: Node, model: Members, made_for: str) -> Members:
     n, p = len(model["x"]), len(model["u"])
     table: Table = {
-        "law": itself,
+        "law": None,
         "period": (),
         "L": (n, n),
         "u": (None, p),
@@ -175,10 +166,10 @@ def _read_funnel(node: Node, model: Members, steps: int, digests: dict[str, str]
         "bound": nonnegative,
         "rate": (),
         "gain": (),
-        **dict.fromkeys(("measured", "safety_factor", "measured_on"), itself),
+        **dict.fromkeys(("measured", "safety_factor", "measured_on")),
     }
     table: Table = {
-        "set": itself,
+        "set": None,
         "assumption": lambda entry: entry.read(assumed),
         **dict.fromkeys(CHAINS, samples),
         "half_widths": (*samples, n),

@@ -10,7 +10,7 @@ from math import factorial, prod
 from types import SimpleNamespace
 
 from .exact import Matrix, combined, identity, product, scaled, semidefinite, transposed
-from .files import Members, Node, Terms, each, itself, refuse_if
+from .files import Members, Node, Terms, each, refuse_if
 from .polynomials import Polynomial, Ring
 
 MAX_CURVED = 64  # degrees with a bound of their curvature
@@ -28,8 +28,8 @@ def read_step(node: Node, model: Members, at: Sample, ring: Ring) -> Members:
             "T": (n, n),
             "kappa": nonnegative,
             "curvature": each(nonnegative, 0, MAX_CURVED),
-            "tube": itself,
-            "inlet": itself,
+            "tube": None,
+            "inlet": None,
         }
     )
     T = triangular(step["T"], node)

@@ -9,7 +9,7 @@ from fractions import Fraction
 
 from . import text
 from .exact import definite
-from .files import Node, Read, bound_files, itself, refuse_if
+from .files import Node, Read, bound_files, refuse_if
 from .increments import gap, positive
 from .models import read_model
 
@@ -21,11 +21,11 @@ SENTENCE = (
 
 def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     """Decide {kind, about: {model}, rate} by {P, multipliers}."""
-    stated = claim.read({"kind": itself, "about": itself, "rate": ()})
+    stated = claim.read({"kind": None, "about": None, "rate": ()})
     documents, digests = bound_files(stated["about"], read, "model")
     model, rate = read_model(documents["model"]), stated["rate"]
     refuse_if(not 0 < rate < 1, "the rate should satisfy 0 < rate < 1", "not_below")
-    given = proof.read({"P": (model.states, model.states), "multipliers?": itself})
+    given = proof.read({"P": (model.states, model.states), "multipliers?": None})
     P = given["P"]
     definite(P, "P")
     form = gap(model, rate**2, P, [], model.F, P)

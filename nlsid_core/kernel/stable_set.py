@@ -14,10 +14,10 @@ from typing import Any
 
 from . import text
 from .exact import definite
-from .files import Node, Read, Table, Terms, bound_files, itself, limit, one_of, refuse_if
+from .files import Node, Read, Table, Terms, bound_files, limit, one_of, refuse_if
 from .implicit_models import Implicit, derivative, read_implicit
 from .polynomials import Polynomial, Ring, at_width
-from .positivity import WITNESS, expanded, positive, read_squares
+from .positivity import WITNESS, positive, read_squares
 
 MAX_VARIABLES = 100
 STORAGE = {"2.11": " M", "2.13": " P", "2.19": ""}  # what a proof states of it, by set
@@ -41,8 +41,8 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
         "left",
     )
     table: Table = {
-        "kind": itself,
-        "about": itself,
+        "kind": None,
+        "about": None,
         "set": one_of(*STORAGE, former=LEFT),
         "delta": (),
         "box?": (None, 2),
@@ -66,7 +66,7 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
         wanted = _inequalities(model, kind, storage, delta, box, ring)
         witnesses = given["inequalities"].members(" ".join(wanted))
         for name, (c, domain) in wanted.items():
-            witness = witnesses[name].members(WITNESS, "multipliers")
+            witness = witnesses[name].members(f"{WITNESS} multipliers?")
             _positive_on(c, domain, witness, f"inequality {name}")
 
     at_width(count, [None], prove)
@@ -91,7 +91,7 @@ def _positive_on(c: Polynomial, domain: Vector, parts: Mapping[str, Node], what:
     for entry in parts["multipliers"].items(0, len(domain)) if "multipliers" in parts else []:
         members = entry.members(f"of {WITNESS}")
         last = members["of"].whole(last + 1, len(domain) - 1)
-        terms.append(-1 * (expanded(members, c.ring) * domain[last]))
+        terms.append(-1 * (read_squares(members, c.ring).form * domain[last]))
     positive(c.ring.sum(terms), read_squares(parts, c.ring), c.ring, what, strict=False)
 
 

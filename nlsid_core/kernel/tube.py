@@ -21,19 +21,7 @@ from fractions import Fraction
 
 from . import text
 from .exact import Matrix, at_most, combined, definite, unit
-from .files import (
-    Members,
-    Node,
-    Read,
-    Table,
-    bound_files,
-    each,
-    itself,
-    limit,
-    one_of,
-    refuse_if,
-    whole,
-)
+from .files import Members, Node, Read, Table, bound_files, each, limit, one_of, refuse_if, whole
 from .increments import Model, gap, positive
 from .models import read_model
 from .signals import Signal, apart, ranges
@@ -53,7 +41,7 @@ TERM: Table = {
 ASSUMPTION: Table = {  # what was measured is no part of the claim
     "kind": one_of("fading", "energy"),
     "samples?": whole(1, MAX_SAMPLES),
-    **dict.fromkeys(("measured", "rank?", "safety_factor", "designed_on", "measured_on"), itself),
+    **dict.fromkeys(("measured", "rank?", "safety_factor", "designed_on", "measured_on")),
 }
 CommandLevel = list[tuple[Fraction, Members]]  # weights, not negative, some positive; and terms G
 
@@ -93,15 +81,15 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     roles = "model policy funnel" if planned else "model funnel"
     documents, digests = bound_files(about, read, roles)
     made_for = {role: digests[role] for role in roles.split()[:-1]}
-    table: Table = {"settling": whole(0, MAX_SAMPLES), "tubes": itself, "box?": itself}
+    table: Table = {"settling": whole(0, MAX_SAMPLES), "tubes": None, "box?": None}
     if not planned:
-        table |= {"response?": itself, "cusum?": itself, "commands?": itself}
+        table |= {"response?": None, "cusum?": None, "commands?": None}
     funnel = documents["funnel"].document("funnel", table, "tube", made_for)
     model = read_model(documents["model"], funnel["box"])
     policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None
     tubes = [_read_tube(node, model, policy) for node in funnel["tubes"].items(1, MAX_TUBES)]
 
-    given = proof.read({"multipliers?": itself})["multipliers"]
+    given = proof.read({"multipliers?": None})["multipliers"]
     trees = given.items(len(tubes), len(tubes)) if given else [None] * len(tubes)
     modes = _modes(model, policy)
     margin = min(_decide_tube(*pair, modes) for pair in zip(tubes, trees, strict=True))
@@ -183,14 +171,14 @@ def _read_tube(node: Node, model: Model, policy: Members | None) -> Members:
         "assumption": lambda entry: entry.read(ASSUMPTION),
         "follows?": lambda entry: read_level(entry, len(model.u)),
         "direct?": (p,),
-        "peak?": itself,  # alone it is no part of the claim
+        "peak?": None,  # alone it is no part of the claim
     }
     tube = node.read(table)
     direct = tube["direct"] or [Fraction(0)] * p
     peaks = direct
     if tube["direct"]:
         node.require({"what is direct needs a peak": tube["peak"]})
-        peaks = tube["peak"].read({"at_most": (p,), "measured": itself})["at_most"]
+        peaks = tube["peak"].read({"at_most": (p,), "measured": None})["at_most"]
     tube["direct"] = list(zip(direct, peaks, strict=True))
     rho, energy = tube["rho"], tube["assumption"]["kind"] == "energy"
     ends = tube["assumption"]["samples"] is not None

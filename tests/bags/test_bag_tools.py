@@ -44,10 +44,12 @@ from tests.bag_messages import (
     command,
     joints,
     odometry,
+    put,
     speed_bag,
 )
 from tests.conftest import SHARED
 from tests.mcap_files import write_mcap
+from tests.verbs import nlsid
 
 ROBOT = SHARED / "schunk_arm" / "Robot"
 
@@ -179,8 +181,7 @@ def test_signals_lists_paths_with_units(bag: Path) -> None:
 def test_signals_names_the_joints_and_gives_their_ranges(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "arm") as writer:
         for k in range(5):
-            data = joints(START_NS + k, [0.5 * k, -1.0 * k])
-            writer.write("/arm", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
+            put(writer, k, "/arm", JOINT_TYPE, joints(START_NS + k, [0.5 * k, -1.0 * k]))
         writer.add_topic("/empty", JOINT_TYPE)
     found = json.loads(run("signals", tmp_path / "arm", "--json"))
     listed = {entry["signal"]: entry for entry in found}
@@ -210,10 +211,8 @@ def test_info_and_check_speak_json_and_status(bag: Path, tmp_path: Path) -> None
 
 
 def test_the_command_line_says_its_version_and_completes_names() -> None:
-    said = CliRunner().invoke(app, ["--version"])
-    assert said.exit_code == 0
-    assert said.output.startswith("nlsid 0.")
-    assert "--install-completion" in CliRunner().invoke(app, ["--help"]).output
+    assert nlsid("--version").startswith("nlsid 0.")
+    assert "--install-completion" in nlsid("--help")
 
 
 def test_operations_are_exported(bag: Path, tmp_path: Path) -> None:
@@ -349,8 +348,7 @@ def test_names_and_times_change_and_what_does_not_fit_is_refused(bag: Path, tmp_
     np.testing.assert_array_equal(moved.stamp_ns, before.stamp_ns + 10 * 10**9)
     with BagWriter(tmp_path / "late") as writer:
         for k in range(3):
-            data = odometry(START_NS + k, float(k))
-            writer.write(ODOM, ODOM_TYPE, data, log_time_ns=7 + k, publish_time_ns=7 + k)
+            put(writer, 7 + k, ODOM, ODOM_TYPE, odometry(START_NS + k, float(k)))
     for rule, expected in (("header", START_NS), ("log", 7)):
         run("convert", tmp_path / "late", "--out", tmp_path / rule, "--restamp", rule)
         with Bag(tmp_path / rule) as copy:
@@ -522,8 +520,7 @@ def test_every_element_of_a_command_is_checked(tmp_path: Path) -> None:
         for k in range(100):
             for topic in ("/joint_commands", "/joint_states"):
                 stamp = START_NS + k * PERIOD_NS
-                data = joints(stamp, rng.standard_normal(3))
-                writer.write(topic, JOINT_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+                put(writer, stamp, topic, JOINT_TYPE, joints(stamp, rng.standard_normal(3)))
     [found] = check_fitness(
         [tmp_path / "arm"],
         excitations=["/joint_commands:position[*]"],
@@ -542,13 +539,10 @@ def test_commands_that_come_when_they_like_are_not_bad(tmp_path: Path) -> None:
         for k in range(800):
             stamp = START_NS + k * PERIOD_NS
             held += 0.3 * (rng.standard_normal() - held)
-            writer.write(
-                ODOM, ODOM_TYPE, odometry(stamp, held), log_time_ns=stamp, publish_time_ns=stamp
-            )
+            put(writer, stamp, ODOM, ODOM_TYPE, odometry(stamp, held))
             if rng.random() < 0.3:
                 at = stamp + int(rng.integers(0, PERIOD_NS))
-                data = command(at, float(rng.standard_normal()))
-                writer.write(CMD, CMD_TYPE, data, log_time_ns=at, publish_time_ns=at)
+                put(writer, at, CMD, CMD_TYPE, command(at, float(rng.standard_normal())))
     [found] = check_fitness([tmp_path / "teleop"], excitations=[COMMAND], responses=[SPEED])
     assert found.verdict < Level.BAD
     said = {f.check: f for f in found.findings}
@@ -560,11 +554,9 @@ def test_a_command_that_changes_only_where_no_response_is_is_named(tmp_path: Pat
     with BagWriter(tmp_path / "late") as writer:
         for k in range(100):
             stamp = START_NS + k * PERIOD_NS
-            data = command(stamp, 1.0 if k < 50 else 0.5)
-            writer.write(CMD, CMD_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+            put(writer, stamp, CMD, CMD_TYPE, command(stamp, 1.0 if k < 50 else 0.5))
             if k >= 50:
-                data = odometry(stamp, 0.1 * (k % 7))
-                writer.write(ODOM, ODOM_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+                put(writer, stamp, ODOM, ODOM_TYPE, odometry(stamp, 0.1 * (k % 7)))
     [found] = check_fitness([tmp_path / "late"], excitations=[COMMAND], responses=[SPEED])
     assert found.verdict is Level.BAD
     said = [finding.what for finding in found.findings if finding.level is Level.BAD]

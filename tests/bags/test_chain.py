@@ -30,6 +30,7 @@ from nlsid_core import files
 from nlsid_core.errors import DataError
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
+from tests.bag_messages import put
 from tests.verbs import nlsid
 
 CONFIG = config_file("f1tenth.yaml")
@@ -275,8 +276,7 @@ def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
             if message.topic == "/cmd_vel" and message.log_time_ns > last:
                 continue
             kind, _ = source.types_on(message.topic)
-            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
-            target.write(message.topic, kind, message.data, **times)
+            put(target, message.log_time_ns, message.topic, kind, message.data)
     signals = {"responses": [SPEED], "excitations": ["/cmd_vel:twist.linear.x"]}
     grid = Grid(0.025, 0.1)
     [whole] = read_bags([trial("05")], **signals, grid=grid)  # type: ignore[arg-type]
@@ -511,8 +511,7 @@ def test_a_picture_is_not_overwritten_where_nothing_was_judged(chain: Path, tmp_
     with Bag(trial("05")) as source, BagWriter(tmp_path / "short") as target:
         for message in list(source.messages())[:9]:
             kind, _ = source.types_on(message.topic)
-            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
-            target.write(message.topic, kind, message.data, **times)
+            put(target, message.log_time_ns, message.topic, kind, message.data)
     picture = tmp_path / "monitor.png"
     picture.write_bytes(b"of another run")
     arguments = ["monitor", str(chain), str(tmp_path / "short"), "--out", str(picture)]

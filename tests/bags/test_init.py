@@ -21,7 +21,6 @@ from bags.chain.identification_config import section_of
 from bags.chain.training import decoded
 from bags.commands.init import said_briefly
 from bags.designs import documents
-from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
@@ -36,6 +35,7 @@ from nlsid_core.identification.choosing import HeldOut
 from tests.bag_messages import (
     CMD_TYPE,
     COMMAND,
+    JOINT_TYPE,
     SPEED,
     START_NS,
     command,
@@ -43,6 +43,8 @@ from tests.bag_messages import (
     joints,
     number_bag,
     odometry,
+    put,
+    serialised,
     speed_bag,
     twist,
 )
@@ -292,15 +294,9 @@ def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> No
             for k in range(400):
                 force = float(rng.uniform(-1.0, 1.0)) if k % 10 == 0 else force
                 stamp_ns = START_NS + 50_000_000 * k
-                times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
                 measured = way + 1e-4 * rng.standard_normal()
-                writer.write("/cmd_vel", CMD_TYPE, command(stamp_ns, force), **times)
-                writer.write(
-                    "/joint_states",
-                    "sensor_msgs/msg/JointState",
-                    joints(stamp_ns, [measured]),
-                    **times,
-                )
+                put(writer, stamp_ns, "/cmd_vel", CMD_TYPE, command(stamp_ns, force))
+                put(writer, stamp_ns, "/joint_states", JOINT_TYPE, joints(stamp_ns, [measured]))
                 way += 0.05 * speed
                 speed += 0.05 * (force - speed)
     said = nlsid("init", config.parent, bags, "--yes", "-u", CMD, "-y", position)
@@ -497,16 +493,14 @@ def test_many_bags_are_said_as_their_folder(tmp_path: Path) -> None:
 
 def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
     commands = np.repeat(np.random.default_rng(2).uniform(-1.0, 1.0, (20, 2)), 10, axis=0)
-    types, kind = standard_types(), "geometry_msgs/msg/Twist"
+    kind = "geometry_msgs/msg/Twist"
     with BagWriter(tmp_path / "bag") as writer:
         for k, (forward, turn) in enumerate(commands):
-            times = dict.fromkeys(("log_time_ns", "publish_time_ns"), START_NS + k * 25_000_000)
+            at = START_NS + k * 25_000_000
             message = twist(forward)
             message.angular.z = turn + 0.5 * forward
-            writer.write("/cmd_vel", kind, bytes(types.serialize_cdr(message, kind)), **times)
-            writer.write(
-                "/odom", "nav_msgs/msg/Odometry", odometry(times["log_time_ns"], 0.0), **times
-            )
+            put(writer, at, "/cmd_vel", kind, serialised(kind, message))
+            put(writer, at, "/odom", "nav_msgs/msg/Odometry", odometry(at, 0.0))
     with pytest.raises(BagError, match=r"no number follows another; .*always the same: /odom:"):
         choose(look([tmp_path / "bag"]))
 
@@ -640,9 +634,8 @@ def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: P
         for k, value in enumerate(pumped.tolist()):
             stamp = START_NS + k * 500_000_000
             level += 0.1 * (value - level)
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
-            writer.write("/pump", CMD_TYPE, command(stamp, value), **times)
-            writer.write("/level", "sensor_msgs/msg/JointState", joints(stamp, [level]), **times)
+            put(writer, stamp, "/pump", CMD_TYPE, command(stamp, value))
+            put(writer, stamp, "/level", JOINT_TYPE, joints(stamp, [level]))
     said = nlsid(
         "init", tmp_path, bag, "-u", "/pump:twist.linear.x", "-y", "/level:position[name=joint_0]"
     )

@@ -7,12 +7,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.shipped import shipped_file
-from bags.commands.cli import app
 from bags.commands.launching import WORKFLOWS, LaunchFile
 from nlsid_core.errors import DataError
+from tests.verbs import nlsid
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "launch").glob("*.xml"))
@@ -94,14 +93,12 @@ def test_what_only_ros_launch_understands_is_refused(tmp_path: Path) -> None:
 
 def test_run_without_a_workflow_lists_every_one_with_its_arguments() -> None:
     pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
-    done = CliRunner().invoke(app, ["run"])
-    assert done.exit_code == 2
+    said = nlsid("run", status=2)
     for name in WORKFLOWS:
-        assert f"{name}.launch.xml:" in done.output
+        assert f"{name}.launch.xml:" in said
 
 
 def test_run_with_a_workflow_that_does_not_exist_names_those_that_do() -> None:
     pytest.importorskip("rclpy")
-    done = CliRunner().invoke(app, ["run", "../monitor"])
-    assert done.exit_code == 2
-    assert "no workflow '../monitor'; there are: monitor" in done.output
+    said = nlsid("run", "../monitor", status=2)
+    assert "no workflow '../monitor'; there are: monitor" in said

@@ -4,15 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.designs.bundle import Bundle
 from bags.designs.provenance import of_funnel
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateRejected
 from tests.core.kernel.mutations import CORPUS, bind_again, corpus, encoded
+from tests.verbs import nlsid
 
 FOLDER = CORPUS / "tube" / "following"
 
@@ -29,9 +28,7 @@ def trial(letter: str, window: str = "") -> Json:
 
 
 def test_what_was_measured_is_printed_below_the_verdict_and_not_called_proved() -> None:
-    said = CliRunner().invoke(app, ["check", str(FOLDER / "claim.proof.json")])
-    assert said.exit_code == 0, said.output
-    proved, *below = said.output.splitlines()
+    proved, *below = nlsid("check", FOLDER / "claim.proof.json").splitlines()
     assert proved.startswith("PROVED tube: ")
     assert "probability" not in proved
     assert any(
@@ -129,9 +126,7 @@ def test_what_cannot_be_read_is_said_in_a_line_below_the_verdict(
     bind_again(forged)
     for name, document in {**forged.about, "claim.proof.json": forged.document}.items():
         (tmp_path / name).write_bytes(encoded(document))
-    said = CliRunner().invoke(app, ["check", str(tmp_path)])
-    assert said.exit_code == 2
-    proved, *_, unread = said.output.splitlines()
+    proved, *_, unread = nlsid("check", tmp_path, status=2).splitlines()
     assert proved.startswith("PROVED tube: ")
     assert "NOT READ" in unread
     assert "funnel.json: what its assumption was measured on is not as its page says" in unread

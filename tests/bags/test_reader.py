@@ -34,6 +34,7 @@ from tests.bag_messages import (
     START_NS,
     header,
     odometry,
+    put,
     serialised,
     speed_bag,
     twist,
@@ -70,8 +71,7 @@ def test_a_type_without_a_header_is_stamped_by_log_time_and_says_so(tmp_path: Pa
     with BagWriter(tmp_path / "plain") as bag:
         for k in range(3):
             stamp = START_NS + k
-            data = serialised(kind, twist(0.5 * k))
-            bag.write("/cmd", kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+            put(bag, stamp, "/cmd", kind, serialised(kind, twist(0.5 * k)))
     samples = read_signals(tmp_path / "plain", ["/cmd:linear.x"])["/cmd:linear.x"]
     assert samples.clock == LOG_TIME
     assert samples.stamp_ns.tolist() == [START_NS, START_NS + 1, START_NS + 2]

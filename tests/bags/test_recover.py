@@ -45,6 +45,7 @@ from tests.bag_messages import (
     START_NS,
     command,
     odometry,
+    put,
     speed_bag,
 )
 from tests.conftest import PERIOD, simulate_truth
@@ -58,8 +59,7 @@ def chunked(tmp_path: Path) -> Path:
     with BagWriter(tmp_path / "run", custom={"robot": "car"}) as bag:
         for k in range(CHUNKS * PER_CHUNK):
             stamp = START_NS + k
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
-            bag.write(ODOM, ODOM_TYPE, odometry(stamp, float(k)), **times)
+            put(bag, stamp, ODOM, ODOM_TYPE, odometry(stamp, float(k)))
             if k % PER_CHUNK == PER_CHUNK - 1:
                 bag.close_chunk()
     return tmp_path / "run"
@@ -187,8 +187,7 @@ def killed_bag(path: Path, *, cut: int) -> Path:
     with BagWriter(written, in_place=True) as bag:
         for k in range(COUNT):
             stamp = START_NS + k * PERIOD_NS
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
-            bag.write(CMD, CMD_TYPE, command(stamp, float(k)), **times)
+            put(bag, stamp, CMD, CMD_TYPE, command(stamp, float(k)))
             if k % 100 == 99:
                 bag.close_chunk()
     path.mkdir()
@@ -358,9 +357,8 @@ def bag(tmp_path: Path) -> Path:
     with BagWriter(tmp_path / "drive") as target:
         for k, (speed, value) in enumerate(zip(simulate_truth(u), u, strict=True)):
             log_ns = START_NS + round((k - BACK * (k >= SET_AT)) * PERIOD * 1e9)
-            times = {"log_time_ns": log_ns, "publish_time_ns": log_ns}
-            target.write(CMD, CMD_TYPE, command(1, value), **times)
-            target.write(ODOM, ODOM_TYPE, odometry(1, speed), **times)
+            put(target, log_ns, CMD, CMD_TYPE, command(1, value))
+            put(target, log_ns, ODOM, ODOM_TYPE, odometry(1, speed))
     return tmp_path / "drive"
 
 

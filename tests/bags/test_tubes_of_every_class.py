@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.config import load_config
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.commands.cli import app
 from bags.commands.show import UNJUDGED_SAID
 from bags.designs import documents
 from bags.designs.bundle import Bundle
@@ -117,22 +115,18 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     y[:, 0] = 0.01 * np.random.default_rng(0).standard_normal(300)
     gap = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gap")
     bag = write_joint_bag(tmp_path, gap)
-    held = ["monitor", str(linear_funnel.parent), str(bag)]
-    done = CliRunner().invoke(app, held)
-    assert done.exit_code == 2, done.output
+    said = nlsid("monitor", linear_funnel.parent, bag, status=2)
     lost = "3 samples from 1.000 to 1.020 s: 3 samples are missing"
-    assert f"gap: not judged: {lost}\n" in done.output
-    told = CliRunner().invoke(app, [*held, "--json"])
-    [entry] = json.loads(told.stdout)
-    assert told.exit_code == 2
+    assert f"gap: not judged: {lost}\n" in said
+    [entry] = json.loads(nlsid("monitor", linear_funnel.parent, bag, "--json", status=2))
     assert (entry["verdict"], entry["reason"]) == ("unknown", "3 samples are missing")
     assert (entry["filled"], entry["judged"]) == (0, pytest.approx(entry["span"] - 0.03))
     kept = np.setdiff1d(np.arange(300), [50, 100, 150, 200, 250])
     gaps = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gaps")
-    done = CliRunner().invoke(app, [*held[:-1], str(write_joint_bag(tmp_path, gaps))])
-    assert done.output.count("1 sample is missing") == UNJUDGED_SAID == 3
+    said = nlsid("monitor", linear_funnel.parent, write_joint_bag(tmp_path, gaps), status=2)
+    assert said.count("1 sample is missing") == UNJUDGED_SAID == 3
     last = f"the last 1 sample at {PERIOD * 250:.3f} s"
-    assert f"gaps: not judged: 2 more samples in 2 places, {last}" in done.output
+    assert f"gaps: not judged: 2 more samples in 2 places, {last}" in said
     replayed = replay_bag(documents.load(linear_funnel), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
     assert [k for k, r in enumerate(replayed.readings) if r.reason == LOST] == [100, 101, 102]

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from nlsid import ContinuousTracking, Goal, Nominal, VectorField, check, integrate_nominal
 from nlsid_core import files as documents
 from nlsid_core.design import compose_funnels, design_funnel
@@ -17,6 +15,7 @@ from nlsid_core.errors import CertificateMismatch, DataError, Infeasible
 from tests.core.kernel import refusals
 from tests.decided import decided
 from tests.marks import slow_among
+from tests.verbs import nlsid
 
 Files = dict[str, Any]
 
@@ -73,14 +72,10 @@ def test_three_stages_are_one_funnel_and_each_is_still_its_own(
 
 
 def test_the_command_line_composes_and_checks(proofs: list[Path], tmp_path: Path) -> None:
-    runner = CliRunner()
     stages = [option for proof in proofs[:2] for option in ("--compose", str(proof))]
-    made = runner.invoke(app, ["funnel", str(tmp_path), *stages])
-    assert made.exit_code == 0, made.output
-    assert "8 files" in made.output
-    checked = runner.invoke(app, ["check", str(tmp_path / "composition.proof.json")])
-    assert checked.exit_code == 0
-    assert "PROVED composition of 2 funnels" in checked.output
+    assert "8 files" in nlsid("funnel", tmp_path, *stages)
+    checked = nlsid("check", tmp_path / "composition.proof.json")
+    assert "PROVED composition of 2 funnels" in checked
 
 
 def test_stages_are_not_replaced_by_others(proofs: list[Path], tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.thesis.alternation import alternate_rho, exponential_start
+from benchmarks.thesis.alternation import exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import Simulation
 from nlsid import ContinuousTracking, Design, Nominal, VectorField, check, integrate_nominal
@@ -94,23 +94,13 @@ def test_a_sample_at_one_end_only_is_refused() -> None:
         sample_funnel(ContinuousTracking(*hanging(), goal=GOAL), samples=1)
 
 
-# -- the thesis's alternation for ρ ------------------------------------------------------------
+# -- options
 
 
 def test_an_unknown_option_is_named_with_the_known_ones() -> None:
     chosen: Any = {"shape": "magic"}
     with pytest.raises(OptionError, match="shape is 'magic'; it should be one of "):
         ContinuousTracking(*hanging(), goal=GOAL, **chosen)
-
-
-@pytest.mark.slow
-def test_every_iterate_of_the_alternation_is_larger_than_the_last() -> None:
-    setting = prepare(ContinuousTracking(*hanging(), goal=GOAL, **DEFAULTS))
-    start = exponential_start(setting.steps, setting.P)
-    found = alternate_rho(setting.steps, start, stop=1e-3)
-    assert (np.diff(found.volumes) > 0).all()
-    ratio = np.log(start.rho[0]) / np.log(start.rho[4])
-    assert ratio == pytest.approx(2)  # exponential in t
 
 
 # -- the general P(t) --------------------------------------------------------------------------

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import lfilter
-from typer.testing import CliRunner
 
 from bags.chain.shipped import config_file
-from bags.commands.cli import app
 from bags.designs import documents
 from bags.pictures.report import page
 from bags.samples import f1tenth
@@ -50,6 +48,7 @@ from nlsid_core.models import DifferenceEquation, Signal, StateAffineModel
 from tests.conftest import TRUE_A, TRUE_B, synthetic_dataset
 from tests.marks import slow_among
 from tests.repeated import CLASS, pair
+from tests.verbs import nlsid
 
 STATE_AFFINE = {
     "lags": 2,
@@ -142,13 +141,11 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     config: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    made = CliRunner().invoke(app, ["identify", str(out), *BAGS, "--config", str(config)])
-    assert made.exit_code == 0, made.output
+    nlsid("identify", out, *BAGS, "--config", config)
     verdict = check(out / documents.MODEL_PROOF)
     assert "clips its inputs" in verdict.statement
-    refused = CliRunner().invoke(app, ["funnel", str(out), "--config", str(config)])
-    assert refused.exit_code != 0
-    assert "has no section 'funnel'" in str(refused.exception)
+    refused = nlsid("funnel", out, "--config", config, status=None)
+    assert "has no section 'funnel'" in refused
 
 
 # -- Robust simulation error: the bound, its derivatives, its iterates, and what is refused

@@ -224,8 +224,9 @@ def test_parts_that_do_not_belong_together_are_refused(
     )
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor([Stage(design.model, other.policy, design.funnel)])
-    with pytest.raises(CertificateMismatch, match="another model"):
-        Monitor([Stage(replace(design.model, c=1.0), design.policy, design.funnel)])
+    for policy, what in ((design.policy, "policy"), (None, "funnel")):
+        with pytest.raises(CertificateMismatch, match=f"the {what} was made for another model"):
+            Monitor([Stage(replace(design.model, c=1.0), policy, design.funnel)])
 
 
 # -- Alerts: a low margin warns, and what is outside is never anything else

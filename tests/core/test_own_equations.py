@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from bags.pictures.tubes import draw_tube
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import Simulation
@@ -29,6 +27,7 @@ from nlsid_core.design import design_funnel
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
 from nlsid_core.dynamics import PiecewisePolynomial, Rates
 from nlsid_core.errors import DataError, Infeasible, ShapeError
+from tests.verbs import nlsid
 
 MASSES = {"arm": 2.0}  # in kg; a rate that asks for another mass is wrong
 PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"
@@ -68,10 +67,9 @@ def test_the_page_writes_a_problem_for_the_command_line(
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
     (code,) = (block for block in blocks if "spring.json" in block)
     exec(code, {})
-    ended = CliRunner().invoke(app, ["funnel", "spring", "--problem", "spring.json"])
-    assert ended.exit_code == 0, ended.output
-    assert "is applied every 0.0452548" in ended.output
-    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in ended.output
+    said = nlsid("funnel", "spring", "--problem", "spring.json")
+    assert "is applied every 0.0452548" in said
+    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in said
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import pytest
 
 from benchmarks.thesis.rie import (
     IdentificationErrorBound,
-    robust_identification_error,
 )
 from nlsid import Dataset, Degrees, Polynomial, Trajectory
 from nlsid_core.identification.methods.banded import Rows
@@ -145,21 +144,6 @@ def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
         rows = stacked.rows
         found = minimise(Bound(rows, None), rows.identity)
         assert pytest.approx(matrix_inequality(rows), rel=SOLVER) == found.point.J
-
-
-def test_robust_simulation_error_is_at_most_the_robust_identification_error() -> None:
-    """Proposition 4.4 with P = I."""
-    for seed in range(4):
-        stacked = problem(
-            trials=1,
-            samples=80,
-            seed=seed,
-            noise=0.2,
-            model_class=Polynomial(2, degrees=Degrees(leading=1)),
-        )
-        rows = stacked.rows
-        _, J_identification = robust_identification_error(stacked)
-        assert J_identification >= minimise(Bound(rows, None), rows.identity).point.J
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
@@ -33,6 +31,7 @@ from tests import funnel_problem
 from tests.core.kernel import refusals
 from tests.decided import decided
 from tests.funnel_files import Files, saved, write
+from tests.verbs import nlsid
 
 LIMIT = 9.0
 GOAL = np.diag([100.0, 10.0])
@@ -324,11 +323,10 @@ def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> No
     )
     file = tmp_path / "problem.json"
     documents.write_document(file, asked)
-    made = CliRunner().invoke(app, ["funnel", str(tmp_path), "--problem", str(file)])
-    assert made.exit_code == 0, made.output
+    nlsid("funnel", tmp_path, "--problem", file)
     assert ContinuousPolicy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]
-    checked = CliRunner().invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
-    assert "u0 clipped to [-9, 9]" in " ".join(checked.output.split())
+    checked = nlsid("check", tmp_path / "funnel.proof.json")
+    assert "u0 clipped to [-9, 9]" in " ".join(checked.split())
 
 
 @pytest.mark.slow

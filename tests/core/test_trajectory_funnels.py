@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bags.commands.cli import app
 from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import one_dimensional, pendulum
@@ -40,6 +38,7 @@ from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.decided import decided
 from tests.funnel_files import saved, write
+from tests.verbs import nlsid
 
 
 @pytest.fixture(scope="module")
@@ -275,15 +274,10 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     problem_file = tmp_path / "problem.json"
     asked = funnel_problem.document(field, nominal, goal, Q=np.eye(2), R=np.eye(1))
     files.write_document(problem_file, asked)
-    runner = CliRunner()
-    made = runner.invoke(app, ["funnel", str(tmp_path), "--problem", str(problem_file)])
-    assert made.exit_code == 0, made.output
-    assert "pieces of time decided" in made.output
-    assert "found and proved in" in made.output
+    made = nlsid("funnel", tmp_path, "--problem", problem_file)
+    assert "pieces of time decided" in made
+    assert "found and proved in" in made
     assert ContinuousFunnel.load(tmp_path / "funnel.json").tf == 2.0
     assert (tmp_path / "funnel.png").is_file()
-    checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
-    assert checked.exit_code == 0
-    assert "PROVED funnel" in checked.output
-    neither = runner.invoke(app, ["funnel", str(tmp_path)])
-    assert neither.exit_code != 0
+    assert "PROVED funnel" in nlsid("check", tmp_path / "funnel.proof.json")
+    nlsid("funnel", tmp_path, status=None)

@@ -11,10 +11,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_033,
+    ("nlsid_core",): 18_094,
     ("bags",): 11_914,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_436,
+    ("tests",): 22_281,
     ("benchmarks", "examples"): 3_797,
 }
 ARGUMENTS, FIELDS = 6, 8

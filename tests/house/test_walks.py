@@ -7,12 +7,11 @@ from types import FrameType
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.shipped import config_file
-from bags.commands.cli import app
 from bags.samples import f1tenth
 from tests.house.sources import ROOT
+from tests.verbs import nlsid
 
 # What a tube of recorded bags does not go through: the other two kinds, the live node, and the
 # claim itself, which is decided in a process of its own.
@@ -36,10 +35,9 @@ def files_run_by(*arguments: object) -> set[str]:
     before = sys.getprofile()
     sys.setprofile(note)
     try:
-        done = CliRunner().invoke(app, [str(a) for a in arguments])
+        nlsid(*arguments)
     finally:
         sys.setprofile(before)
-    assert done.exit_code == 0, done.output
     return {str(Path(file).relative_to(ROOT)) for file in ran if file.startswith(str(ROOT))}
 
 

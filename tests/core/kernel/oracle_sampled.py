@@ -14,8 +14,7 @@ from math import factorial, prod
 from typing import Any
 
 from nlsid_core import files
-from tests.core.kernel.oracle_continuous import bound as opened
-from tests.core.kernel.oracle_continuous import determinant
+from tests.core.kernel.oracle_continuous import bound, determinant, dot, numbers
 from tests.core.kernel.oracle_polynomial import P, left_over
 from tests.core.kernel.oracle_stability import is_definite, solved
 
@@ -23,11 +22,6 @@ Json = dict[str, Any]
 CHAINS = ("tube", "inlet")
 Vector = list[Fraction]
 Matrix = list[Vector]
-
-
-def fractions(value: Any) -> Any:
-    """Nested lists of numbers as Fractions."""
-    return [fractions(entry) for entry in value] if isinstance(value, list) else Fraction(value)
 
 
 def times(M: Matrix, v: Vector) -> Vector:
@@ -47,7 +41,7 @@ def size2(v: Vector) -> Fraction:
 
 def map_at(model: Json, point: Vector) -> Vector:
     """The model's polynomials at [x; u]."""
-    coefficients = fractions(model["coefficients"])
+    coefficients = numbers(model["coefficients"])
     values = [monomial(point, row) for row in model["exponents"]]
     return [
         sum((v * row[i] for v, row in zip(values, coefficients, strict=True)), Fraction(0))
@@ -57,14 +51,14 @@ def map_at(model: Json, point: Vector) -> Vector:
 
 def policy_input(policy: Json, k: int, deviation: Vector) -> Vector:
     """u_k - K_k x̄."""
-    return plus(fractions(policy["u"][k]), times(fractions(policy["K"][k]), deviation), -1)
+    return plus(numbers(policy["u"][k]), times(numbers(policy["K"][k]), deviation), -1)
 
 
 def explicit_next(model: Json, policy: Json, k: int, deviation: Vector) -> Vector:
     """f(x_k + x̄, u_k - K_k x̄) - x_{k+1}."""
-    x = plus(fractions(policy["x"][k]), deviation)
+    x = plus(numbers(policy["x"][k]), deviation)
     after = map_at(model, x + policy_input(policy, k, deviation))
-    return plus(after, fractions(policy["x"][k + 1]), -1)
+    return plus(after, numbers(policy["x"][k + 1]), -1)
 
 
 def monomial(point: Vector, exponents: list[int]) -> Fraction:
@@ -92,20 +86,15 @@ def squares_at(entry: Json, basis: list[list[int]], point: Vector) -> Fraction:
     return total / below
 
 
-def dot(a: Vector, b: Vector) -> Fraction:
-    """a'b."""
-    return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
-
-
 def claimed_at(documents: dict[str, Json], proof: Json, chain: str, k: int, y: Vector) -> Fraction:
     """The polynomial that has to be nonnegative, at y = z."""
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
     step = proof["steps"][k]
     entry = step[chain]
-    deviation = times(fractions(step["T"]), y)
-    S_next = fractions(funnel["S"][k + 1])
+    deviation = times(numbers(step["T"]), y)
+    S_next = numbers(funnel["S"][k + 1])
     radius = Fraction(funnel[chain][k])
-    size = size2(times(fractions(funnel["S"][k]), deviation))
+    size = size2(times(numbers(funnel["S"][k]), deviation))
     value = Fraction(entry["reach"]) ** 2
     value -= squares_at(entry["ball"], proof["ball_basis"], y) * (radius**2 - size)
     return value - size2(times(S_next, explicit_next(model, policy, k, deviation)))
@@ -149,7 +138,7 @@ def refuted(documents: dict[str, Json]) -> str:
 
 def _outside(model: Json, policy: Json, k: int, deviation: Vector, *, last: bool) -> str:
     """Which signal leaves the box of the data."""
-    x = plus(fractions(policy["x"][k]), deviation)
+    x = plus(numbers(policy["x"][k]), deviation)
     values = [(x[0], model["x_range"][0])]
     if not last:
         values.append((policy_input(policy, k, deviation)[0], model["u_range"][0]))
@@ -165,7 +154,7 @@ def agrees(document: Json, about: Mapping[str, Json]) -> bool:
         named = document["claim"]["about"]
         assert document["claim"]["kind"] == "sampled_funnel"
         assert set(named) == {"model", "policy", "funnel"}
-        documents = {role: opened(named[role], about) for role in named}
+        documents = {role: bound(named[role], about) for role in named}
         model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
         if {policy["model"], funnel["model"]} != {files.digest(model)}:
             return False
@@ -239,7 +228,7 @@ def is_a_response(assumption: Json) -> bool:
 
 def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
     """Obligation 4 at sample k."""
-    n, S = len(model["x"]), fractions(funnel["S"][k])
+    n, S = len(model["x"]), numbers(funnel["S"][k])
     SS = [[dot([r[i] for r in S], [r[j] for r in S]) for j in range(n)] for i in range(n)]
     units = [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
     tube, inlet = (Fraction(funnel[chain][k]) for chain in CHAINS)
@@ -250,7 +239,7 @@ def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
         (g, c, box) for g, c, box in zip(units, policy["x"][k], model["x_range"], strict=True)
     ]
     if k < len(policy["u"]):
-        signals += zip(fractions(policy["K"][k]), policy["u"][k], model["u_range"], strict=True)
+        signals += zip(numbers(policy["K"][k]), policy["u"][k], model["u_range"], strict=True)
     for g, c, (low, high) in signals:
         room = min(Fraction(high) - Fraction(c), Fraction(c) - Fraction(low))
         wanted.append((g, room, both))
@@ -282,10 +271,10 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
     n = len(model["x"])
     y: Any = [P.variable(n, i) for i in range(n)]
-    S, S_next = (fractions(funnel["S"][i]) for i in (k, k + 1))
-    T, A = fractions(step["T"]), fractions(funnel["A"][k])
+    S, S_next = (numbers(funnel["S"][i]) for i in (k, k + 1))
+    T, A = numbers(step["T"]), numbers(funnel["A"][k])
     bound = Fraction(funnel["assumption"]["bound"])
-    kappa, gammas = Fraction(step["kappa"]), fractions(step["curvature"])
+    kappa, gammas = Fraction(step["kappa"]), numbers(step["curvature"])
     if not (is_triangular(step["T"]) and min([kappa, *gammas]) >= 0):
         return False
     if not stretches_less(multiplied(S, T), kappa):

@@ -7,14 +7,11 @@ from interpolation, and nothing is shared with the kernel or the prover.
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from itertools import product
+from math import comb
 from typing import Any
 
 Rows = list[list[Fraction]]
 Json = dict[str, Any]
-
-
-def exact(value: float | int) -> Fraction:
-    return Fraction(value)
 
 
 def zeros(rows: int, columns: int) -> Rows:
@@ -55,7 +52,7 @@ def increments(model: Json) -> tuple[Rows, int, list[tuple[Fraction, Fraction]]]
     """F, m, and the box."""
     kind = model["kind"]
     if kind == "difference_equation":
-        a = [exact(entry) for entry in model["a"]]
+        a = [Fraction(entry) for entry in model["a"]]
         n = len(a)
         F = zeros(n, n)
         for i in range(n):
@@ -76,13 +73,13 @@ def increments(model: Json) -> tuple[Rows, int, list[tuple[Fraction, Fraction]]]
             F[i][i] = Fraction(1)
         box = []
         for i, _ in model["window"]:
-            offset, scale = exact(model["u_offset"][i]), exact(model["u_scale"][i])
-            low, high = (exact(end) for end in model["u_range"][i])
+            offset, scale = Fraction(model["u_offset"][i]), Fraction(model["u_scale"][i])
+            low, high = (Fraction(end) for end in model["u_range"][i])
             box.append(((low - offset) / scale, (high - offset) / scale))
         return F, p, box
     if kind == "cell_network":
         m, n = len(model["maps"]), len(model["start"])
-        return [[exact(model["next"][i][k]) for k in range(m + n)] for i in range(n)], m, []
+        return [[Fraction(model["next"][i][k]) for k in range(m + n)] for i in range(n)], m, []
     M, n1, n2, _, g = cascade(model)
     F = zeros(n1 + n2, M + n1 + n2)
     a1, a2 = padded(model["a1"], n1), padded(model["a2"], n2)
@@ -100,7 +97,7 @@ def increments(model: Json) -> tuple[Rows, int, list[tuple[Fraction, Fraction]]]
 
 
 def padded(values: list[float], size: int) -> list[Fraction]:
-    return [exact(values[i]) if i < len(values) else Fraction(0) for i in range(size)]
+    return [Fraction(values[i]) if i < len(values) else Fraction(0) for i in range(size)]
 
 
 def cascade(model: Json) -> tuple[int, int, int, Rows, Rows]:
@@ -114,13 +111,13 @@ def cascade(model: Json) -> tuple[int, int, int, Rows, Rows]:
         own = padded(a, n)
         for row in rows:
             rest = padded(row[1:], n)
-            found.append([exact(row[0]) * own[k] + rest[k] for k in range(n)])
+            found.append([Fraction(row[0]) * own[k] + rest[k] for k in range(n)])
     return len(b1), n1, n2, C, g
 
 
 def slopes(model: Json) -> tuple[Fraction, Fraction]:
-    c = [exact(entry) for entry in model["f"]["coefficients"]]
-    found = [(c[k + 1] - c[k]) / exact(model["f"]["spacing"]) for k in range(len(c) - 1)]
+    c = [Fraction(entry) for entry in model["f"]["coefficients"]]
+    found = [(c[k + 1] - c[k]) / Fraction(model["f"]["spacing"]) for k in range(len(c) - 1)]
     return min(found), max(found)
 
 
@@ -134,7 +131,7 @@ def value_at(model: Json, w: list[Fraction]) -> Rows:
             for power, entry in zip(powers, w, strict=True):
                 weight *= entry**power
             for a, b in product(range(p), range(p)):
-                E[a][k * p + b] += weight * exact(block[a][b])
+                E[a][k * p + b] += weight * Fraction(block[a][b])
     return E
 
 
@@ -162,9 +159,7 @@ def interpolated(
     for axis, d in enumerate(degrees):
         matrix = [
             [
-                Fraction(binomial(d, k))
-                * Fraction(i, d or 1) ** k
-                * Fraction(d - i, d or 1) ** (d - k)
+                Fraction(comb(d, k)) * Fraction(i, d or 1) ** k * Fraction(d - i, d or 1) ** (d - k)
                 for k in range(d + 1)
             ]
             for i in range(d + 1)
@@ -184,10 +179,6 @@ def interpolated(
     return list(values.values())
 
 
-def binomial(n: int, k: int) -> int:
-    return 1 if k in (0, n) else binomial(n - 1, k - 1) + binomial(n - 1, k)
-
-
 def added(A: Rows, B: Rows) -> Rows:
     return [[a + b for a, b in zip(x, y, strict=True)] for x, y in zip(A, B, strict=True)]
 
@@ -198,11 +189,11 @@ def vertices(model: Json, box: list[tuple[Fraction, Fraction]]) -> list[Rows] | 
     if kind == "state_affine":
         return bernstein(model, box)
     if kind == "monotone_equation":
-        e1, e2, e3 = (exact(entry) for entry in model["e"])
+        e1, e2, e3 = (Fraction(entry) for entry in model["e"])
         if e3 < 0 or (e3 == 0 and e2 != 0):
             return None
         least = e1 - e2 * e2 / (3 * e3) if e3 else e1
-        return [[[least] + [-exact(entry) for entry in model["a"]]]]
+        return [[[least] + [-Fraction(entry) for entry in model["a"]]]]
     if kind == "cell_network":
         return network_vertices(model)
     M, n1, n2, C, _ = cascade(model)
@@ -222,7 +213,7 @@ def network_vertices(model: Json) -> list[Rows] | None:
     m, n = len(model["maps"]), len(model["start"])
     ends = []
     for f in model["maps"]:
-        knots, values = ([exact(v) for v in f[key]] for key in ("knots", "values"))
+        knots, values = ([Fraction(v) for v in f[key]] for key in ("knots", "values"))
         if len(knots) < 2 or any(knots[k] >= knots[k + 1] for k in range(len(knots) - 1)):
             return None
         found = [
@@ -237,7 +228,7 @@ def network_vertices(model: Json) -> list[Rows] | None:
         for j in range(m):
             E[j][j] = Fraction(1)
             for k in range(m + n):
-                E[j][k] -= s[j] * exact(model["into"][j][k])
+                E[j][k] -= s[j] * Fraction(model["into"][j][k])
         matrices.append(E)
     return matrices
 
@@ -263,8 +254,8 @@ def gap(F: Rows, m: int, P: Rows, rate: Fraction, N: Rows | None, E: Rows | None
 def is_proved(model: Json, claim: Json, proof: Json) -> bool:
     """Whether (D) and its conditions hold."""
     F, m, box = increments(model)
-    rate = exact(claim["rate"])
-    P = [[exact(entry) for entry in row] for row in proof["P"]]
+    rate = Fraction(claim["rate"])
+    P = [[Fraction(entry) for entry in row] for row in proof["P"]]
     if not 0 < rate < 1 or not is_definite(P):
         return False
     if m == 0:
@@ -280,8 +271,8 @@ def is_proved(model: Json, claim: Json, proof: Json) -> bool:
                 holds(part, [*box[:i], half, *box[i + 1 :]])
                 for part, half in zip(tree["parts"], halves, strict=True)
             )
-        N = [[exact(entry) for entry in row] for row in tree["N"]]
-        has_ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
+        N = [[Fraction(entry) for entry in row] for row in tree["N"]]
+        has_ray = model["kind"] == "monotone_equation" and Fraction(model["e"][2]) > 0
         if has_ray and (N[0][0] < 0 or any(row[0] != 0 for row in N[1:])):
             return False
         assert set(tree) == {"N"}

@@ -14,7 +14,6 @@ from tests.core.kernel.oracle_stability import (
     Json,
     Rows,
     cascade,
-    exact,
     increments,
     interpolated,
     is_definite,
@@ -26,7 +25,7 @@ Box = list[tuple[Fraction, Fraction]]
 
 
 def matrix(values: list[list[float]], rows: int, columns: int) -> Rows:
-    found = [[exact(entry) for entry in row] for row in values]
+    found = [[Fraction(entry) for entry in row] for row in values]
     if len(found) != rows or any(len(row) != columns for row in found):
         raise ValueError("shape")
     return found
@@ -39,16 +38,18 @@ def outputs(model: Json, m: int, n: int) -> Rows:
         return [[Fraction(int(j == 0)) for j in range(n)]]
     if kind == "block_cascade":
         M, n1, n2, _, _ = cascade(model)
-        row = [exact(b[0]) for b in model["b2"]] + [Fraction(0)] * n
+        row = [Fraction(b[0]) for b in model["b2"]] + [Fraction(0)] * n
         if n2:
             row[M + n1] = Fraction(1)
         return [row]
     if kind == "cell_network":
-        return [[exact(entry) for entry in row[: m + n]] for row in model["output"]]
+        return [[Fraction(entry) for entry in row[: m + n]] for row in model["output"]]
     scales = model.get("y_scale", [1.0] * m)
     if kind == "monotone_equation" or kind == "implicit":
         scales = [1.0] * m
-    return [[exact(scales[j]) if i == j else Fraction(0) for i in range(m + n)] for j in range(m)]
+    return [
+        [Fraction(scales[j]) if i == j else Fraction(0) for i in range(m + n)] for j in range(m)
+    ]
 
 
 class Implicit:
@@ -61,7 +62,7 @@ class Implicit:
         assert self.n % self.p == 0
         assert len(model["window"]) == self.q
         self.terms = [
-            (tuple(e), [exact(c) for c in row])
+            (tuple(e), [Fraction(c) for c in row])
             for e, row in zip(model["h"]["exponents"], model["h"]["coefficients"], strict=True)
         ]
         self.model = model
@@ -77,7 +78,7 @@ class Implicit:
                 for k, c in enumerate(row):
                     if c and any(e[:n]):
                         assert sum(e) == 1
-                        F[p + k][p + e.index(1)] += exact(c)
+                        F[p + k][p + e.index(1)] += Fraction(c)
         return F
 
     def slope(self, z: list[Fraction]) -> Rows:
@@ -120,8 +121,8 @@ class Implicit:
         return E, True
 
     def box(self, given: Json) -> Box:
-        y = [(exact(low), exact(high)) for low, high in given["y"]]
-        u = [(exact(low), exact(high)) for low, high in given["u"]]
+        y = [(Fraction(low), Fraction(high)) for low, high in given["y"]]
+        u = [(Fraction(low), Fraction(high)) for low, high in given["u"]]
         assert len(y) == self.p
         assert len(u) == len(self.model["u"])
         assert all(low < high for low, high in [*y, *u])
@@ -149,7 +150,7 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
             assert found is not None
             return found
 
-        ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
+        ray = model["kind"] == "monotone_equation" and Fraction(model["e"][2]) > 0
         return F, m, box, ray, hull
     implicit = Implicit(model)
     found = implicit.everywhere()
@@ -181,7 +182,7 @@ def direct(tube: Json, j: int) -> tuple[Fraction, Fraction]:
     peaks = tube["peak"]["at_most"]
     assert set(tube["peak"]) == {"at_most", "measured"}
     assert len(tube["direct"]) == len(peaks) == len(tube["tau"])
-    return exact(tube["direct"][j]), exact(peaks[j])
+    return Fraction(tube["direct"][j]), Fraction(peaks[j])
 
 
 def holds(
@@ -190,9 +191,9 @@ def holds(
     """(D) and every (O_j) for (F, H); the first `kept` entries of the box are not split."""
     (F, H), (box, ray, hull) = rows, shape
     n, p = len(F), len(H)
-    size, rho = m + n + p, exact(tube["rho"])
+    size, rho = m + n + p, Fraction(tube["rho"])
     P, R = matrix(tube["P"], n, n), matrix(tube["R"], p, p)
-    L, tau = matrix(tube["L"], n, p), [exact(t) for t in tube["tau"]]
+    L, tau = matrix(tube["L"], n, p), [Fraction(t) for t in tube["tau"]]
     if not (is_definite(P) and is_definite(R) and len(tau) == p and min(tau) > 0):
         return False
     supply = zeros(size, size)
@@ -256,10 +257,10 @@ def follows(level: Json, model: Json, rows: int) -> bool:
         factors = term["inputs"]
         if len(factors) > 4 or any(type(i) is not int or not 0 <= i < inputs for i in factors):
             return False
-        if term["of"] not in ("value", "change") or exact(term["scale"]) <= 0:
+        if term["of"] not in ("value", "change") or Fraction(term["scale"]) <= 0:
             return False
-        exact(term["centre"])
-        if not 0 <= exact(term["fading"]) < 1:
+        Fraction(term["centre"])
+        if not 0 <= Fraction(term["fading"]) < 1:
             return False
     weights = matrix(level["weights"], rows, len(level["terms"]))
     return all(min(row) >= 0 and sum(row) > 0 for row in weights)
@@ -267,8 +268,8 @@ def follows(level: Json, model: Json, rows: int) -> bool:
 
 def closed(model: Json, policy: Json, kappa: Fraction) -> tuple[Rows, Rows]:
     """F - κBK and H - κDK of a difference equation."""
-    a, b = ([exact(entry) for entry in model[key]] for key in "ab")
-    K, n = [exact(entry) for entry in policy["K"][0]], len(a)
+    a, b = ([Fraction(entry) for entry in model[key]] for key in "ab")
+    K, n = [Fraction(entry) for entry in policy["K"][0]], len(a)
     A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
     B = [b[i + 1] + a[i] * b[0] for i in range(n)]
     F = [[A[i][j] - kappa * B[i] * K[j] for j in range(n)] for i in range(n)]
@@ -277,12 +278,12 @@ def closed(model: Json, policy: Json, kappa: Fraction) -> tuple[Rows, Rows]:
 
 def is_a_plan(model: Json, policy: Json, funnel: Json) -> bool:
     """What has to hold of a policy beside the inequalities."""
-    low, high = (exact(end) for end in model["u_range"])
-    n, u = len(model["a"]), [exact(entry) for (entry,) in policy["u"]]
+    low, high = (Fraction(end) for end in model["u_range"])
+    n, u = len(model["a"]), [Fraction(entry) for (entry,) in policy["u"]]
     return (
         model["kind"] == "difference_equation"
         and len(policy["start"]) == n == len(policy["K"][0])
-        and exact(policy["period"]) == exact(model["period"])
+        and Fraction(policy["period"]) == Fraction(model["period"])
         and 1 <= len(u) <= 10**6
         and all(low <= entry <= high for entry in u)
         and all(tube["L"] == policy["L"] for tube in funnel["tubes"])
@@ -303,8 +304,8 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
     if not 1 <= len(trees) == len(funnel["tubes"]) <= 8 or ("multipliers" in proof) != (m > 0):
         return False
     for tube, tree in zip(funnel["tubes"], trees, strict=True):
-        given, rho = tube["assumption"], exact(tube["rho"])
-        level, inlet = exact(tube["level"]), exact(tube["inlet"])
+        given, rho = tube["assumption"], Fraction(tube["rho"])
+        level, inlet = Fraction(tube["level"]), Fraction(tube["inlet"])
         if not 0 < rho <= 1 or (given["kind"] == "energy") != (rho == 1):
             return False
         if inlet < 0 or level < 0:
@@ -320,8 +321,8 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
             c, peak = direct(tube, j)
             if not 0 <= c <= 1 or peak < 0 or (c and ("follows" in tube or policy)):
                 return False
-            left = exact(width) - c * peak
-            if not (width > 0 and left > 0) or level + rho * inlet > exact(tau) * left**2:
+            left = Fraction(width) - c * peak
+            if not (width > 0 and left > 0) or level + rho * inlet > Fraction(tau) * left**2:
                 return False
     return True
 
@@ -338,10 +339,10 @@ def runs(
 
     It lasts `samples`, no more than those of an energy.
     """
-    P, rho = matrix(tube["P"], len(tube["P"]), len(tube["P"])), exact(tube["rho"])
-    n, R = len(P), exact(tube["R"][0][0])
-    inlet, level = exact(tube["inlet"]), exact(tube["level"])
-    L = [exact(entry[0]) for entry in policy["L"]]
+    P, rho = matrix(tube["P"], len(tube["P"]), len(tube["P"])), Fraction(tube["rho"])
+    n, R = len(P), Fraction(tube["R"][0][0])
+    inlet, level = Fraction(tube["inlet"]), Fraction(tube["level"])
+    L = [Fraction(entry[0]) for entry in policy["L"]]
     x = [Fraction(rng.randrange(-8, 9)) for _ in range(n)]
     while inlet and V(P, x) > inlet:
         x = [entry / 2 for entry in x]

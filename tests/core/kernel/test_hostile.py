@@ -63,7 +63,7 @@ WITNESS = {
     "squares": Node({"unit": 0, "factors": [[[1]]]}, "squares"),
 }
 READERS: dict[str, Callable[[Node], Any]] = {
-    "members": lambda node: node.members("basis columns", "squares"),
+    "members": lambda node: node.members("basis columns squares?"),
     "items": lambda node: node.items(1, 3),
     "text": lambda node: node.text(),
     "number": lambda node: node.number(),

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 
 import pytest
@@ -46,11 +45,9 @@ def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:
 def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:
     """2^14 of them took 27 s, as all were in one place of a dictionary."""
     document, about = equal_hashes(9)
-    started = time.process_time()
     with pytest.raises(kernel.Rejected) as refused:
         kernel.decide(files.encode(document), lambda name: files.encode(about[name]))
     assert refused.value.reason in kernel.REASONS
-    assert time.process_time() >= started  # how long it took is `benchmarks.kernel`'s to say
     ring = Ring(11, 64)
     packed = {ring.key([1] + [0] * 10), ring.key([0] * 10 + [2])}
     assert len({hash(key) for key in packed}) == 2

@@ -140,6 +140,9 @@ def test_a_zero_at_one_end_of_s_is_nonnegative_and_not_positive() -> None:
         decide(c, witness, strict=False)
         with refused("not_positive"):
             decide(c, witness)
+    for tiny in (Fraction(1, 2**1074), -Fraction(1, 10**30)):  # of no product: no lane is so small
+        with refused("not_positive"):
+            decide([one + oracle.P(1, {(3,): tiny})], witness)
     below = [nothing - oracle.P.constant(1, Fraction(1, 10**30)), one]
     with pytest.raises(Rejected):
         decide(below, witness, strict=False)

@@ -14,6 +14,7 @@ from nlsid_core.kernel import Rejected, Verdict, positivity, sampled_funnel
 from nlsid_core.kernel.polynomials import BITS, Polynomial, Ring
 from nlsid_core.kernel.sampled_step import prove_curvature, stretch
 from tests.core.kernel import oracle_sampled as oracle
+from tests.core.kernel.oracle_continuous import numbers
 from tests.tracked import designed
 
 # At each step of each chain. Two different polynomials of degree 6 agree at one with probability
@@ -79,7 +80,7 @@ def test_a_reach_holds_for_the_oracle_at_random_states_of_the_set() -> None:
     model, policy = design.model.document(), design.policy.document()
     rng = random.Random(0)
     for k in range(len(design.policy)):
-        S, S_next = (oracle.fractions(design.funnel.S[i].tolist()) for i in (k, k + 1))
+        S, S_next = (numbers(design.funnel.S[i].tolist()) for i in (k, k + 1))
         for chain in ("tube", "inlet"):
             reach = Fraction(design.proof["steps"][k][chain]["reach"])
             radius = Fraction(float(getattr(design.funnel, chain)[k]))
@@ -128,7 +129,7 @@ def test_half_widths_of_ill_conditioned_shapes_are_above_the_true_ones(seed: int
     for i in range(3):
         S[i][:i] = [0.0] * i
     (found,) = closed_loop.half_widths(np.array([S]), np.array([0.7]), 0.1)
-    exact = oracle.fractions(S)
+    exact = numbers(S)
     columns = []
     for i in range(3):  # S x = e_i, from the last row up
         x = [Fraction(0)] * 3

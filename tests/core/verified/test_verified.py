@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.commands.cli import app
 from bags.designs import documents
 from bags.samples import f1tenth
 from benchmarks.verified import generator, mutated
@@ -39,6 +37,7 @@ from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
 from tests.funnel_files import saved as saved_design
 from tests.tracked import designed
 from tests.tracked import write as write_design
+from tests.verbs import nlsid
 
 Json = dict[str, Any]
 ROOT = Path(__file__).resolve().parents[3]
@@ -837,14 +836,12 @@ def test_coq_proves_the_car_that_ships(build: Path, tmp_path: Path) -> None:
 def test_check_asks_the_second_kernel(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(second, "BUILT", program)
     proved = CORPUS / "tube" / "lasting_linear" / "claim.proof.json"
-    told = CliRunner().invoke(app, ["check", "--second", str(proved)])
-    assert told.exit_code == 0
-    assert "second kernel: accepted by the checker that Coq proves right" in told.output
+    told = nlsid("check", "--second", proved)
+    assert "second kernel: accepted by the checker that Coq proves right" in told
     beyond = CORPUS / "tube" / "lasting_implicit_box" / "claim.proof.json"
-    told = CliRunner().invoke(app, ["check", "--second", str(beyond)])
-    assert told.exit_code == 2
-    assert "increments are known on a box only" in told.output.replace("\n", " ")
-    assert "PROVED" in told.output
+    told = nlsid("check", "--second", beyond, status=2)
+    assert "increments are known on a box only" in told.replace("\n", " ")
+    assert "PROVED" in told
 
 
 def test_a_second_kernel_that_breaks_down_refuses_nothing(tmp_path: Path) -> None:
@@ -865,7 +862,6 @@ def test_without_the_second_kernel_check_says_so(
     monkeypatch.setattr(second, "BUILT", tmp_path / "nothing")
     monkeypatch.setenv("PATH", str(tmp_path))
     proved = CORPUS / "tube" / "lasting_linear" / "claim.proof.json"
-    told = CliRunner().invoke(app, ["check", "--second", str(proved)])
-    assert told.exit_code == 2
-    assert "PROVED tube" in told.output
-    assert "not built here" in told.output
+    told = nlsid("check", "--second", proved, status=2)
+    assert "PROVED tube" in told
+    assert "not built here" in told
