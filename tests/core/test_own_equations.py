@@ -69,7 +69,7 @@ def test_the_page_writes_a_problem_for_the_command_line(
     exec(code, {})
     said = nlsid("funnel", "spring", "--problem", "spring.json")
     assert "is applied every 0.0452548" in said
-    assert "with a hold of 0.0452548 s, 0.241 of the half-widths are left" in said
+    assert "with a hold of 0.0452548 s, 0.283 of the half-widths are left" in said
 
 
 @pytest.mark.slow
