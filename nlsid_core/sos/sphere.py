@@ -106,9 +106,9 @@ class SphereProgram:
     """Everything that depends on the number of variables only; build it once and solve often.
 
     n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
-    are kept only if they contain one of them (default: all). v then has the 1 too, with which g may
-    have terms of degree 1 in the others; where all are nonlinear, the sphere has it as the sum of
-    squares. basis: (k, n) exponents of v, lower degree first; weight: (k,), the sum of
+    are kept only if they contain one of them (default: all). constant: whether v has the 1, with
+    which g may have terms of degree 1 in the others; where all are nonlinear, the sphere has it as
+    the sum of squares. basis: (k, n) exponents of v, lower degree first; weight: (k,), the sum of
     (weight·monomial)² is 1 on the sphere.
     points: (N, n) where g has to be evaluated.
 
@@ -117,6 +117,7 @@ class SphereProgram:
 
     n: int
     nonlinear: tuple[int, ...] | None = None
+    constant: bool = False
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
     points: FloatArray = field(init=False)
@@ -126,9 +127,11 @@ class SphereProgram:
         chosen = self.chosen
         if not chosen or not set(chosen) <= set(range(self.n)):
             raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n")
+        if self.constant and len(chosen) == self.n:
+            raise DataError("1 is |z|² on the sphere, which a program of all variables has")
         high = monomials(self.n, [2])
         low = monomials(self.n, [1])
-        one = np.zeros((int(len(chosen) < self.n), self.n), dtype=np.int64)
+        one = np.zeros((int(self.constant), self.n), dtype=np.int64)
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis)
         weight = weights_of(basis, np.isin(np.arange(self.n), chosen))

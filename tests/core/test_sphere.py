@@ -117,12 +117,12 @@ def test_fewer_monomials_suffice_where_few_states_enter_nonlinearly() -> None:
 
 
 @pytest.mark.parametrize("nonlinear", [(2,), (1, 2)])
-def test_a_push_of_every_state_is_taken_beside_few_products(
+def test_a_push_of_every_state_needs_the_one_beside_few_products(
     nonlinear: tuple[int, ...],
 ) -> None:
     """g of degree 1 in all, of degree 4 with two or more factors that are nonlinear."""
     n, rng = 3, np.random.default_rng(7)
-    program, full = SphereProgram(n, nonlinear), SphereProgram(n)
+    program, full = SphereProgram(n, nonlinear, constant=True), SphereProgram(n)
     assert len(program.basis) < len(full.basis) + 1
     on_sphere = monomial_values(program.basis, program.points) * program.weight
     assert (on_sphere**2).sum(axis=1) == pytest.approx(np.ones(len(program.points)))
@@ -136,6 +136,10 @@ def test_a_push_of_every_state_is_taken_beside_few_products(
 
     found, expected = (p.solve(g(p.points)) for p in (program, full))
     assert found.m == pytest.approx(expected.m, abs=1e-6 * float(np.ptp(g(full.points))))
+    without = SphereProgram(n, nonlinear)
+    assert without.solve(g(without.points)).m != pytest.approx(expected.m, rel=1e-2)
+    with pytest.raises(DataError, match="program of all variables"):
+        SphereProgram(n, constant=True)
 
 
 def test_a_constant_needs_no_iteration() -> None:

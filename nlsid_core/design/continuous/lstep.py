@@ -154,7 +154,9 @@ class LSteps:
     @cached_property
     def program(self) -> SphereProgram:
         """Made when it is asked for: of many states it takes seconds."""
-        return sphere_program(self.field.n, len(self.multiplied))
+        n, count = self.field.n, len(self.multiplied)
+        # What the input is off is a term of degree 1 in Ẇ.
+        return sphere_program(n, count, constant=self.widths is not None and count < n)
 
     @property
     def multiplied(self) -> tuple[int, ...]:
@@ -211,7 +213,7 @@ class LSteps:
         W_rate += np.einsum("ij,ij->i", x_bar @ section.shape.rate, x_bar)
         if self.kappa is not None:
             W_rate += self.from_pushes(section, x_bar).sum(axis=1)
-        return np.asarray(-W_rate / rho)
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
 
     def moves(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
         """(cases, N, n) dx̄/dt at the program's points; w that is bounded is in its centre."""
@@ -242,6 +244,19 @@ class LSteps:
     def radius(self) -> FloatArray:
         """(n_w,) half of what each w may be."""
         return np.asarray(np.ptp(self.field.uncertain, axis=1) / 2)
+
+    def _from_defect(self, section: Section, rho: float) -> FloatArray:
+        """What the nominal's defect adds to -Ẇ/ρ along z that enter linearly, of degree 1.
+
+        The reduced basis has no product for it; the proof's Gram matrix, which has 1, does.
+        """
+        linear = [j for j in range(self.program.n) if j not in self.program.chosen]
+        if not linear or self.program.constant:
+            return np.zeros(len(self.program.points))
+        centre = self.field.uncertain.mean(axis=1)
+        rate = self.rate(section, section.x[None], section.u[None], centre)[0]
+        slope = -2 * section.shape.base.T @ section.shape.P @ (rate - section.x_rate) / np.sqrt(rho)
+        return np.asarray(self.program.points[:, linear] @ slope[linear])
 
     def in_mode(self, section: Section, rho: float, case: int) -> FloatArray:
         """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
@@ -331,6 +346,10 @@ class LSteps:
 
 
 @lru_cache(maxsize=16)
-def sphere_program(n: int, multiplied: int) -> SphereProgram:
-    """The program for Ẇ of n states: degree 2 only with the last ones, which are `multiplied`."""
-    return SphereProgram(n, None if multiplied == n else tuple(range(n - multiplied, n)))
+def sphere_program(n: int, multiplied: int, *, constant: bool) -> SphereProgram:
+    """The program for Ẇ of n states: degree 2 only with the last ones, which are `multiplied`.
+
+    constant: Ẇ may have terms of degree 1.
+    """
+    last = None if multiplied == n else tuple(range(n - multiplied, n))
+    return SphereProgram(n, last, constant)

@@ -200,14 +200,14 @@ def _pieces(
 
 def proof_basis(program: SphereProgram) -> IntArray:
     """1 and the rest of the program's basis."""
-    if not program.basis[0].any():
+    if program.constant:
         return program.basis
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
 def _spread(program: SphereProgram) -> FloatArray:
     """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
-    if not program.basis[0].any():
+    if program.constant:
         return program.weight**2
     return np.concatenate([[ONE], (1 - ONE) * program.weight**2])
 
