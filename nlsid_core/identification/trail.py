@@ -33,6 +33,7 @@ T = TypeVar("T", bound=Model)
 S = TypeVar("S")
 R = TypeVar("R")
 log = logging.getLogger(__name__)
+NOTHING = "no start of the search leads to a model that can be used"
 STEPS_A_BOUND = 10  # of Newton's method, to its minimum, as a rule
 FEW_STEPS = 2  # towards it in a large problem: a new bound brings more than the end of the last
 FEWEST_BOUNDS = 6  # from every start, however large the problem is
@@ -183,5 +184,10 @@ def tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | Non
 def least_error(models: Sequence[T], train: Dataset) -> T:
     """The model that simulates the training data best; Infeasible if there is none."""
     if not models:
-        raise Infeasible("no start of the search leads to a model that can be used")
-    return min(models, key=lambda model: simulation_percent(model, train))
+        raise Infeasible(NOTHING)
+    return by_error(models, train)[0]
+
+
+def by_error(models: Sequence[T], train: Dataset) -> list[T]:
+    """The models, the one that simulates the training data best first."""
+    return sorted(models, key=lambda model: simulation_percent(model, train))

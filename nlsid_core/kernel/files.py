@@ -179,7 +179,9 @@ class Node:
         if not kinds.issuperset(map(type, value)):
             wanted = "numbers" if Fraction in kinds else "whole numbers"
             raise Rejected(f"{self.where} should hold {wanted} only")
-        return list(map(Fraction, value)) if Fraction in kinds else list(value)
+        if Fraction in kinds:
+            return [e if type(e) is Fraction else Fraction(e) for e in value]
+        return list(value)
 
     def monomials(
         self, count: int, degree: int = MAX_DEGREE, order: Callable[[bytes], Any] | None = None
@@ -318,7 +320,8 @@ def _float64(text: str) -> Fraction:
 
 
 def _whole(text: str) -> int:
-    value = int(text) if len(text) <= 20 else 2**64
-    if abs(value) > MAX_WHOLE:
+    if len(text) < 16:  # most are
+        return int(text)
+    if len(text) > 20 or abs(int(text)) > MAX_WHOLE:
         raise ValueError(f"{text[:24]} is a whole number beyond 2^53")
-    return value
+    return int(text)

@@ -92,7 +92,8 @@ class Ring:
         """A polynomial, or a number as one."""
         if isinstance(value, Polynomial):
             return value
-        return Polynomial(self, {0: value.numerator}, value.denominator, 0, 0, abs(value.numerator))
+        whole, denominator = value.as_integer_ratio()
+        return Polynomial(self, {0: whole} if whole else {}, denominator, 0, 0, abs(whole))
 
     def bernstein(self, points: Sequence[Fraction], level: int = 0, index: int = 0) -> Polynomial:
         """Σ_j B_j(r) points[j] with r = (index + s) / 2^level."""
@@ -100,8 +101,8 @@ class Ring:
         weights = [point.numerator * (common // point.denominator) for point in points]
         d = len(points) - 1
         basis, norms = _bernstein(d, level, index, self.width)
-        norm = sum(map(mul, map(abs, weights), norms))
-        return Polynomial(self, {0: sum(map(mul, weights, basis))}, common << level * d, 0, d, norm)
+        packed, norm = sum(map(mul, weights, basis)), sum(map(mul, map(abs, weights), norms))
+        return Polynomial(self, {0: packed} if packed else {}, common << level * d, 0, d, norm)
 
     def derivative(self, p: Polynomial) -> Polynomial:
         """dp/ds."""

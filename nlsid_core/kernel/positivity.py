@@ -9,7 +9,9 @@ is left on the diagonal: c > 0 if something is left for the monomial 1. docs/cer
 
 from collections.abc import Mapping
 from fractions import Fraction
-from operator import lshift, mul
+from functools import reduce
+from itertools import combinations_with_replacement
+from operator import lshift, mul, or_
 from types import SimpleNamespace
 
 from .exact import identity
@@ -22,7 +24,8 @@ MAX_SHIFT = 400  # of a power of two
 WITNESS = "basis columns squares"
 
 # Σ_j B_j(s) |R_j V v|² / 4^unit, nowhere negative: a `form` in s and x. keys: of the monomials v.
-# columns: their powers of two.
+# columns: their powers of two. paired: who is charged for a product, the pair with the largest
+# columns, the first such.
 Squares = SimpleNamespace
 
 
@@ -42,8 +45,13 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
     }
     stated = parts["squares"].read(table)
     keys, shifts, grams = list(map(ring.key, basis)), [c - min(columns) for c in columns], []
-    pairs = [(i, j) for i in range(size) for j in range(i, size)]
-    products = [(keys[i] + keys[j], shifts[i] + shifts[j] + (i != j)) for i, j in pairs]
+    products, paired = [], dict[int, tuple[int, int]]()
+    for i, j in combinations_with_replacement(range(size), 2):
+        key, shift = keys[i] + keys[j], shifts[i] + shifts[j]
+        products.append((key, shift + (i != j)))
+        a, b = paired.setdefault(key, (i, j))
+        if shift > shifts[a] + shifts[b]:
+            paired[key] = i, j
     for factor in stated["factors"].items(1, MAX_FACTORS):
         rows = [row.integers(1, size) for row in factor.items(0, 4 * MAX_BASIS)]
         gram: dict[int, int] = {}
@@ -53,7 +61,7 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
         grams.append(Polynomial(ring, gram, 1, 2 * max(map(sum, basis)), 0, norm))
     weight = Fraction(2) ** (2 * min(columns) - 2 * stated["unit"])
     shares = [weight * ring.bernstein(row) for row in identity(len(grams))]
-    return Squares(keys=keys, columns=columns, form=ring.dot(shares, grams))
+    return Squares(keys=keys, columns=columns, paired=paired, form=ring.dot(shares, grams))
 
 
 def powers_of_two(node: Node, size: int) -> list[int]:
@@ -73,10 +81,9 @@ def positive(
     positive number, is lane k of an integer, at the bit k * width.
     Raises TooNarrow if the ring is.
     """
-    form: Polynomial = squares.form
+    r: Polynomial = c - squares.form
     columns: list[int] = squares.columns
-    r, keys, room = c - form, squares.keys, [max(columns) - column for column in columns]
-    D = r.order
+    keys, room, D = squares.keys, [max(columns) - column for column in columns], r.order
     # All that is added to a diagonal, or taken off it, is less than half of a lane together.
     width = r.norm.bit_length() + D + max(room) + 2
     ones = sum(1 << width * k for k in range(D + 1))
@@ -91,7 +98,7 @@ def positive(
         some = negative(lanes) >> width - 1
         return ((lanes + halves) ^ halves ^ ((some << width) - some)) + some
 
-    squared, paired = {2 * key: i for i, key in enumerate(keys)}, _pairs(keys, room)
+    squared, paired = {2 * key: i for i, key in enumerate(keys)}, squares.paired
     left = [0] * len(keys)  # of row i in some unit times 2^-room[i]
     for key, lanes in ring.bernstein_coefficients(r, width):
         if key in squared:
@@ -105,36 +112,23 @@ def positive(
         else:
             refuse_if(lanes, f"{what}: a monomial is no product of the basis", "not_positive")
 
-    failing = 0
-    for lanes in left:
-        failing |= negative(lanes)
+    failing = reduce(or_, map(negative, left))
     first = f"Bernstein coefficient {(failing & -failing).bit_length() // width - 1} of {D}"
     refuse_if(failing, f"{what}: not positive ({first})", "not_positive")
     some = 0 in keys and not negative(left[keys.index(0)] - ones)
     refuse_if(strict and not some, f"{what}: not positive, only nonnegative", "not_positive")
 
 
-def _pairs(keys: list[int], room: list[int]) -> dict[int, tuple[int, int]]:
-    """Who is charged for a product: the pair with the largest columns, the first such."""
-    paired: dict[int, tuple[int, int]] = {}
-    for i, left in enumerate(keys):
-        for j in range(i + 1, len(keys)):
-            a, b = paired.setdefault(left + keys[j], (i, j))
-            if room[i] + room[j] < room[a] + room[b]:
-                paired[left + keys[j]] = i, j
-    return paired
-
-
 def _upper(rows: list[list[int]], size: int) -> list[int]:
     """R'R on and above its diagonal, row by row: a row of R, packed into one integer, times R'."""
-    rows = [[0] * (size - len(row)) + row for row in [[], *rows]]
-    most = max(max(max(row), -min(row)) for row in rows)
+    most = max((max(max(row), -min(row)) for row in rows), default=0)
     width = (most * most * len(rows)).bit_length() + 1
-    lanes = range(0, width * size, width)
-    lines = [sum(map(lshift, row, lanes)) for row in rows]
+    lanes, rows = range(0, width * size, width), [[], *rows]  # one at least, for zip
+    lines = [sum(map(lshift, row, lanes[size - len(row) :])) for row in rows]
+    columns = zip(*([0] * (size - len(row)) + row for row in rows), strict=True)
     half, found = 1 << width - 1, []
     halves = sum(half << lane for lane in lanes)
-    for i, column in enumerate(zip(*rows, strict=True)):
+    for i, column in enumerate(columns):
         line = sum(map(mul, lines, column)) + halves
         found += [(line >> lane & 2 * half - 1) - half for lane in lanes[i:]]
     return found

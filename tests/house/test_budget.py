@@ -12,7 +12,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_030,
+    ("nlsid_core",): 18_107,
     ("bags",): 11_914,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_283,

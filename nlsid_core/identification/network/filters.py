@@ -7,6 +7,7 @@ what the phases are.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from nlsid_core.identification.network.fit import (
     Scaled,
     best_for,
     minimise,
+    shortened,
 )
 from nlsid_core.identification.network.maps import Smooth
 from nlsid_core.identification.network.options import FilterMapFilter, Network
@@ -33,10 +35,11 @@ from nlsid_core.models.signal import signals_of
 STEPS, TOLERANCE = 40, 1e-3  # with fewer knots
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
 SMOOTHING = 1e-8  # of the spline
-START_SAMPLES = 10_000  # of each trial, for the starts
+SCREENED_SAMPLES, START_SAMPLES = 2000, 10_000  # for the starts
 START_INTERVALS = 12
 FEWEST_INTERVALS = 6  # of a map that is refined
 SCREENING_STEPS, START_STEPS = 20, 60
+REMEMBERED = 16  # of the best starts
 KEPT_STARTS = 3  # of the screened ones, minimised further
 POLE_RADII = (0.5, 0.95)
 POLE_ANGLES = (0.1, 1.5)  # rad a sample: a filter that passes something of a sampled signal
@@ -117,9 +120,10 @@ def filter_map_filter(
     """
     made, progress = model_class.structure, task.progress
     scaled = _scales(train)
-    trials = _trials(train, scaled, made, task)
+    trials = _trials(train, scaled, made, task.transient)
     radius = min(MAX_RADIUS, task.searched_rate)
-    found = _best_start(trials, radius, made, np.random.default_rng(model_class.seed))
+    plain = replace(model_class, structure=replace(made, phases=1, intervals=START_INTERVALS))
+    found = _best_start(train, plain, radius, task.transient)
     progress(f"best of {made.starts} starts", 0.4)
     knots = [K for K in (made.intervals // 4, made.intervals // 2) if K >= FEWEST_INTERVALS]
     steps: list[Step] = []
@@ -161,10 +165,12 @@ def _scales(train: Dataset) -> Scaled:
     return Scaled((0.0, float(spreads[0][0])), (np.zeros(1), spreads[1]), ())
 
 
-def _trials(data: Dataset, scales: Scaled, made: FilterMapFilter, task: Task) -> tuple[Trial, ...]:
+def _trials(
+    data: Dataset, scales: Scaled, made: FilterMapFilter, transient: int
+) -> tuple[Trial, ...]:
     """In these scales, from rest or in motion."""
     held, (_, n2) = made.begin == "measured", made.orders
-    skipped = max(task.transient, n2) if held else task.transient
+    skipped = max(transient, n2) if held else transient
     found = Scaled.of(data, skipped, skipped, scales).trials
     trials = tuple(replace(t, start=t.y[: n2 if held else 0], held=held) for t in found)
     needed = 2 * (sum(made.orders) + 2) + START_INTERVALS + 3
@@ -175,18 +181,24 @@ def _trials(data: Dataset, scales: Scaled, made: FilterMapFilter, task: Task) ->
     return trials
 
 
+@lru_cache(maxsize=REMEMBERED)
 def _best_start(
-    trials: tuple[Trial, ...], radius: float, made: FilterMapFilter, rng: np.random.Generator
+    train: Dataset, model_class: Network[FilterMapFilter], radius: float, transient: int
 ) -> Cascade:
-    """The best of the minima from random all-pole filters with f by linear least squares."""
-    part = tuple(replace(t, u=t.u[:START_SAMPLES], y=t.y[:START_SAMPLES]) for t in trials)
+    """The best of the minima from random all-pole filters with f by linear least squares.
+
+    Remembered, since models with more knots or phases begin with it too.
+    """
+    made, rng = model_class.structure, np.random.default_rng(model_class.seed)
+    trials = _trials(train, _scales(train), made, transient)
+    few, more = (shortened(trials, n) or trials for n in (SCREENED_SAMPLES, START_SAMPLES))
     screened = [
-        _minimised(_random_start(part, made, rng, radius), part, radius, steps=SCREENING_STEPS)
+        _minimised(_random_start(few, made, rng, radius), few, radius, steps=SCREENING_STEPS)
         for _ in range(made.starts)
     ]
     screened.sort(key=lambda found: found[1].rms)
     finished = [
-        _minimised(start, part, radius, steps=START_STEPS) for start, _ in screened[:KEPT_STARTS]
+        _minimised(start, more, radius, steps=START_STEPS) for start, _ in screened[:KEPT_STARTS]
     ]
     return min(finished, key=lambda found: found[1].rms)[0]
 

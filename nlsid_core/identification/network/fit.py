@@ -5,10 +5,12 @@ trust (scipy); else by damped steps (J'J + λ diag(J'J))δ = -J'r, of which thos
 than allowed are refused. Source: Marquardt 1963; Branch, Coleman and Li 1999.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.optimize import least_squares
 
@@ -22,6 +24,8 @@ FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP, GIVE_UP_DAMPING = 1e-2, 0.2, 4.0, 1e8
 PATIENCE = 3  # steps in a row that gain less than the tolerance
 RIDGE = 1e-10  # of the largest diagonal entry: what the data do not show has no curvature
 MAX_RADIUS = 1.0 - 1e-6  # of the poles
+NEAR = 0.8  # of the longest trial of a stack: shorter ones are in another
+LARGEST_STACK = 100_000  # samples
 INSIDE = 1e-9  # of the bounds, where a search within them begins
 
 
@@ -66,6 +70,32 @@ class Scaled:
 
 
 @dataclass(frozen=True, eq=False)
+class Stack:
+    """Several trials as one, (T, N, …), the shorter ones with samples that are not scored.
+
+    which: (T,) their numbers. scored: (T, N), whether a sample is.
+    """
+
+    trial: Trial
+    which: IntArray
+    scored: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial], which: Sequence[int]) -> "Stack":
+        """The last of them is the longest."""
+        some, N = [trials[i] for i in which], len(trials[which[-1]].y)
+        u, y = (np.zeros((len(some), N, *part.shape[1:])) for part in (some[0].u, some[0].y))
+        for t, trial in enumerate(some):
+            u[t, : len(trial.y)], u[t, len(trial.y) :] = trial.u, trial.u[-1]
+            y[t, : len(trial.y)] = trial.y
+        starts = np.array([trial.start for trial in some])
+        stacked = Trial(u, y, starts, some[0].skipped, some[0].held)
+        place = np.arange(N)
+        scored = [(place >= t.skipped) & (place < len(t.y)) for t in some]
+        return cls(stacked, np.array(which), np.array(scored))
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """What is minimised over θ: [the free starts of every trial; the parameters].
 
@@ -89,22 +119,41 @@ class Problem:
         starts = [trial.start for trial in self.trials] if self.signals.free else []
         return np.concatenate([*starts, parameters])
 
-    def parts(self, theta: FloatArray) -> Iterator[tuple[Trial, IntArray]]:
-        """Every trial with its start in θ, and where in θ its start and the parameters are."""
-        G, shared = self.signals.given, np.arange(self.starts, len(theta))
-        for i, trial in enumerate(self.trials):
-            if not self.signals.free:
-                yield trial, shared
+    def started(self, theta: FloatArray) -> tuple[Trial, ...]:
+        """The trials with their starts in θ."""
+        if not self.signals.free:
+            return tuple(self.trials)
+        starts = theta[: self.starts].reshape(len(self.trials), -1)
+        return tuple(replace(t, start=s) for t, s in zip(self.trials, starts, strict=True))
+
+    @cached_property
+    def stacks(self) -> list["Stack"]:
+        """The trials, those of about one length together."""
+        order = sorted(range(len(self.trials)), key=lambda i: len(self.trials[i].y))
+        found: list[list[int]] = []
+        for i in order:
+            N, together = len(self.trials[i].y), found[-1] if found else []
+            is_near = together and len(self.trials[together[0]].y) >= NEAR * N
+            if is_near and (len(together) + 1) * N <= LARGEST_STACK:
+                together.append(i)
             else:
-                at = np.arange(i * G, (i + 1) * G)
-                yield replace(trial, start=theta[at]), np.concatenate([at, shared])
+                found.append([i])
+        return [Stack.of(self.trials, which) for which in found]
+
+    def begun(self, stack: "Stack", theta: FloatArray) -> Trial:
+        """The stack's trials with their starts in θ."""
+        if not self.signals.free:
+            return stack.trial
+        starts = theta[: self.starts].reshape(len(self.trials), -1)
+        return replace(stack.trial, start=starts[stack.which])
 
     def errors(self, theta: FloatArray) -> FloatArray:
         """ŷ - y at the scored samples of all trials."""
-        parameters, y = theta[self.starts :], self.signals.output
-        return np.concatenate(
-            [(self.signals.run(parameters, t)[y] - t.y)[t.skipped :] for t, _ in self.parts(theta)]
-        )
+        parts = []
+        for each in self.stacks:
+            sources = self.signals.run(theta[self.starts :], self.begun(each, theta))
+            parts.append((sources[self.signals.output] - each.trial.y)[each.scored])
+        return np.concatenate(parts)
 
     def mean_square(self, theta: FloatArray) -> float:
         """Of the errors."""
@@ -117,12 +166,15 @@ class Problem:
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
         """The derivatives of the residual."""
-        blocks = []
-        for trial, at in self.parts(theta):
-            _, moved = self.signals.sensitivities(theta[self.starts :], trial)
-            J = moved[self.signals.output][:, trial.skipped :].T
+        blocks, G = [], self.signals.given if self.signals.free else 0
+        for each in self.stacks:
+            _, moved = self.signals.sensitivities(theta[self.starts :], self.begun(each, theta))
+            J = moved[self.signals.output][:, each.scored].T
             block = np.zeros((len(J), len(theta)))
-            block[:, at] = J
+            block[:, self.starts :] = J[:, G:]
+            own = G * each.which[np.nonzero(each.scored)[0]]  # where the starts of a sample are
+            for k in range(G):
+                block[np.arange(len(J)), own + k] = J[:, k]
             blocks.append(block)
         of_errors = np.concatenate(blocks)
         none = np.zeros((len(self.bend), self.starts))
@@ -167,7 +219,7 @@ def minimise(problem: Problem, parameters: FloatArray, *, steps: int, tolerance:
     return Minimum(
         rms=problem.mean_square(theta) ** 0.5,
         parameters=theta[problem.starts :],
-        trials=tuple(trial for trial, _ in problem.parts(theta)),
+        trials=problem.started(theta),
     )
 
 

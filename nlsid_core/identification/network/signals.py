@@ -18,8 +18,10 @@ from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.identification.network.maps import Map, as_piecewise_linear
+from nlsid_core.models import PiecewiseLinear
 
 NONE: IntArray = np.zeros(0, dtype=np.int64)  # taps without parameters
+TOGETHER = 8  # trials whose loops are quicker all at once
 DIVERGED = 1e3  # spreads of a signal, at which a loop's simulation is held
 
 
@@ -62,8 +64,9 @@ class Mapped:
 class Trial:
     """u (N, q) and y (N,), scaled. start: the given first samples of all signals, in their order.
 
-    The first `skipped` samples are not scored. held: before the trial every input was what it is at
-    the first sample, for ever; else all was zero.
+    Or several trials of one length, with one more axis before these. The first `skipped` samples
+    are not scored. held: before the trial every input was what it is at the first sample, for ever;
+    else all was zero.
     """
 
     u: FloatArray
@@ -136,15 +139,16 @@ class Signals:
         return slowest
 
     def run(self, theta: FloatArray, trial: Trial) -> list[FloatArray]:
-        """Inputs, 1 and nodes, (N,) each, along a trial."""
-        sources, first = [*trial.u.T, np.ones(len(trial.u))], 0
+        """Inputs, 1 and nodes, (N,) each, along a trial; (T, N) along several."""
+        sources, first = [*np.moveaxis(trial.u, -1, 0), np.ones(trial.u.shape[:-1])], 0
         for number, node in enumerate(self.nodes, self.inputs + 1):
             if isinstance(node, Mapped):
-                sources.append(node.function.values(theta[node.at], sources[node.source]))
+                x = sources[node.source]
+                sources.append(node.function.values(theta[node.at], x.ravel()).reshape(x.shape))
                 continue
-            start = trial.start[first : first + node.given]
+            start = trial.start[..., first : first + node.given]
             first += node.given
-            forcing = np.zeros(len(trial.u))
+            forcing = np.zeros(trial.u.shape[:-1])
             for part in node.taps:
                 if part.source < number:
                     forcing += passed(part.weights(theta), sources[part.source], trial)
@@ -158,18 +162,19 @@ class Signals:
     def sensitivities(
         self, theta: FloatArray, trial: Trial
     ) -> tuple[list[FloatArray], list[FloatArray]]:
-        """`run`, and the derivatives (G + P, N) of each in [start; θ]; G: of free starts."""
-        sources, first, N = self.run(theta, trial), 0, len(trial.u)
+        """`run`, and the derivatives (G + P, …) of each in [start; θ]; G: of free starts."""
+        sources, first, shape = self.run(theta, trial), 0, trial.u.shape[:-1]
         G = self.given if self.free else 0
-        moved: list[FloatArray] = [np.zeros((G + len(theta), N))] * (self.inputs + 1)
+        moved: list[FloatArray] = [np.zeros((G + len(theta), *shape))] * (self.inputs + 1)
         live: list[list[int]] = [[]] * (self.inputs + 1)  # the rows that are not zero
         for number, node in enumerate(self.nodes, self.inputs + 1):
-            direct = np.zeros((G + len(theta), N))
+            direct = np.zeros((G + len(theta), *shape))
             if isinstance(node, Mapped):
-                p, x, rows = theta[node.at], sources[node.source], live[node.source]
+                p, x, rows = theta[node.at], sources[node.source].ravel(), live[node.source]
                 if number in self.chained:
-                    direct[rows] = node.function.slopes(p, x) * moved[node.source][rows]
-                    direct[G + node.at] += node.function.moves(p, x)
+                    slopes = node.function.slopes(p, x).reshape(shape)
+                    direct[rows] = slopes * moved[node.source][rows]
+                    direct[G + node.at] += node.function.moves(p, x).reshape(-1, *shape)
                 moved.append(direct)
                 live.append(sorted({*rows, *(G + node.at).tolist()}))
                 continue
@@ -182,17 +187,20 @@ class Signals:
                     direct[rows] += passed(part.weights(theta), moved[part.source][rows], trial)
             own, A = self.own_maps(number), self.own_filter(number, theta)
             for part, one in own:
-                moves = one.function.moves(theta[one.at], sources[number])
-                direct[G + one.at] += passed(part.weights(theta), moves, trial)
-            direct[:, : node.given] = 0.0
+                moves = one.function.moves(theta[one.at], sources[number].ravel())
+                direct[G + one.at] += passed(part.weights(theta), moves.reshape(-1, *shape), trial)
+            direct[..., : node.given] = 0.0
             if self.free:
-                direct[first + np.arange(node.given), np.arange(node.given)] = 1.0
+                for k in range(node.given):
+                    direct[first + k, ..., k] = 1.0
             first += node.given
-            rows = np.flatnonzero(direct.any(axis=1)).tolist()
+            rows = np.flatnonzero(direct.reshape(len(direct), -1).any(axis=1)).tolist()
             if own:
-                bands = _bands(A, own, theta, sources[number], node.given)
-                depth = (len(bands) - 1, 0)
-                direct[rows] = solve_banded(depth, bands, direct[rows].T, check_finite=False).T
+                for which in np.ndindex(shape[:-1]):
+                    bands = _bands(A, own, theta, sources[number][which], node.given)
+                    here = (rows, *which)
+                    depth = (len(bands) - 1, 0)
+                    direct[here] = solve_banded(depth, bands, direct[here].T, check_finite=False).T
             else:
                 direct[rows] = _filtered(A, direct[rows], np.zeros(node.given), trial)
             moved.append(direct)
@@ -222,9 +230,9 @@ def _filtered(A: FloatArray, forcing: FloatArray, start: FloatArray, trial: Tria
     """(…, N): forcing through 1/A, from the given first samples, from rest or from a held past."""
     if not forcing.size:  # nothing moves, as in a flat map's first step
         return forcing
-    if len(start):
+    if given := start.shape[-1]:
         forcing = forcing.copy()
-        forcing[..., : len(start)] = lfilter(A, [1.0], start)  # what makes them the first samples
+        forcing[..., :given] = lfilter(A, [1.0], start)  # what makes them the first samples
         return np.asarray(lfilter([1.0], A, forcing))
     before = forcing[..., :1] if trial.held else np.zeros(1)
     return np.asarray(lfilter([1.0], A, forcing - before) + before / np.sum(A))
@@ -237,12 +245,39 @@ def _looped(
     forcing: FloatArray,
     start: FloatArray,
 ) -> FloatArray:
-    """(N,) through its one map, held at DIVERGED where it grows beyond all measure."""
+    """(…, N) through its one map, held at DIVERGED where it grows beyond all measure."""
     [(part, one)] = own
     f = as_piecewise_linear(one.function, theta[one.at])
+    a, weights = list(enumerate((-A[1:]).tolist(), 1)), part.weights(theta)
+    if forcing.ndim == 1:
+        return _one_looped(f, a, weights, forcing, start)
+    if len(forcing) < TOGETHER:
+        pairs = zip(forcing, start, strict=True)
+        return np.array([_one_looped(f, a, weights, *each) for each in pairs])
+    y, mapped = np.empty_like(forcing.T), np.empty_like(forcing.T)
+    given = start.shape[-1]
+    y[:given], mapped[:given] = start.T, f(start.T)
+    for t in range(given, len(y)):
+        value = forcing[:, t].copy()
+        for k, weight in a:
+            value += weight * y[t - k]
+        for k, weight in weights:
+            value += weight * mapped[t - k]
+        y[t] = np.clip(value, -DIVERGED, DIVERGED)
+        mapped[t] = f(y[t])
+    return y.T
+
+
+def _one_looped(
+    f: PiecewiseLinear,
+    a: list[tuple[int, float]],
+    weights: list[tuple[int, float]],
+    forcing: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """(N,), in plain numbers, which is quicker for one or few."""
     inner, slopes = f.knots[1:-1].tolist(), f.slopes.tolist()
     levels = (f.values[:-1] - f.slopes * f.knots[:-1]).tolist()
-    a, weights = list(enumerate((-A[1:]).tolist(), 1)), part.weights(theta)
     y, mapped = start.tolist(), f(start).tolist()
     for value in forcing[len(y) :].tolist():
         for k, weight in a:

@@ -16,10 +16,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.identification.methods.descent import Outputs, Step, descend
 from nlsid_core.identification.polynomial.implicit_rie import (
-    Model,
-    Proof,
     indeterminates_of,
-    kept_in_set,
     left_coefficients,
     right_coefficients,
     set_constraints,
@@ -33,6 +30,7 @@ from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables
 from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import NormBound, Program, solve
+from nlsid_core.sos.program import Constraint
 
 MONOTONE = 0.1  # kept of ∂e/∂v + (∂e/∂v)', where Q is 1
 FREE = 1e-3  # of the damping, along θ
@@ -78,6 +76,17 @@ class ImplicitSet:
             window=rows.model_class.window(len(u_mean)),
         )
         return Rollout(model, scaled)
+
+    @cached_property
+    def constraints(self) -> list[Constraint]:
+        """The inequalities of the set, the same at every step; none without one."""
+        if self.slowest is None:
+            return []
+        e, f = unknowns(self.rows)
+        S = np.array(
+            [[constant(MONOTONE * (i == j)) for j in range(len(e))] for i in range(len(e))]
+        )
+        return set_constraints(self.rows, e, f, S, self.slowest)
 
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """e (m_e, n_v) and f (m_f, n_v)."""
@@ -130,8 +139,6 @@ class ImplicitSet:
             )
         rows, (bound,) = self.rows, variables("bound")
         n_v, n_e = len(rows.y_scale[0]), len(rows.left)
-        e, f = unknowns(rows)
-        S = np.array([[constant(MONOTONE * (i == j)) for j in range(n_v)] for i in range(n_v)])
         columns = [
             [*left_coefficients(rows, i, n_v), *right_coefficients(rows, i)] for i in range(n_v)
         ]
@@ -148,7 +155,7 @@ class ImplicitSet:
         entries = combinations(moving, [*names, constant(1.0)])
         program = Program(
             indeterminates_of(rows.names),
-            (*set_constraints(rows, e, f, S, self.slowest), NormBound(tuple(entries), bound)),
+            (*self.constraints, NormBound(tuple(entries), bound)),
             minimise=bound,
         )
         found, theta = solve(program), step.theta.copy()
@@ -165,18 +172,14 @@ def minimise_certified_implicit(
     *,
     slowest: float = 1.0,
     steps: int,
-) -> tuple[Model, Proof] | None:
-    """A local minimum of Σ |y - ŷ|² in the set, from scaled e and f in it or not, with its proof.
+) -> tuple[FloatArray, FloatArray] | None:
+    """Scaled e and f of a local minimum of Σ |y - ŷ|² in the set; None if there is none.
 
-    None if there is none, or it has no exact proof.
+    start: scaled e and f, in the set or not.
     """
     inside = ImplicitSet(rows, slowest)
-    theta = SCALE * np.concatenate(start).ravel()
-    found = descend(inside, theta, steps=steps)
-    if found is None:
-        return None
-    model, proof = kept_in_set(rows, *inside.split(found), MONOTONE)
-    return None if proof is None else (model, proof)
+    found = descend(inside, SCALE * np.concatenate(start).ravel(), steps=steps)
+    return None if found is None else inside.split(found)
 
 
 def minimise_equation(

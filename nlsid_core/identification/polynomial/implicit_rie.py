@@ -93,7 +93,8 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
     found, bound = _interior([*parts, *_weighted(rows, S)], names)
     lowest = float(np.linalg.eigvalsh(_values(found, S))[0])
     best = coefficients(found, rows)
-    model, proof = kept_in_set(rows, *best, lowest)
+    model = kept_in_set(rows, *best, lowest)
+    proof = prove_kept(model, rows)
     if proof is None:
         raise Infeasible(
             f"no exact proof in set {rows.set} for the minimiser; try lower degrees, "
@@ -115,15 +116,17 @@ def refuse_large_program(rows: ImplicitRows) -> None:
         )
 
 
-def kept_in_set(
-    rows: ImplicitRows, e: FloatArray, f: FloatArray, monotone: float
-) -> tuple[Model, Proof | None]:
-    """The model of scaled coefficients for which the set's inequality kept Q, and its proof.
+def kept_in_set(rows: ImplicitRows, e: FloatArray, f: FloatArray, monotone: float) -> Model:
+    """The model of scaled coefficients for which the set's inequality kept Q.
 
     monotone: what was kept of ∂e/∂v + (∂e/∂v)' in scaled signals.
     """
-    model = rows.model(e, f, HALF * monotone / 2.0)
-    return model, _proved(model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0))
+    return rows.model(e, f, HALF * monotone / 2.0)
+
+
+def prove_kept(model: Model, rows: ImplicitRows) -> Proof | None:
+    """The proof of a model that was kept in the set."""
+    return _proved(model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0))
 
 
 def implicit_equation_error(rows: ImplicitRows) -> Model:

@@ -9,6 +9,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.methods.options import Rie, Sem
 from nlsid_core.identification.polynomial import explicit
 from nlsid_core.identification.polynomial.implicit_descent import (
+    MONOTONE,
     minimise_certified_implicit,
     minimise_equation,
 )
@@ -16,16 +17,18 @@ from nlsid_core.identification.polynomial.implicit_rie import (
     Model,
     Proof,
     implicit_equation_error,
+    kept_in_set,
     least_squares_coefficients,
     minimise_implicit_rie,
     prove_in_set,
+    prove_kept,
     refuse_large_program,
 )
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, build_implicit_rows
 from nlsid_core.identification.polynomial.moment_rie import identify_from_repeats
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.starts import as_implicit, linear_start
-from nlsid_core.identification.trail import Task, Trail, least_error, tried
+from nlsid_core.identification.trail import NOTHING, Task, Trail, by_error, least_error, tried
 from nlsid_core.models import MonotoneEquation
 
 Coefficients = tuple[FloatArray, FloatArray]  # scaled e and f of an implicit model
@@ -100,14 +103,17 @@ def _anywhere(rows: ImplicitRows, task: Task, method: Sem) -> MonotoneEquation:
 
 
 def _inside(rows: ImplicitRows, task: Task, method: Sem) -> tuple[Model, Proof]:
-    """The best of the local minima of the simulation error in the set, from all starts at hand."""
+    """The best proved one of the local minima of the simulation error in the set, of all starts."""
 
-    def minimised(start: Coefficients) -> tuple[Model, Proof] | None:
+    def minimised(start: Coefficients) -> Coefficients | None:
         return minimise_certified_implicit(
             rows, start, slowest=task.searched_rate, steps=method.iterations
         )
 
     starts = _starts(rows, task)
     found = [one for start in starts if (one := tried(start, minimised)) is not None]
-    best = least_error([model for model, _ in found], rows.dataset)
-    return next(one for one in found if one[0] is best)
+    models: list[Model] = [kept_in_set(rows, *one, MONOTONE) for one in found]
+    for model in by_error(models, rows.dataset):
+        if (proof := prove_kept(model, rows)) is not None:
+            return model, proof
+    raise Infeasible(NOTHING)
