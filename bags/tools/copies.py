@@ -40,5 +40,7 @@ class Rows:
     """
 
     period: Annotated[float | None, "s between rows."] = None
-    time: Annotated[str | None, "The column with the rows' times."] = None
+    time: Annotated[
+        str | None, "The column with the rows' times; default: one called t or time."
+    ] = None
     start: Annotated[float, "s since 1970 of time 0."] = 0.0

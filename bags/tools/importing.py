@@ -5,7 +5,7 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +29,9 @@ NUMBER: Final = "std_msgs/msg/Float64"  # of a topic with one column, `data`, an
 SLOW: Final = 1.0  # s between rows, of most robots times in another unit: asked about
 EPOCHS: Final = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e9}  # the least time since 1970 in it
 _TIME: Final = re.compile(r"(?P<column>.+)\|unit\((?P<unit>s|ms|us|ns)\)")
+_IS_TIME: Final = re.compile(
+    r"(?i)(t|time|timestamp|stamp)([ _]?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))?"
+)
 _TITLE: Final = re.compile(r".+?(?:[ _]?[\[(](?P<a>\w+)[\])]|_(?P<b>s|ms|us|ns))")
 
 
@@ -129,7 +132,7 @@ def import_table(
         out: the bag.
         assignments: `signal=column` each.
         types: topic -> message type, a standard one; a number where only `topic:data` is assigned.
-        rows: when the rows were recorded.
+        rows: when the rows were recorded; without a period or a column, by the one named as time.
         custom: key-value pairs of the bag's own.
 
     Returns:
@@ -138,11 +141,14 @@ def import_table(
     Raises:
         BagError, DataError: for what does not fit, and if `out` exists.
     """
+    tables = read_table(file)
+    if rows.period is None and rows.time is None:
+        rows = replace(rows, time=next(filter(_IS_TIME.fullmatch, tables), None))
     if (rows.period is None) == (rows.time is None):
         raise BagError(
-            "state either the period of the rows (--period) or the column with their times (--time)"
+            "state either the period of the rows (--period) or the column with their times "
+            f"(--time); there are: {listed(tables)}"
         )
-    tables = read_table(file)
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
     for text in assignments:
         path, column = _assigned(text)
@@ -150,7 +156,10 @@ def import_table(
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     if not topics:
-        raise BagError("nothing is assigned, so there is nothing to write")
+        raise BagError(
+            "say which column is which signal, e.g. -s /speed:data=COLUMN; there are: "
+            f"{listed(tables)}"
+        )
     times, unit = _times(tables, rows)
     stamps = _stamps(times, round(rows.start * 1e9))
     streams = []

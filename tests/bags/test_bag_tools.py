@@ -657,6 +657,8 @@ TABLES: list[tuple[str, Rows, list[float] | str]] = [
         f"^the time of row 1 is 2147483648 s {SEVENTIES}",
     ),
     ("t,speed\n-0.1,1\n0.4,2\n", Rows(time="t", start=0.1), [1.0, 2.0]),
+    ("speed,Time (ms)\n1,0\n2,100\n", Rows(), [1.0, 2.0]),
+    ("stemp,speed\n0,1\n0.1,2\n", Rows(), r"their times \(--time\); there are: stemp, speed$"),
 ]
 
 

@@ -627,6 +627,7 @@ def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seco
     whole_way(parts, config, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: Path) -> None:
     bag, level = tmp_path / "tank", 0.0
     pumped = np.repeat(np.random.default_rng(2).uniform(0.0, 1.0, 30), 10)

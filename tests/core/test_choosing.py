@@ -119,7 +119,11 @@ def test_what_is_promised_holds_on_new_excitations() -> None:
         (Polynomial(2), Rse(4)),
         (Polynomial(2, (1, 2)), Rse(4)),
         (Polynomial(2, set="3.8"), Sem(4)),
-        (Network(FilterMapFilter((1, 1), intervals=4, starts=2)), Sem(4, certified=True)),
+        pytest.param(
+            Network(FilterMapFilter((1, 1), intervals=4, starts=2)),
+            Sem(4, certified=True),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_simulation_starts_where_the_first_samples_are_nearest(

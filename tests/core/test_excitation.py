@@ -122,6 +122,7 @@ def test_equations_that_leave_every_number_begin_anew_and_rest() -> None:
     assert states[-1] == 0.1
 
 
+@pytest.mark.slow
 def test_w_is_drawn_from_its_box() -> None:
     field = VectorField.from_function(lambda u, w: [u[0] + w[0]], 1, 1, uncertain=[[-0.5, 1.0]])
     plant = FieldPlant(field, np.zeros(1), period=STEP, rng=np.random.default_rng(0))

@@ -18,7 +18,7 @@ from nlsid_core.design.continuous.shape import solve_ends
 from nlsid_core.design.continuous.vstep import enlarging, samples_of
 from nlsid_core.design.continuous.vstep_program import GAP
 from nlsid_core.designs import AnyDesign
-from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values
 
@@ -92,15 +92,6 @@ def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> 
 def test_a_sample_at_one_end_only_is_refused() -> None:
     with pytest.raises(DataError, match="its two ends are the least"):
         sample_funnel(ContinuousTracking(*hanging(), goal=GOAL), samples=1)
-
-
-# -- options
-
-
-def test_an_unknown_option_is_named_with_the_known_ones() -> None:
-    chosen: Any = {"shape": "magic"}
-    with pytest.raises(OptionError, match="shape is 'magic'; it should be one of "):
-        ContinuousTracking(*hanging(), goal=GOAL, **chosen)
 
 
 # -- the general P(t) --------------------------------------------------------------------------

@@ -174,6 +174,7 @@ def test_where_limits_are_far_away_a_refusal_blames_the_hold() -> None:
     assert "the inputs' limits" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
     with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
         design(tracking(hold=1.0))

@@ -193,6 +193,7 @@ def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
     assert len(sizes) == len(set(sizes))
 
 
+@pytest.mark.slow
 def test_errors_that_leave_no_funnel_without_a_hold_are_the_reason() -> None:
     wrong = r"may be wrong by \[0.05, 0.2\], not even without a hold: input 0 is then off by"
     with pytest.raises(Infeasible, match=wrong):

@@ -253,6 +253,7 @@ def servo(seed: int, samples: int = 1500) -> Dataset:
     )
 
 
+@pytest.mark.slow
 def test_a_servo_with_a_limit_of_speed_is_found_and_proved() -> None:
     """Where a linear model has 30 % of the spread; stiffer than proved it would not be stable."""
     made = identify(servo(1), Network(Follower(), start_samples=10))
@@ -284,6 +285,7 @@ def test_a_duffing_oscillator_is_found_and_proved(oscillator: Fit[CellNetwork]) 
         proofs.decide(document, {"m.json": oscillator.model.document()})
 
 
+@pytest.mark.slow
 def test_a_well_damped_loop_is_proved_as_it_is() -> None:
     """x'' + 2x' + x + x³ = u contracts over all of its range: nothing is unrolled."""
     made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, lags=2))

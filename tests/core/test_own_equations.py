@@ -60,6 +60,7 @@ def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) ->
     assert run.max_v > 0.9
 
 
+@pytest.mark.slow
 def test_the_page_writes_a_problem_for_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_107,
-    ("bags",): 11_914,
+    ("bags",): 11_917,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_287,
+    ("tests",): 22_283,
     ("benchmarks", "examples"): 3_797,
 }
 ARGUMENTS, FIELDS = 6, 8
