@@ -73,12 +73,11 @@ def prove_pieces(
     ends: list[Ends] | None = None,
     *,
     kept: Proved | None = None,
-    most: int = MAX_LEVEL,
 ) -> Proved:
     """A proof for all time, or parts on which there is none.
 
     ends: L-steps at the ends of the intervals, where they are at hand. kept: pieces that are proved
-    already; other intervals are halved `most` times at most.
+    already.
     """
     known: dict[tuple[int, float], list[SphereSolution]] = {}
     for k, pair in enumerate(ends or []):
@@ -108,8 +107,8 @@ def prove_pieces(
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
         failed = [part for part, good in zip(waiting, by_part.tolist(), strict=True) if not good]
-        unproved += [part for part in failed if part.level == most]
-        waiting = [half for part in failed if part.level < most for half in part.halves()]
+        unproved += [part for part in failed if part.level == MAX_LEVEL]
+        waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
     return Proved(*_joined(steps, done), unproved=tuple(unproved))
 
 

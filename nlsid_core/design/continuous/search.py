@@ -32,8 +32,7 @@ from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.progress import Progress
 
 LARGER = 16.0  # times the margin where a piece is not proved
-LEVELS = (1, 2, 3, 4)  # how often an interval is halved for its proof, before its margin grows
-LEVELS_OF_CASES = (4, 4, 4)  # of several cases: to sweep again takes longer than halves do
+SWEEPS = 3  # the second and the third with larger margins where pieces are not proved
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold, within which one with a hold is looked for
 STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in a search for it
 
@@ -162,22 +161,20 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
     What is proved stays as long as its interval does.
     """
     intervals = range(len(setting.P) - 1)
-    times, again, kept = np.ones(len(intervals)), None, None
-    for most in LEVELS if setting.steps.cases == 1 else LEVELS_OF_CASES:
+    times, again, kept, refusal = np.ones(len(intervals)), None, None, Infeasible("")
+    for _ in range(SWEEPS):
         try:
             made = swept(setting, replace(wanted, times=times), progress, again=again)
-            last = False
-        except NoFunnel:
-            if kept is None:
-                raise
-            most, last = LEVELS[-1], True  # no larger margin: smaller parts have to do
+        except NoFunnel as found:
+            refusal = found if kept is None else refusal
+            break
         if again is not None and kept is not None:
             kept = kept.on([k for k in intervals if made.ends[k] is again.ends[k]])
         steps, policy = made.setting.steps, made.setting.policy
         digest = files.digest(policy.document())
         funnel = ContinuousFunnel(policy.x, setting.P, made.rho, policy.vector_field, digest)
         refuse_unmonitorable(funnel)
-        shown = prove_pieces(steps, funnel, made.ends, kept=kept, most=most)
+        shown = prove_pieces(steps, funnel, made.ends, kept=kept)
         if not shown.unproved:
             return Found(made.setting, funnel, shown, wanted.margin)
         left = np.isin(intervals, [part.interval for part in shown.unproved])
@@ -187,8 +184,6 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
             float(policy.t[int(np.flatnonzero(left)[-1])]),
             left,
         )
-        if last:
-            break
         kept, times = shown, np.where(left, LARGER * times, times)
         again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
     raise refusal
