@@ -183,7 +183,8 @@ def config_of(folder: Path, given: Path | None) -> Path:
     path = given or folder / CONFIG
     if given is None and not path.is_file():
         raise DataError(
-            f"there is no {path}: `nlsid init {folder} BAG...` writes one, or give --config"
+            f"there is no {path}: `nlsid init DIR BAG...` writes one, or give --config. A design's "
+            "folder stands before the bags"
         )
     return path
 

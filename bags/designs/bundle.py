@@ -61,7 +61,9 @@ class Bundle:
                 inner = _beside(folder, contents[stage])
                 contents |= {f"{stage}.{role}": content for role, content in inner.items()}
         if not composed and contents.get("funnel") != named:
-            raise CertificateMismatch(f"{designs.PROOF} beside {funnel} is not about this funnel")
+            raise CertificateMismatch(
+                f"{designs.PROOF} beside {funnel} is not about it: give the design's folder"
+            )
         bundle = cls(contents)
         _refuse_size(bundle.text())
         return bundle

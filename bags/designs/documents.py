@@ -49,6 +49,8 @@ def funnel_of(folder: Path) -> Path:
     for name in (designs.COMPOSITION, FUNNEL):
         if (folder / name).is_file():
             return folder / name
+    if folder.is_file():
+        raise DocumentError(f"{folder} is a file: give the design's folder, {folder.parent}")
     raise DocumentError(
         f"{folder} has no {FUNNEL}: `nlsid funnel {folder}` writes it. A design's folder stands "
         "before the bags"

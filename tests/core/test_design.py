@@ -151,7 +151,7 @@ def test_a_proof_of_something_else_is_no_design(
 ) -> None:
     tube.save(tmp_path)
     files.write_document(tmp_path / PROOF, fit.proof.document(fit.model, MODEL))
-    with pytest.raises(CertificateMismatch, match="is not about this funnel"):
+    with pytest.raises(CertificateMismatch, match="is not about it: give the design's folder"):
         load(tmp_path)
 
 

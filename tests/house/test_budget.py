@@ -13,7 +13,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_102,
-    ("bags",): 11_917,
+    ("bags",): 11_919,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_283,
     ("benchmarks", "examples"): 3_797,
