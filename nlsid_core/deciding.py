@@ -6,8 +6,8 @@ the operating system, and it starts in a tenth of a second.
 
 A proof that this machine has decided is remembered, by the digest of its bytes and of the kernel's
 own sources, with the digests of all files that were read for it: what is remembered is what would
-be decided again. The folder is the user's own, of mode 0700; what another user could have written
-is ignored.
+be decided again. Nothing is remembered where the sources change meanwhile. The folder is the user's
+own, of mode 0700; what another user could have written is ignored.
 """
 
 import contextlib
@@ -23,7 +23,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,6 +61,7 @@ class Deciding:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         with _own_errors():
             self._proof = read_regular(proof)
+        self._key = _entry(self._proof)
         self._found = _recalled(self._proof, proof.parent) if remembered else None
         self.before = self._found is not None
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - until close
@@ -69,7 +69,7 @@ class Deciding:
         self._process: subprocess.Popen[bytes] | None = None
         if not self.before:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", str(KERNEL), *options, str(proof.resolve())],
+                [sys.executable, "-I", str(KERNEL), *options, str(proof.absolute())],
                 stdin=subprocess.DEVNULL,
                 stdout=self._answer,
                 stderr=subprocess.DEVNULL,
@@ -109,7 +109,8 @@ class Deciding:
         if status is None or not content:
             raise CertificateRejected(self._why(status))
         self._found = _verdict(json.loads(content))
-        _remember(self._proof, self._found)
+        if _entry(self._proof) == self._key:  # else another kernel may have answered
+            _remember(self._key, self._found)
         return self._found
 
     def wait(self) -> Verdict:
@@ -172,7 +173,6 @@ def _own_errors() -> Iterator[None]:
         raise as_ours(str(refusal), refusal.reason) from refusal
 
 
-@cache
 def _sources() -> bytes:
     """The kernel's own sources, by which its decisions are known."""
     found = hashlib.sha256()
@@ -221,7 +221,7 @@ def _recalled(proof: bytes, folder: Path) -> Verdict | None:
     return verdict if same and verdict.digests.get("proof") == digest(proof) else None
 
 
-def _remember(proof: bytes, verdict: Verdict) -> None:
+def _remember(key: str, verdict: Verdict) -> None:
     known = _cache()
     if known is None:
         return
@@ -230,4 +230,4 @@ def _remember(proof: bytes, verdict: Verdict) -> None:
         handle, name = tempfile.mkstemp(dir=known)  # of mode 0600
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
-        Path(name).replace(known / _entry(proof))
+        Path(name).replace(known / key)

@@ -156,7 +156,7 @@ def _structures(
 
 
 def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
-    """The best with more or fewer lags, higher degrees, and by more or fewer steps."""
+    """The best with more or fewer lags, higher degrees or knots, and equations by one step."""
     best = least(rows)
     if best is None:
         return
@@ -176,7 +176,7 @@ def nearby(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         yield from (one, two)
         if rows[-1].percent < rows[-2].percent:
             yield three
-    if isinstance(method := attempt.method, Rse | Sem):
+    if isinstance(made, Polynomial) and isinstance(method := attempt.method, Rse | Sem):
         yield replace(attempt, method=replace(method, iterations=1))
 
 

@@ -59,12 +59,15 @@ def answer(path: str) -> dict[str, Any]:
     """
     try:
         verdict = _kernel.check(path)
+        return {**vars(verdict), "margin": verdict.short_margin, "said": str(verdict)}
     except OSError as error:
         return {"unread": error.strerror, "said": f"cannot be read: {error.strerror}"}
     except _kernel.Rejected as refusal:
         said = f"REJECTED {refusal} [{refusal.reason}]"
         return {"rejected": str(refusal), "reason": refusal.reason, "said": said}
-    return {**vars(verdict), "margin": str(verdict.margin), "said": str(verdict)}
+    except MemoryError:
+        much = "reading it takes too much memory"
+        return {"rejected": much, "reason": "too_large", "said": f"REJECTED {much} [too_large]"}
 
 
 def main(given: list[str]) -> int:

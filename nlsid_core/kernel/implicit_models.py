@@ -30,6 +30,8 @@ def read_implicit(node: Node) -> Implicit:
         {
             "monotonicity and period should be positive": positive,
             "there should be an equation, and no more than states": 0 < k <= n,
+            "two states have the same name": len(set(given["states"])) == n,
+            "two inputs have the same name": len(set(given["inputs"])) == m,
             "a shift gives the states without an equation": bool(given["shift"]) == (k < n),
         }
     )

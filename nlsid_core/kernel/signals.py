@@ -11,11 +11,16 @@ from .files import Node, refuse_if
 MAX_SIGNALS = 50
 
 # No `speed/1000` and no `speed*1000`: they would be read as other quantities.
-_NAME = re.compile(r"(?!e[-+0-9])[A-Za-z_/%°µ](?:(?<![/-])[0-9.]|[A-Za-z_/()\[\]%°µ-])*", re.ASCII)
+_NAME = re.compile(
+    r"(?!e[-+0-9]|(?i:inf|infinity|nan|pi)$)"
+    r"[A-Za-z_/%°µ](?:(?<![/-])[0-9.]|[A-Za-z_/()\[\]%°µ-])*",
+    re.ASCII,
+)
 
 # Digits in exponents only: "0.2 m/1000" would be another number, and so would "0.2 sqrt(g)" be.
 _UNIT = re.compile(
-    r"(?![eE][-+^0-9]|.*sqrt)(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
+    r"(?![eE][-+^0-9]|.*sqrt|(?i:inf|infinity|nan|pi)$)(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*",
+    re.ASCII,
 )
 
 
@@ -41,7 +46,8 @@ def name_label(name: str) -> str:
 
 def unit_label(unit: str) -> str:
     """A unit behind a number: as it is if it cannot change how the number is read, else quoted."""
-    return unit if not unit or _UNIT.fullmatch(unit) else json.dumps(unit)
+    closed = set("()").isdisjoint(re.sub(r"\([^()]*\)", "", unit))
+    return unit if not unit or (closed and _UNIT.fullmatch(unit)) else json.dumps(unit)
 
 
 def read_signal(node: Node) -> Signal:

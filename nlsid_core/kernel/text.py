@@ -14,6 +14,7 @@ from string import Formatter
 from typing import Any
 
 DIGITS = 4  # significant, of a number that is rounded
+LONGEST = 10_000  # bits of a fraction that is printed whole
 SHORT = 6  # significant digits of a number that is not
 # Not the context of whoever calls, which may round.
 EXACT = Context(prec=60, Emax=MAX_EMAX, Emin=MIN_EMIN)
@@ -35,6 +36,12 @@ class Verdict:
     digests: dict[str, str]
     kind: str = ""
     files: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def short_margin(self) -> str:
+        """The margin as p/q, or rounded down where that is longer than Python would read."""
+        longest = max(self.margin.numerator.bit_length(), self.margin.denominator.bit_length())
+        return str(self.margin) if longest < LONGEST else below(self.margin)
 
     def __str__(self) -> str:
         lines = [f"PROVED {self.statement}, margin {below(self.margin)}"]

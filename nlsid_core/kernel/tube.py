@@ -288,7 +288,7 @@ def _energy(model: Model, tube: Members) -> str:
         samples=samples,
         rho=tube["rho"],
         g=" g" if follows else "",
-        sum=f", g = {formula(follows, model.u)}" if follows else "",
+        sum=f", g = {formula(follows, apart(model.u, model.y))}" if follows else "",
     )
     peaks = (
         text.say(PEAK, name=signal.name, peak=signal.quantity(text.below(peak)))

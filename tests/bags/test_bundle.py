@@ -1,6 +1,8 @@
 """Bundles of a design: what is true is decided as from its files, everything else is refused."""
 
 import json
+import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 from bags.designs import bundle as bundles
 from bags.designs import documents
 from bags.designs.bundle import Bundle, Check
-from nlsid_core import files
+from nlsid_core import deciding, files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.proofs import check
@@ -136,6 +138,37 @@ def test_what_was_decided_is_remembered_and_no_other_user_can_write_it(
         answer = decide(bundle.text())
         assert (answer["before"], "all is well" in answer["proved"]) == (False, False)
         entry.chmod(0o600)
+
+
+def test_nothing_is_remembered_where_the_kernel_changed_meanwhile(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The process that decides reads the sources of its own time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(deciding, "KERNEL", shutil.copytree(deciding.KERNEL, tmp_path / "kernel"))
+    source = tmp_path / "kernel" / "text.py"
+    before = source.read_text()
+    check = Check(bundle.text())
+    source.write_text(before + "# another one\n")
+    while (answer := check.poll()) is None:
+        time.sleep(0.01)
+    check.close()
+    assert "proved" in answer
+    assert not decide(bundle.text())["before"]
+    source.write_text(before)
+    assert not decide(bundle.text())["before"]
+
+
+def test_a_linked_proof_is_about_the_files_beside_the_link(funnel: Path, tmp_path: Path) -> None:
+    for path in funnel.parent.glob("*.json"):
+        if path.name != documents.FUNNEL_PROOF:
+            shutil.copy(path, tmp_path)
+    (tmp_path / documents.FUNNEL_PROOF).symlink_to(funnel.with_name(documents.FUNNEL_PROOF))
+    assert check(tmp_path / documents.FUNNEL_PROOF).statement
+    tampered = tmp_path / documents.FUNNEL
+    tampered.write_text(with_digit_changed(tampered.read_text()))
+    with pytest.raises(CertificateMismatch):
+        check(tmp_path / documents.FUNNEL_PROOF)
 
 
 def test_a_check_can_be_called_off(bundle: Bundle) -> None:

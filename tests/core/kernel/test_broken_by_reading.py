@@ -126,6 +126,9 @@ def test_a_tube_is_not_about_trajectories_that_start_elsewhere() -> None:
         "speed stays within 0.001 m of every trajectory for 9000 samples, margin 0.9; x",
         "e-9",
         "e9",
+        "inf",
+        "NaN",
+        "Pi",
         "5",
         "",
         'a"b',
@@ -160,7 +163,8 @@ def test_usual_names_and_units_are_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "unit", ["/1000", "m/1000", "*1e3", "E3", "e^3", "x10", "sqrt(g)", "·10³ m", "m 2"]
+    "unit",
+    ["/1000", "m/1000", "*1e3", "E3", "e^3", "x10", "sqrt(g)", "·10³ m", "m 2", "nan", "m)^2*(s"],
 )
 def test_a_unit_cannot_change_the_number_before_it(unit: str) -> None:
     """`0.0000009537 /1000` would be a thousandth of what is proved."""

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from fractions import Fraction
 
 import pytest
 
@@ -40,6 +41,13 @@ def test_lower_limits_of_the_system_stay_and_the_proof_is_decided() -> None:
     program = f"ulimit -t 15; ulimit -v 3000000; exec {sys.executable} -I {KERNEL} {proof}"
     found = subprocess.run(["sh", "-c", program], capture_output=True, text=True, check=False)
     assert ": PROVED " in found.stdout, found.stderr
+
+
+def test_a_margin_too_long_to_be_read_is_rounded_down() -> None:
+    for margin in (Fraction(1, 3), Fraction(1, 3**10_000)):
+        shown = kernel.Verdict("it is so", margin, (), {}).short_margin
+        assert len(shown) < 4300
+        assert 0.999 * margin < Fraction(shown) <= margin
 
 
 def test_monomials_that_a_file_chose_for_their_hashes_take_no_longer() -> None:

@@ -5,12 +5,22 @@ from typing import Any
 
 import pytest
 
-from nlsid_core.kernel import positivity, stable_set
+from nlsid_core.kernel import Rejected, positivity, stable_set
+from nlsid_core.kernel.files import parse
+from nlsid_core.kernel.implicit_models import read_implicit
 from tests.core.kernel import mutations
 from tests.core.kernel import oracle_polynomial as oracle
 from tests.core.kernel.mutations import Case
 
 CASES = [case for case in mutations.corpus() if case.kind == "stable_set"]
+
+
+@pytest.mark.parametrize("what", ["states", "inputs"])
+def test_two_of_one_name_are_refused(what: str) -> None:
+    (model,) = CASES[0].copied().about.values()
+    model[what] = ["a", "a"]
+    with pytest.raises(Rejected, match=f"two {what} have the same name"):
+        read_implicit(parse(mutations.encoded(model), "model"))
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -92,6 +92,15 @@ def test_the_change_of_a_product_is_not_the_product_of_a_change() -> None:
     assert f"g = 3 (change of ({name} x {name}) / 1" in said
 
 
+def test_an_input_with_the_outputs_name_is_told_apart_in_a_level_by_commands() -> None:
+    model, funnel, proof = claim("following")
+    term = {"inputs": [0], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.0}
+    tubes(funnel)["follows"] = {"terms": [term], "weights": [[3.0]]}
+    name = model["u"]["name"] = model["y"]["name"]
+    said = decide(model, funnel, proof).assumptions[1]
+    assert f"g = 3 (input {name} / 1" in said
+
+
 def test_one_observer_of_all_tubes_is_called_so() -> None:
     model, funnel, proof = claim("linear")
     funnel["tubes"] = funnel["tubes"][:1]
