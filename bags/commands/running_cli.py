@@ -61,9 +61,16 @@ def monitor(
     from bags.monitoring.replay import to_judge
     from bags.pictures.report import drawable, write_margins
     from bags.recordings.folders import expand_bags
+    from nlsid_core.dynamics import VectorField
+    from nlsid_core.errors import DataError
 
     settings = settings_if_any(folder, config)
     design = documents.load(folder, wiring=wired.wiring())
+    if design.wiring is not None and not isinstance(design.model, VectorField):
+        raise DataError(
+            "-y, -u and --period are for designs of equations; this one reads the topics that it "
+            "was identified with: `nlsid bag convert BAG... --out NEW --rename OLD=NEW`"
+        )
     folders = expand_bags(bags)
     if settings is not None and not judging.every:
         chosen = to_judge(design, folders)

@@ -40,7 +40,10 @@ class Workers:
             return _dask(self.scheduler)
         if self.count:
             spawn = multiprocessing.get_context("spawn")  # obstore's threads do not live in a fork
-            return ProcessPoolExecutor(self.count, mp_context=spawn, initializer=_end_with_parent)
+            pool = ProcessPoolExecutor(self.count, mp_context=spawn, initializer=_end_with_parent)
+            for _ in range(self.count):  # all begin now: none while the pool ends for a dead one
+                pool.submit(os.getpid)
+            return pool
         return _Here()
 
     def close(self, executor: Executor) -> None:

@@ -149,7 +149,7 @@ class Dataset:
 
     @classmethod
     def from_pandas(
-        cls, frames: Mapping[str, Any] | Any, *, y: Sequence[str], u: Sequence[str]
+        cls, frames: Mapping[str, Any] | Any, *, y: Sequence[str] | str, u: Sequence[str] | str
     ) -> "Dataset":
         """Make a dataset of pandas DataFrames, one a trial, on one grid of time.
 
@@ -163,13 +163,19 @@ class Dataset:
             The dataset; its signals are called as the columns.
 
         Raises:
-            DataError: on NaN, where a column is missing, and where the rows are not equally far
-                apart in time.
+            DataError: on NaN, where a column is missing, where the index only counts the rows, and
+                where they are not equally far apart in time.
         """
         trials = []
+        y, u = ((one,) if isinstance(one, str) else one for one in (y, u))
         for name, table in (frames if isinstance(frames, Mapping) else {"data": frames}).items():
             if missing := [str(column) for column in (*y, *u) if column not in table]:
                 raise DataError(f"{name}: no column {missing[0]}; there are {list(table.columns)}")
+            if table.index.name is None and type(table.index).__name__ == "RangeIndex":
+                raise DataError(
+                    f"{name}: the index only counts the rows; let it be the time, such as "
+                    "table.set_index('t')"
+                )
             t = table.index.to_numpy()
             if t.dtype.kind == "M":
                 t = (t - t[0]) / np.timedelta64(1, "s")

@@ -19,7 +19,8 @@ from nlsid_core.running.forecast import linear_form
 from nlsid_core.running.tubes import Limits
 
 MOST_ORDER, MOST_TUBES = 32, 4  # as in nlsid_monitor.h
-_PLAIN = re.compile(r"[^|*]*(\|hold\([^|]*\))?")  # where a number is, and for how long it is held
+# Where a number is, by which clock its times are, and for how long it is held.
+_PLAIN = re.compile(r"[^|*]*(\|(clock|hold)\([^|]*\))*")
 
 
 def write_table(design: AnyDesign, path: Path) -> Verdict:

@@ -115,6 +115,8 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     y[:, 0] = 0.01 * np.random.default_rng(0).standard_normal(300)
     gap = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gap")
     bag = write_joint_bag(tmp_path, gap)
+    other = nlsid("monitor", linear_funnel.parent, bag, "-y", "/a:x", "-u", "/b:x", status=None)
+    assert "--rename OLD=NEW" in other
     said = nlsid("monitor", linear_funnel.parent, bag, status=2)
     lost = "3 samples from 1.000 to 1.020 s: 3 samples are missing"
     assert f"gap: not judged: {lost}\n" in said

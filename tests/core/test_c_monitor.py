@@ -99,3 +99,13 @@ def test_other_designs_have_no_table_and_it_says_why(name: str) -> None:
 def test_a_name_cannot_end_the_comment(made: OutputTubeDesign) -> None:
     model = replace(made.model, y=replace(made.model.y, name="*/ int evil; /*"))
     assert c_table(model, made.funnel).split("\n")[0].count("*/") == 1
+
+
+def test_a_clock_and_a_hold_change_no_number_and_other_operations_do(
+    made: OutputTubeDesign,
+) -> None:
+    y = replace(made.model.y, path="/y:data|clock(log)|hold(0.1 s)")
+    assert "nlsid_table" in c_table(replace(made.model, y=y), made.funnel)
+    y = replace(y, path="/y:data|derivative(0.1 s)")
+    with pytest.raises(DataError, match="these have operations: /y:data"):
+        c_table(replace(made.model, y=y), made.funnel)

@@ -31,7 +31,7 @@ def test_data_frames_are_trials(train: Dataset) -> None:
         )
         for trial in train
     }
-    made = Dataset.from_pandas(tables, y=["speed"], u=["command"])
+    made = Dataset.from_pandas(tables, y="speed", u=["command"])
     assert made.names == train.names
     for one, other in zip(made, train, strict=True):
         np.testing.assert_array_equal(np.hstack([one.y, one.u]), np.hstack([other.y, other.u]))
@@ -39,6 +39,8 @@ def test_data_frames_are_trials(train: Dataset) -> None:
         identify(tables["run_0"], Polynomial(2))
     with pytest.raises(DataError, match=r"run_0: no column effort; there are \['speed'"):
         Dataset.from_pandas(tables, y=["speed"], u=["effort"])
+    with pytest.raises(DataError, match=r"data: the index only counts the rows.*set_index"):
+        Dataset.from_pandas(tables["run_0"].reset_index(drop=True), y="speed", u="command")
 
 
 def test_a_trials_own_columns_are_simulated(train: Dataset, fit: Fit[DifferenceEquation]) -> None:

@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_110,
-    ("bags",): 11_919,
+    ("nlsid_core",): 18_113,
+    ("bags",): 11_926,
     ("nlsid_ros",): 2_662,
-    ("tests",): 22_329,
+    ("tests",): 22_339,
     ("benchmarks", "examples"): 3_797,
 }
 ARGUMENTS, FIELDS = 6, 8
