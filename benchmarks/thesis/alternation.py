@@ -28,6 +28,7 @@ HIGHEST_DECAY = 40  # of the exponential start
 STOP = 0.025  # thesis: growth of the volume below which the alternation has converged
 RADII = (0.5, 1.0, 1.5)  # what has degree 4 at most and vanishes on three spheres is zero
 DEGREE = 4  # of c in z
+CONSTANT = 0.95  # of an L-step's margin, that a V-step may ask for again
 
 
 def exponential_start(steps: LSteps, P: FloatArray) -> ContinuousFunnel:
@@ -98,8 +99,9 @@ def levels(
         growth = (funnel.rho[k + 1] - before) / h / present
         falls = _falls(steps, section_at(steps, funnel.P, k, float(end)), present)
         for found, row in zip(solutions, falls, strict=True):
-            parts = dict(enumerate(np.split(row, firsts))) | {0: row[:1] + growth}
-            mu = end_proof(steps.program, found, parts, 1.0, found.m + growth)[1]
+            kept = CONSTANT * (found.m + growth)
+            parts = dict(enumerate(np.split(row, firsts))) | {0: row[:1] + growth - kept}
+            mu = end_proof(steps.program, found, parts, 1.0, found.m + growth - kept)[1]
             constant, slope = row.copy(), np.zeros_like(row)
             for unit in np.eye(funnel.n, dtype=np.int64):
                 rows = _monomials(funnel.n, DEGREE - 2) + 2 * unit
@@ -131,10 +133,9 @@ def largest_level(constant: FloatArray, slope: FloatArray, n: int) -> float:
     """
     basis = _monomials(n, DEGREE // 2)
     i, j = conic.triangle(len(basis))
-    size = len(i)
-    home = positions(basis[i] + basis[j], _monomials(n, DEGREE))
-    weight = np.where(i == j, 1.0, conic.SQRT2)
-    gram = sp.csc_matrix((weight, (home, np.arange(size))), shape=(len(constant), size))
+    size, home = len(i), positions(basis[i] + basis[j], _monomials(n, DEGREE))
+    entries = np.where(i == j, 1.0, conic.SQRT2), (home, np.arange(size))
+    gram = sp.csc_matrix(entries, shape=(len(constant), size))
     A = sp.vstack(
         [
             sp.hstack([sp.csc_matrix(-slope[:, None]), gram]),
