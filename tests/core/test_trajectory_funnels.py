@@ -93,7 +93,7 @@ def test_alternation_ends_where_the_sweep_does() -> None:
     steps = LSteps(field, design.policy)
     start = exponential_start(steps, design.funnel.P)
     found = alternate_rho(steps, start, stop=0.002)
-    assert found.volumes[0] < found.volumes[-1]
+    assert found.volumes[0] < 0.8 * found.volumes[-1] < found.volumes[1]  # most in one step
     assert found.volumes[-1] == pytest.approx(design.funnel.volume_integral(), rel=0.01)
 
 
