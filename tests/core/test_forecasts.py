@@ -116,7 +116,7 @@ def test_no_output_that_keeps_the_assumption_leaves_its_forecast(name: str) -> N
 def test_no_output_of_thousands_leaves_its_forecast(name: str, peak: bool) -> None:
     model, funnel = alone(name, peak=peak)
     for kind in ("spent", "random", "sign"):
-        y, u = attack(model, funnel, kind, 500, seed=2)
+        y, u = attack(model, funnel, kind, 1500, seed=2)
         for k, forecast in forecasts(model, funnel, y, u):
             assert used(forecast, y[k + 1 :]).max(initial=0.0) <= 1.0
 

@@ -419,11 +419,11 @@ def test_no_innovation_that_keeps_the_assumption_leaves_the_tube(name: str, kind
 
 @pytest.mark.slow
 @EVERY
-def test_no_innovation_of_tens_of_thousands_leaves_the_tube(name: str) -> None:
+def test_no_innovation_of_a_hundred_thousand_leaves_the_tube(name: str) -> None:
     made = design(name)
     most = 0.0
     for kind in ("random", "sign", "held"):
-        most = max(most, float(attacks(made, 0, kind, samples=8_000, seed=7).max()))
+        most = max(most, float(attacks(made, 0, kind, samples=34_000, seed=7).max()))
     print(f"{name}: largest |o|/width {most:.3f}")
     assert 0.3 < most <= 1.0 + 1e-9
 
