@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from bags.designs.documents import load
+    from bags.monitoring.replay import replay
     from bags.pictures.notebook import plot, to_control
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
@@ -89,6 +90,7 @@ __all__ = [
     "plan_motion",
     "plot",
     "read_bags",
+    "replay",
     "standard_errors",
     "taylor_field",
     "to_control",
@@ -108,6 +110,7 @@ _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal
 _MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
 _HOMES: Final = {
     "bags.pictures.notebook": ("plot", "to_control"),
+    "bags.monitoring.replay": ("replay",),
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),

@@ -12,7 +12,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_113,
+    ("nlsid_core",): 18_102,
     ("bags",): 11_926,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_339,
