@@ -42,7 +42,7 @@ LOOK: Final = 0.01  # s between two looks at the process
 class Limits:
     """What a proof may take: s of processor time (a large one takes 3), MB of address space."""
 
-    seconds: int = 20
+    seconds: int = 15
     memory: int = 4096
 
 

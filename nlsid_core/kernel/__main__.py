@@ -23,7 +23,7 @@ if not __package__:  # run as a folder, by a Python that has no nlsid: be the pa
 else:
     from . import checking as _kernel
 
-SECONDS = 20  # of processor time for a proof; a large one takes 3
+SECONDS = 15  # of processor time for a proof; a large one takes 3
 MEMORY = 4096  # MB of address space
 AFTER = 5  # s that a proof has to end in when its time is up, before the system ends it
 
