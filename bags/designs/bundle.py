@@ -44,13 +44,16 @@ class Bundle:
     contents: Mapping[str, bytes]
 
     @classmethod
-    def load(cls, funnel: Path | str) -> "Bundle":
-        """The files of the proof beside `funnel`; of a composition's proof, those of its stages.
+    def load(cls, path: Path | str) -> "Bundle":
+        """The files of the proof in a design's folder, or beside its funnel; of a composition's
+        proof, those of its stages.
 
         Raises CertificateMismatch if the proof is about another funnel, DocumentError if it is no
-        proof or the files are too large to be published; OS errors for the proof pass through.
+        proof, the folder has none or the files are too large to be published; OS errors for the
+        proof pass through.
         """
-        funnel = Path(funnel)
+        path = Path(path)
+        funnel = _funnel_of(path) if path.is_dir() else path
         folder = funnel.parent
         composed = funnel.name == designs.COMPOSITION
         named = funnel.read_bytes()
@@ -228,6 +231,17 @@ def _design(
     if wrong := of_funnel(model.document(), funnel.document()).wrong:
         raise CertificateRejected(f"what was measured contradicts the design: {'; '.join(wrong)}")
     return design
+
+
+def _funnel_of(folder: Path) -> Path:
+    """What is read of a design folder: a proof of several funnels, or its funnel."""
+    for name in (designs.COMPOSITION, designs.FUNNEL):
+        if (folder / name).is_file():
+            return folder / name
+    raise DocumentError(
+        f"{folder} has no {designs.FUNNEL}: `nlsid funnel {folder}` writes it. A design's folder "
+        "stands before the bags"
+    )
 
 
 def _beside(folder: Path, proof: bytes) -> dict[str, bytes]:
