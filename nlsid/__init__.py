@@ -24,7 +24,6 @@ if TYPE_CHECKING:
         SampledTracking,
         design,
         integrate_nominal,
-        nominal_through,
         plan_motion,
     )
     from nlsid_core.designs import Design
@@ -86,7 +85,6 @@ __all__ = [
     "identify",
     "integrate_nominal",
     "load",
-    "nominal_through",
     "plan_motion",
     "plot",
     "read_bags",
@@ -107,7 +105,7 @@ _FAMILIES: Final = (
 )
 _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
-_MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
+_MOTIONS: Final = ("integrate_nominal", "plan_motion")
 _HOMES: Final = {
     "bags.pictures.notebook": ("plot", "to_control"),
     "bags.monitoring.replay": ("replay",),
