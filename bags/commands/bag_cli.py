@@ -37,6 +37,7 @@ bag_app = typer.Typer(
     name="bag",
     help="Look into recordings, check, repair and convert them.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",
 )
 out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
 

@@ -16,6 +16,7 @@ app = typer.Typer(
     name="nlsid",
     help="Learn how a robot answers its commands, prove it, and tell when it no longer does.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
 GROUPS = {

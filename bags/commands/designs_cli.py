@@ -156,12 +156,15 @@ def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path
     from bags.pictures import tables
     from nlsid_core import files
     from nlsid_core.design import design
-    from nlsid_core.designs import Wiring
 
     assert given.problem is not None
-    problem, push = load_problem(given.problem), None
-    if bags:
-        wiring = Wiring(tuple(wired.response or ()), tuple(wired.excitation or ()), wired.period)
+    problem, push, wiring = load_problem(given.problem), None, wired.wiring()
+    if bool(bags) != (wiring is not None):
+        raise DataError(
+            "how far the equations are off is measured in BAG..., with -y for the state and -u for "
+            "the inputs: give all three, or none"
+        )
+    if wiring is not None:
         field: Any = problem.dynamics
         push, broken = measured(
             field,

@@ -43,8 +43,9 @@ WHOLE = 34  # letters of a name that is not broken
 
 fleet_app = typer.Typer(
     name="fleet",
-    help="Many bags at once, on this machine or in object storage: are they fit, are they inside.",
+    help="Check and monitor many bags at once, on this machine or in object storage.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",
 )
 
 

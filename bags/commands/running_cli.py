@@ -110,7 +110,7 @@ def run(
         ),
     ] = None,
 ) -> None:
-    """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
+    """Start the nodes of a workflow and end them together. It needs rclpy, but no ROS launch."""
     from bags.commands.launching import WORKFLOWS, launch_file, run_together
 
     _refuse_without_rclpy()

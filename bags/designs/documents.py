@@ -1,7 +1,7 @@
 """The files of one design folder, by name, and reading them back."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from bags.designs.bundle import Bundle
 from nlsid_core import designs, files
@@ -63,5 +63,4 @@ def load_stable_model(path: Path | str) -> StableModel:
     model = load_noun(path)
     if not isinstance(model, get_args(StableModel)):
         raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
-    found: StableModel = model
-    return found
+    return cast(StableModel, model)

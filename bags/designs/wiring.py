@@ -7,6 +7,7 @@ from bags.signals.message_reader import SignalVector
 from bags.signals.sampling import Sampler
 from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import BagError
 
 
 def wiring_of(
@@ -14,10 +15,15 @@ def wiring_of(
 ) -> Wiring | None:
     """Where the state and the inputs of a continuous funnel are, each `topic:field.path[index]`.
 
-    None if nothing was said. Raises BagError if one of them is not on one topic.
+    None if nothing was said. Raises BagError if one is missing, or is not on one topic.
     """
     if not (response or command):
         return None
+    if not (response and command):
+        raise BagError(
+            "give both, where the state is (-y, or the parameter response) and where the inputs "
+            "are (-u, or command): one of them is missing"
+        )
     wiring = Wiring(tuple(response or ()), tuple(command or ()), period)
     SignalVector.parse(wiring.response)
     SignalVector.parse(wiring.command)

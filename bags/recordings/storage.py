@@ -139,7 +139,9 @@ def open_file(path: Path, stack: ExitStack, lost: list[str], *, salvage: bool) -
         if start.startswith(magic):
             return stack.enter_context(closing(kind(path, salvage=salvage)))
     what = f"starts with {start[:8].hex(' ')}" if start else "is empty, or cut off"
-    raise BagError(f"it is no MCAP, SQLite or ROS 1 file: it {what}")
+    raise BagError(
+        f"it is no MCAP, SQLite or ROS 1 file: it {what}. `nlsid bag import` makes a bag of a table"
+    )
 
 
 def _unzipped(

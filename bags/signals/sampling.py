@@ -212,9 +212,8 @@ class Sampler:
 
     def measures(self, topic: str, data: bytes) -> bool:
         """Whether a message has any of its topic's signals; one of other transforms has none."""
-        if not all(self._signals[k].path.framed for k in self._on[topic]):
-            return True
-        return any(map(math.isfinite, self.numbers(topic, data).values()))
+        framed = all(self._signals[k].path.framed for k in self._on[topic])
+        return not framed or any(map(math.isfinite, self.numbers(topic, data).values()))
 
     def unknown(self, topic: str) -> dict[int, float]:
         """What `numbers` gives for a message that cannot be read: NaN of each of its signals."""

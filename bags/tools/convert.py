@@ -299,9 +299,8 @@ class _Parts:
         if self._into.storage != "mcap" or block.compression != self._compression:
             return False
         writer = self.at(block.start_ns)
-        if block.end_ns >= self._until_ns:
-            return False
-        return all(writer.add_copy(*self.sources[0, key]) == n for n, key in numbers.items())
+        copied = (writer.add_copy(*self.sources[0, key]) == n for n, key in numbers.items())
+        return block.end_ns < self._until_ns and all(copied)
 
     def _begin(self, log_ns: int) -> BagWriter:
         """Begin the next, with all that is no message."""

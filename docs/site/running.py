@@ -1,53 +1,66 @@
-"""Runs the blocks of a page and puts what they print below them.
+"""Runs the blocks of a page as a notebook, and puts what they print below them.
 
-A page that begins with the front matter `run: true` is executed from top to bottom in an empty
-folder of its own. ```sh blocks are run by bash, ```python blocks in one process that keeps its
-names, a ```yaml block whose first line is `# NAME.yaml` becomes that file. A block that fails
-stops the build with what it printed. A picture `![...](run/NAME.png)` is NAME.png of the folder.
-Pages stay plain Markdown: they can be read without having been run.
+A page that begins with the front matter `run: true` becomes a notebook, which is executed from top
+to bottom in an empty folder of its own. ```sh blocks are cells that bash runs, ```python blocks
+share their names, a ```yaml block whose first line is `# NAME.yaml` becomes that file. A block that
+fails stops the build with what it printed. A picture `![...](run/NAME.png)` is NAME.png of the
+folder. Pages stay plain Markdown: they can be read without having been run.
 """
 
-import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError, CellTimeoutError
 
 FRONT = re.compile(r"\A---\nrun: true\n---\n")
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```\n", re.DOTALL | re.MULTILINE)
 PICTURE = re.compile(r"(!\[[^\]]*\]\()run/([\w./-]+)\)")
-LIMIT = 900.0  # s for one block
+NAMED = re.compile(r"# ([\w-]+\.(?:yaml|py))\n")
+LIMIT = 900  # s for one block
 LONGEST = 90  # lines of output shown
 COLUMNS = 92
-
-_WORKER = """
-import json, sys, traceback
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
-
-names = {"__name__": "__main__"}
-for line in sys.stdin:
-    out, failed = StringIO(), False
-    with redirect_stdout(out), redirect_stderr(out):
-        try:
-            exec(compile(json.loads(line), "block", "exec"), names)
-        except BaseException:
-            traceback.print_exc()
-            failed = True
-    print(json.dumps([failed, out.getvalue()]), flush=True)
-"""
+V4: Any = nbformat.v4
+SHELL = "%%script bash -euo pipefail\n"
 
 
 class BlockError(Exception):
     """A block of a page that did not run."""
 
 
+def notebook(page: str) -> Any:
+    """The page as a notebook that has not been run: a cell for each passage and each block."""
+    cells, position = [], 0
+    for block in FENCE.finditer(page):
+        cells.append(V4.new_markdown_cell(page[position : block.start()].strip()))
+        cells.append(_cell(block[1], block[2]))
+        position = block.end()
+    cells.append(V4.new_markdown_cell(page[position:].strip()))
+    for cell in cells:
+        cell.source = PICTURE.sub(r"\1\2)", cell.source)
+    return V4.new_notebook(cells=[cell for cell in cells if cell.source])
+
+
+def _cell(language: str, code: str) -> Any:
+    name = NAMED.match(code)
+    if language == "python":
+        return V4.new_code_cell(code.rstrip())
+    if language == "sh":
+        return V4.new_code_cell(SHELL + code)
+    if name:
+        return V4.new_code_cell(f"%%writefile {name[1]}\n{code}")
+    return V4.new_markdown_cell(f"```{language}\n{code}```")
+
+
 def run_page(text: str, folder: Path, root: Path) -> str:
-    """The page with the output of every block below it.
+    """The page with the output of every block below it; the notebook is FOLDER/FOLDER.ipynb.
 
     folder: made empty, the blocks run in it. root: the checkout, first on Python's path. Raises
     BlockError.
@@ -55,44 +68,55 @@ def run_page(text: str, folder: Path, root: Path) -> str:
     if folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
-    page, done = FRONT.sub("", text), []
-    with _Python(folder, root) as python:
-        position = 0
-        for block in FENCE.finditer(page):
-            done.append(page[position : block.end()])
-            position = block.end()
-            language, code = block[1], block[2]
-            if language == "sh":
-                output = _shell(code, folder, root)
-            elif language == "python":
-                output = python.run(code)
-            else:
-                _write_named(code, folder)
-                continue
-            done.extend(_shown(output))
-        done.append(page[position:])
-    return "".join(done)
+    page = FRONT.sub("", text)
+    made = notebook(page)
+    client = NotebookClient(
+        made, timeout=LIMIT, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    )
+    try:
+        client.execute(env=_environment(root))
+    except (CellExecutionError, CellTimeoutError) as error:
+        raise BlockError(str(error)) from error
+    (folder / f"{folder.name}.ipynb").write_text(V4.writes(made))
+    outputs = (cell for cell in made.cells if cell.cell_type == "code")
+    done, position = [], 0
+    for block in FENCE.finditer(page):
+        done.append(page[position : block.end()])
+        position = block.end()
+        if block[1] in ("sh", "python"):
+            done.extend(_shown(_printed(next(outputs))))
+        elif NAMED.match(block[2]):
+            next(outputs)  # says only that it wrote the file
+    return "".join([*done, page[position:]])
+
+
+def _printed(cell: Any) -> str:
+    """What a cell wrote, its streams one after the other as they came, and its last value."""
+    return "".join(
+        output.get("text") or output.get("data", {}).get("text/plain", "") + "\n"
+        for output in cell.outputs
+    )
 
 
 def pictures(page: str, folder: Path, target: Path) -> str:
-    """The page with its pictures copied from the folder that it ran in to `target`, by its name."""
+    """The page with its pictures copied from the folder that it ran in to `target`, by its name.
+
+    The notebook is copied as well, with a link below the title.
+    """
 
     def placed(match: re.Match[str]) -> str:
         source = folder / match[2]
         if not source.is_file():
             raise BlockError(f"no block made the picture {match[2]}")
         name = f"{folder.name}-{match[2].replace('/', '-')}"
-        target.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target / name)
         return f"{match[1]}/{target.name}/{name})"
 
-    return PICTURE.sub(placed, page)
-
-
-def _write_named(code: str, folder: Path) -> None:
-    name = re.match(r"# ([\w-]+\.(?:yaml|py))\n", code)
-    if name:
-        (folder / name[1]).write_text(code)
+    target.mkdir(parents=True, exist_ok=True)
+    shutil.copy(folder / f"{folder.name}.ipynb", target)
+    link = f"{{download}}`This page as a notebook </{target.name}/{folder.name}.ipynb>`"
+    title, _, rest = PICTURE.sub(placed, page).lstrip().partition("\n")
+    return f"{title}\n\n{link}, executed as it stands here.\n{rest}"
 
 
 def _environment(root: Path) -> dict[str, str]:
@@ -105,65 +129,6 @@ def _environment(root: Path) -> dict[str, str]:
         "TERM": "dumb",
         "MPLBACKEND": "Agg",
     }
-
-
-def _shell(code: str, folder: Path, root: Path) -> str:
-    command = ["bash", "-euo", "pipefail", "-c", code]
-    try:
-        done = subprocess.run(
-            command,
-            cwd=folder,
-            env=_environment(root),
-            stdin=subprocess.DEVNULL,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=LIMIT,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise BlockError(f"after {LIMIT:g} s still running:\n{code}") from error
-    if done.returncode:
-        raise BlockError(f"status {done.returncode} from\n{code}\n{done.stdout}")
-    return done.stdout
-
-
-class _Python:
-    """A Python process that keeps its names from block to block."""
-
-    def __init__(self, folder: Path, root: Path) -> None:
-        self._folder, self._root = folder, root
-        self._process: subprocess.Popen[str] | None = None
-
-    def __enter__(self) -> "_Python":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-
-    def run(self, code: str) -> str:
-        if self._process is None:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _WORKER],
-                cwd=self._folder,
-                env=_environment(self._root),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(code) + "\n")
-        self._process.stdin.flush()
-        answer = self._process.stdout.readline()
-        if not answer:
-            raise BlockError(f"Python ended in\n{code}")
-        failed, output = json.loads(answer)
-        if failed:
-            raise BlockError(f"{output}\nfrom\n{code}")
-        return str(output)
 
 
 def _shown(output: str) -> Iterator[str]:
