@@ -194,7 +194,7 @@ class Design(Generic[D, P, F, S]):
 
     @property
     def digest(self) -> str:
-        """Of the funnel's document, or of a composition's proof: how an announcement names it.
+        """The digest of the funnel, or of a composition's proof, as an announcement names it.
 
         Without a funnel of the policy's.
         """

@@ -398,7 +398,7 @@ class FunnelMonitor(ManagedNode):
 
     @property
     def _judging(self) -> str:
-        """Of which funnel and run the verdicts are."""
+        """The funnel and the run that are judged."""
         assert self._watch is not None
         if not self.values.controller or self._watch.monitor.goes_on:
             return f"{self._digest} {UNANNOUNCED}"

@@ -119,6 +119,12 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> OutputTubeDesign:
     )
 
 
+@pytest.fixture(name="tube")
+def _tube(design: OutputTubeDesign) -> OutputTubeDesign:
+    """The same, by a name that is not the verb's."""
+    return design
+
+
 @pytest.fixture
 def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: OutputTubeDesign) -> Path:
     """Model, policy, funnel and both proofs as files, as the command line writes them."""

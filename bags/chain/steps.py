@@ -272,7 +272,7 @@ def check_split(names: Sequence[str], config: Config) -> None:
 
 
 def absent_from(names: Sequence[str], config: Config) -> list[str]:
-    """Of each use the names and patterns in the split that none of the trials has, as a reason."""
+    """Say which names and patterns of each use in the split none of the trials has."""
     reasons = []
     for use in USES:
         absent = [name for name in getattr(config.split, use) if not _of_bags(names, [name])]

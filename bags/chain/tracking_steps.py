@@ -76,7 +76,7 @@ def widest_start(made: TrackingDesign, runs: Dataset) -> float:
 
 
 def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
-    """By fault, how many of these runs' copies that have it break the proof's assumption."""
+    """Count by fault how many copies of these runs break the proof's assumption."""
     meter = DisturbanceMeter(made.funnel.S, made.funnel.A)
 
     def used(run: Trajectory) -> float:

@@ -92,8 +92,9 @@ class Bundle:
 
     @property
     def digest(self) -> str:
-        """Of the funnel's file, which names the model and the policy that it was made for; of a
-        composition's proof, which names its stages.
+        """The digest of the funnel's file, which names its model and its policy.
+
+        Of a composition it is that of the proof, which names the stages.
         """
         return files.digest(self.contents.get(PROOF if self._stages else "funnel", b""))
 

@@ -37,5 +37,5 @@ def washouts_of(signals: Sequence[Signal]) -> list[Fraction | None]:
 
 
 def displacement_half_width(half_width: float, span: Fraction, washout: Fraction) -> Fraction:
-    """Of the displacement over `span` s, in the unit of `half_width`, the largest meanwhile."""
+    """Bound the displacement over `span` s; half_width: the largest meanwhile, in its unit."""
     return Fraction(half_width) * (2 + span / washout)

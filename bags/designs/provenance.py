@@ -59,7 +59,7 @@ class Provenance:
 
 
 def of_proof(proof: Path) -> Provenance:
-    """Of the funnel of a proof that was decided; nothing where no bound was measured.
+    """Read it from a proof that was decided; nothing where no bound was measured.
 
     Raises DocumentError for what the kernel does not read and is not as its page says.
     """
@@ -78,7 +78,7 @@ def of_proof(proof: Path) -> Provenance:
 
 
 def of_funnel(model: Json, funnel: Json) -> Provenance:
-    """Of a funnel's document and that of its model."""
+    """Read it from a funnel's document and that of its model."""
     fitted = model.get("bags")
     found = []
     if funnel["kind"] == "sampled":

@@ -35,7 +35,7 @@ NAMED = re.compile(r"\[name=([^\]]+)\]")  # an element of a message that is foun
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Of one signal: path, the most at any sample of the claim; goal, the most at its last sample.
+    """Tolerances of one signal: path, the most at any sample of the claim; goal, at its last.
 
     Both in the signal's unit, as decimal numbers rounded up. Raises DataError if one is 0, which
     readers of these files take for "not checked".
@@ -161,7 +161,7 @@ class Tolerances:
 
 
 def tolerances(folder: Path | str) -> Tolerances:
-    """Of the design in a folder, its proof checked.
+    """Read them from the design in a folder, its proof checked.
 
     Raises CertificateRejected if nothing is proved, DataError if its claim bounds no signal.
     """

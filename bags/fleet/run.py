@@ -38,7 +38,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Of one bag: content, or the reason why there is none.
+    """The answer for one bag: content, or the reason why there is none.
 
     was_read: the reason is what the bag holds, not that it cannot be read. kept: it was in the
     manifest. requests, fetched (bytes): what reading it took.

@@ -120,7 +120,7 @@ OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _
 
 @dataclass(frozen=True)
 class Breaking:
-    """By fault, in how many of so many trials a copy with it breaks what a proof assumes."""
+    """Counts by fault: in how many of the trials a copy with it breaks the assumption."""
 
     trials: int
     counts: dict[str, int]
@@ -203,7 +203,7 @@ class Width:
 
     @property
     def part(self) -> str:
-        """Of which part of the range the half-width is, rounded up, and the range."""
+        """The half-width as a part of the range, rounded up, and the range."""
         return f"{_up(self.share)} of its range, {self.range:.3g} {self.unit}".strip()
 
     @property

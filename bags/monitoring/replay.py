@@ -155,7 +155,7 @@ class Replay:
 
     @property
     def starting(self) -> int:
-        """Of how many samples the run's start is made."""
+        """How many samples make the run's start."""
         return sum(1 for _ in takewhile(lambda reading: reading.waits, self.readings))
 
     @property

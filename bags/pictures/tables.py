@@ -150,7 +150,7 @@ def say_catching(console: Console, catching: Catching) -> None:
 
 
 def breaking_table(found: Breaking) -> Table:
-    """By fault, how many of the copies that have it break what a proof assumes."""
+    """List by fault how many copies of trials break the assumption of a proof."""
     table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
     table.add_column("fault")
     table.add_column("broken", justify="right")

@@ -108,7 +108,7 @@ def draw_free_run(model: StateModel, validation: Dataset) -> Figure:
 
 
 def _band(design: AnyDesign) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of one stage: times in s, the motion (N, n) and the half-widths (N, n) at them."""
+    """Times of one stage in s, the motion (N, n) and the half-widths (N, n) at them."""
     policy, funnel = design.policy, design.funnel
     if isinstance(funnel, ContinuousFunnel):
         t = np.linspace(funnel.t0, funnel.tf, TIMES)

@@ -138,7 +138,7 @@ def data_files(folder: Path) -> tuple[Path, ...]:
 
 
 def without_twins(files: Iterable[Path]) -> list[Path]:
-    """Of a file that lies there compressed and unpacked, only the first of both."""
+    """Leave out a file where it lies there under another name, compressed or unpacked."""
     found: dict[str, Path] = {}
     for file in files:
         found.setdefault(file.name.removesuffix(COMPRESSED), file)

@@ -299,7 +299,7 @@ def _rate(stamps: IntArray) -> float:
 
 
 def _role(text: str, msgtype: str) -> tuple[float, str]:
-    """By which share a number drives, as its type and its names say, and the words for it."""
+    """How likely a number drives, as its type and its names say, and the words for it."""
     topic, _, field = text.lower().partition(":")
     share, why = 0.5, []
     if msgtype in COMMANDS:
@@ -377,7 +377,7 @@ def _delay(
 
 
 def _position_unit(unit: str) -> str:
-    """Of the position whose unit, or whose rate's unit, this is."""
+    """The unit of the position whose unit, or whose rate's unit, this is."""
     return " or ".join(part.removesuffix("/s") for part in unit.split(" or "))
 
 

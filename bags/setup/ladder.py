@@ -86,7 +86,7 @@ Stage = Callable[[Dataset, Sequence[Row]], Iterator[Attempt]]  # of the rows tha
 
 
 def linear(data: Dataset, _rows: Sequence[Row]) -> Iterator[Attempt]:
-    """By least squares."""
+    """Try linear models by least squares."""
     for made in _linear_of(data, LAGS if signals_of(data) == (1, 1) else FEW_LAGS):
         yield Attempt(made, LeastSquares())
 
@@ -190,7 +190,7 @@ def memories(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
 
 
 def _lags(row: Row) -> int:
-    """Of an equation; 0 of a network."""
+    """The lags of an equation; 0 of a network."""
     made = row.attempt.model_class
     return made.lags if isinstance(made, Polynomial) else 0
 

@@ -203,7 +203,7 @@ class _Growing:
             self._values[row, here] = part.values[name]
 
     def columns(self) -> Columns:
-        """By log time; the sort is stable, so equal log times stay as recorded."""
+        """Sort by log time; the sort is stable, so equal log times stay as recorded."""
         times, values = self._times[:, : self._length], self._values[:, : self._length]
         if (np.diff(times[0]) < 0).any():
             order = np.argsort(times[0], kind="stable")

@@ -400,7 +400,7 @@ def restarts_in(trial: Trajectory) -> int:
 
 
 def said_restarts(dataset: Dataset) -> list[str]:
-    """Of each trial that a monitor would not judge as one run: that, and what to do."""
+    """Name each trial that a monitor would not judge as one run, and say what to do."""
     return [
         f"{trial.name}: its stamps stray from a grid of {trial.period:g} s, so that a monitor "
         f"begins {count} new runs in it and judges it in pieces or not at all; {ON_A_GRID}"

@@ -202,7 +202,7 @@ class Recording:
         return values
 
     def summary(self, most: int) -> dict[str, str]:
-        """Of all topics together, and then a line each of the `most` that lose most, in words."""
+        """Sum up all topics, and then give a line to each of the `most` that lose most."""
         counts = self.counts()
         lost = {topic: self._lost_on(topic) for topic in self._lost}
         values = {

@@ -11,7 +11,7 @@ from nlsid_core.running.reading import Reading
 
 
 def signal_names(design: AnyDesign) -> tuple[str, ...]:
-    """Of the measured signals, with their units."""
+    """Names of the measured signals, with their units."""
     return tuple(f"{s.name} [{s.unit}]" if s.unit else s.name for s in design.signals[0])
 
 
@@ -33,7 +33,7 @@ class HalfWidths:
         self._rows = [tuple(map(float, row)) for row in rows]
 
     def of(self, reading: Reading) -> dict[str, float]:
-        """By name, at a reading; of several signals with their index."""
+        """Numbers by name, at a reading; of several signals with their index."""
         place = min(max(round(reading.t / self._period), 0), len(self._rows) - 1)
         row = tuple(reading.half_widths) or self._rows[place]
         if len(row) == 1:

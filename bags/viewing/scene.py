@@ -132,7 +132,7 @@ class Scene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the measured signals, with units, as far as the monitor told them."""
+        """Names of the measured signals, with units, as far as the monitor told them."""
         with self._lock:
             return self._names
 

@@ -43,7 +43,7 @@ class Form:
 
     @classmethod
     def of(cls, model: StableModel, bounds: Json | None, K: FloatArray | None = None) -> "Form":
-        """Of a model, perhaps on the box `bounds` {y, u}, perhaps with a policy's K (n,).
+        """Read a model's form, perhaps on the box `bounds` {y, u}, perhaps with a policy's K (n,).
 
         Raises Infeasible if no storage proves that it forgets its start.
         """

@@ -465,7 +465,7 @@ def _best(
         return scale * float(np.sqrt(ahead + began)), scale * float(np.sqrt(ever + began))
 
     def ordered(found: list[tuple[float, float, Any]]) -> list[Any]:
-        """By the lasting width where the forecast is near the narrowest, then by the forecast."""
+        """Sort by the lasting width where the forecast is near the narrowest, else by forecast."""
         enough = near * min((ahead for ahead, _, _ in found), default=0.0)
         keys = [(0.0, ever) if ahead <= enough else (ahead, 0.0) for ahead, ever, _ in found]
         return [found[k][2] for k in sorted(range(len(found)), key=keys.__getitem__)]

@@ -107,7 +107,7 @@ class Rates:
 
     @cached_property
     def plan(self) -> Plan:
-        """Of the values of the exact rates, 0 in the place of the others."""
+        """The plan for values of the exact rates, with 0 in the place of the others."""
         names = ("t", *variable_names(self.n, self.m, len(self.uncertain)))
         none = constant(0.0, names=names)
         return Plan.of([none if p is None else p for p in self.exact], names)

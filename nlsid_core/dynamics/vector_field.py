@@ -313,9 +313,8 @@ class VectorField:
 
     @cached_property
     def _slopes(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
-        """Of every derivative of a monomial by an entry of (x, u): its factor, which monomial it is
-
-        of, its exponents, and (derivatives, n + m) 1 at the entry.
+        """For every derivative of a monomial by an entry of (x, u): its factor, the monomial, its
+        exponents, and (derivatives, n + m) 1 at the entry.
         """
         exponents, _ = self.coefficients
         within = exponents[:, 1 : 1 + self.n + self.m]
@@ -374,7 +373,7 @@ class Plan:
 
     @classmethod
     def of(cls, equations: Sequence[Polynomial], names: Sequence[str]) -> "Plan":
-        """Of n polynomials in the variables `names`."""
+        """Make the plan for n polynomials in the variables `names`."""
         exponents, table = _table(equations, names)
         size = exponents.shape[1]
         known = {(0,) * size: 0}

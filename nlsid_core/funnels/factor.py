@@ -65,7 +65,7 @@ def factor_of(P: FloatArray) -> FloatArray:
 
 
 def rounding_of(F: FloatArray, what: str) -> FloatArray:
-    """By how much of itself |F (x - y)|, in float64, can be below the true value: (...).
+    """Which part of itself |F (x - y)|, in float64, can be below the true value: (...).
 
     F: (..., n, n), x and y float64. Source: N. Higham, Accuracy and Stability of Numerical
     Algorithms, (3.11): |fl(F x) - F x| ≤ γ_n |F||x|, and |F||x| ≤ |F||F⁻¹| |F x|.

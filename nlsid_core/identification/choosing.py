@@ -86,7 +86,7 @@ class Row:
 
     @property
     def judged(self) -> FloatArray:
-        """By what attempts are compared: errors, and what the data leave open."""
+        """How attempts are compared: errors, and what the data leave open."""
         return self.errors + self.apart
 
     @property
@@ -96,7 +96,7 @@ class Row:
 
     @property
     def rate(self) -> float:
-        """Of the slowest proof."""
+        """The slowest rate that is proved."""
         return max(fit.proof.rate for fit in self.fits)
 
 

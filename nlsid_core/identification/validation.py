@@ -217,7 +217,7 @@ def _rms(errors: list[FloatArray]) -> float:
 
 
 def _clipped_percent(model: Model, dataset: Dataset) -> float:
-    """Of the samples, those with an input that a state-affine model clips."""
+    """How many percent of the samples have an input that a state-affine model clips."""
     if not isinstance(model, StateAffineModel):
         return 0.0
     low, high = model.u_range.T

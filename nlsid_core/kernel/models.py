@@ -201,7 +201,7 @@ def _pointed(E: Entries) -> Hull | None:
 
 
 def _require_window(window: Any, inputs: int, delays: int | None, node: Node) -> None:
-    """Of rows (input, delay), delays below `delays` if there is such a bound."""
+    """Refuse other rows than (input, delay), delays below `delays` if there is such a bound."""
     known = all(0 <= i < inputs and 0 <= d < (delays or d + 1) for i, d in window)
     node.require({"the window should name inputs and delays that are there": known})
 

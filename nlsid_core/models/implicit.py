@@ -114,12 +114,12 @@ class ImplicitModel(Recorded):
 
     @property
     def lags(self) -> int:
-        """Of recorded signals: how many past samples of y the state stacks."""
+        """How many past samples of y, a recorded signal, the state stacks."""
         return len(self) // self.unknowns
 
     @property
     def history(self) -> int:
-        """Of recorded signals: how many past samples a step looks back."""
+        """How many past samples of recorded signals a step looks back."""
         return max(self.lags, *(d for _, d in self.window), 0)
 
     @property

@@ -66,7 +66,7 @@ class Linear(NamedTuple):
 
 
 def linear_form(model: StableModel) -> Linear | None:
-    """Of a model whose increments are the same everywhere; else None."""
+    """The form of a model whose increments are the same everywhere; else None."""
     varies = isinstance(model, StateAffineModel) and any(g.exponents.any() for g in model.G)
     if varies or not isinstance(model, DifferenceEquation | ImplicitModel | StateAffineModel):
         return None

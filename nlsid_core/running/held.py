@@ -49,7 +49,7 @@ class Held:
 
     @property
     def tolerance(self) -> float:
-        """Of a period, how far off the grid a sample may be: any, where the proof has a hold."""
+        """How much of a period off the grid a sample may be: any, where the proof has a hold."""
         return math.inf if self.hold else TOLERANCE
 
     def overdue(self, age: float, t: float) -> str:

@@ -484,7 +484,7 @@ class Limits(NamedTuple):
 
 
 def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> list[float]:
-    """By what each tube's level is multiplied at the next sample, whose inputs are u (n_u,)."""
+    """The factors of the tubes' levels at the next sample, whose inputs are u (n_u,)."""
     return [meters[j].update(u) if j in meters else each for j, each in enumerate(g)]
 
 

@@ -308,7 +308,7 @@ def _first_iterate(
 def _nearby(
     program: SphereProgram, g: FloatArray, path: tuple[Iterate, ...]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Of another g's iterates the last that is as far from its boundary as the two g differ."""
+    """The last of another g's iterates that is as far from its boundary as the two g differ."""
     V, (X, y, m, _) = program._at.V, path[0]
     differ = float(np.ptp(g - m - np.einsum("ij,ij->i", V @ X, V)))
     least = min(WARM_GAP, WARM_ROOM * differ)

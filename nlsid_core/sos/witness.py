@@ -51,7 +51,7 @@ class Scale:
 
     @classmethod
     def of(cls, monomials: IntArray, Q: FloatArray) -> "Scale":
-        """Of matrices (J+1, k, k)."""
+        """Make the scale of matrices Q (J+1, k, k)."""
         exponents = _columns(Q)
         columns = _raised(monomials, exponents)
         product, square = products_of(monomials)

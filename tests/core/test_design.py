@@ -81,13 +81,6 @@ def test_a_sampled_problem_refuses_radii_that_are_not_positive(options: dict[str
         SampledTracking(base.model, base.policy, base.feedback, assumption(), **options)
 
 
-@pytest.fixture(name="tube")
-def _tube(request: pytest.FixtureRequest) -> OutputTubeDesign:
-    """The session's tube, by a name that is not the verb's."""
-    found: OutputTubeDesign = request.getfixturevalue("design")
-    return found
-
-
 @pytest.fixture(params=["linear", "sampled"])
 def any_design(request: pytest.FixtureRequest, tube: OutputTubeDesign) -> AnyDesign:
     return tube if request.param == "linear" else designed()

@@ -249,14 +249,7 @@ def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:
     assert "outside the box" in monitor.forecast(np.full((3, 1), 50.0)).reason
 
 
-def test_around_a_plan_there_is_no_forecast(planned: OutputTubeDesign) -> None:
-    monitor = planned.monitor(centre=Centre.PROFILE)
+def test_around_a_plan_there_is_no_forecast(tube: OutputTubeDesign) -> None:
+    monitor = tube.monitor(centre=Centre.PROFILE)
     with pytest.raises(DataError, match="around the model's simulation"):
         monitor.forecast(np.zeros((1, 1)))
-
-
-@pytest.fixture
-def planned(request: pytest.FixtureRequest) -> OutputTubeDesign:
-    """The tube around a plan that `tests/conftest.py` designs."""
-    found: OutputTubeDesign = request.getfixturevalue("design")
-    return found

@@ -16,9 +16,9 @@ LONGEST = 2000  # characters of what a cell's last line prints
 def test_what_a_cell_ends_with_is_short(
     train: Dataset, fit: Fit[DifferenceEquation], design: OutputTubeDesign
 ) -> None:
-    held = replay(design, train.trajectories[0])
     tables = compare(train, {"fitted": fit.model}), standard_errors(fit.model, train)
-    shown = (train, train.trajectories[0], fit, fit.model, design, design.verdict, held, *tables)
+    trial, held = train.trajectories[0], replay(design, train.trajectories[0])
+    shown = (train, trial, fit, fit.model, design, design.verdict, held, *tables)
     assert not [each for each in shown if not 20 < len(repr(each)) <= LONGEST]
     assert not [each for each in (train, fit, held) if "<svg" not in each._repr_html_()]
     assert "PROVED tube" in design._repr_html_() == design.verdict._repr_html_()

@@ -52,10 +52,8 @@ def model(stacked: StateAffineRows) -> StateAffineModel:
 
 
 @pytest.fixture(scope="module")
-def documents(stacked: StateAffineRows) -> tuple[Json, Json]:
+def documents(model: StateAffineModel) -> tuple[Json, Json]:
     """Model and proof of the last certified iterate."""
-    *_, last = certified_simulation_error(stacked, iterations=4)
-    model = stacked.model(last.point.theta, last.point.p)
     proof = prove_stability(model)
     assert proof is not None
     return model.document(), proof.document(model, "model.json")

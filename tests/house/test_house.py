@@ -9,6 +9,11 @@ from xml.etree import ElementTree
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, sources
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+NO_SUBJECT = re.compile(r"(Of|By) ")
+WORDS, SENTENCES = 25, re.compile(r"[.!?:;·]\W|\n\n|\n- ")  # of a sentence, at most
+NO_PROSE = re.compile(
+    r"^(```.*?^```|---.*?^---|:::.*?$|\|.*?$|#.*?$)|`[^`]*`", re.DOTALL | re.MULTILINE
+)
 
 
 def public_definitions(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str, Definition]]:
@@ -38,6 +43,24 @@ def test_everything_public_has_a_docstring() -> None:
         if not ast.get_docstring(node) and not is_overload(node)
     ]
     assert not silent
+
+
+def test_no_docstring_begins_without_its_subject() -> None:
+    documented = (
+        (source.name, ast.get_docstring(node) or "")
+        for source in sources(*PACKAGES)
+        for node in ast.walk(source.tree)
+        if isinstance(node, Definition)
+    )
+    assert not [found for found in documented if NO_SUBJECT.match(found[1])]
+
+
+def test_sentences_of_what_is_read_first_are_short() -> None:
+    names = ("README", *(f"docs/{each}" for each in ("index", "install", "choosing", "tutorial-*")))
+    texts = (page.read_text() for name in names for page in ROOT.glob(f"{name}.md"))
+    sentences = [each for text in texts for each in SENTENCES.split(NO_PROSE.sub("X", text))]
+    assert len(sentences) > 200
+    assert not [each for each in sentences if len(each.split()) > WORDS]
 
 
 def test_every_public_signature_says_what_it_takes() -> None:

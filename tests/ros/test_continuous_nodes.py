@@ -135,8 +135,7 @@ def edge(folder: Path) -> FloatArray:
     funnel = load(folder / FUNNEL, wiring=None).funnel
     out = np.random.default_rng(3).standard_normal(funnel.n)
     towards = np.linalg.cholesky(np.linalg.inv(funnel.shape(funnel.t0))) @ out
-    start: FloatArray = funnel.x(funnel.t0) + OUT**0.5 * towards / np.linalg.norm(out)
-    return start
+    return np.asarray(funnel.x(funnel.t0) + OUT**0.5 * towards / np.linalg.norm(out))
 
 
 def test_a_held_funnel_is_driven_to_its_goal_at_stamps_off_the_grid(

@@ -94,7 +94,7 @@ def refusal_time(refusal: Infeasible) -> float | None:
 
 
 def _first(chosen: BoolArray, order: FloatArray, count: int) -> BoolArray:
-    """Of the chosen ones at most `count`, the first in this order."""
+    """Give at most `count` of the chosen ones, the first in this order."""
     sequence = np.argsort(np.where(chosen, order, np.inf), kind="stable")
     kept = np.zeros(len(chosen), dtype=bool)
     kept[sequence[: max(count, 0)]] = True

@@ -134,7 +134,7 @@ class Changes:
 
     @classmethod
     def of(cls, steps: LSteps, funnel: ContinuousFunnel) -> "Changes":
-        """Of this funnel; steps: with widths, of any size."""
+        """Make the changes for this funnel; steps: with widths, of any size."""
         field, K = steps.field, len(funnel.t) - 1
         corners = _corners(field)
         chosen, count = (corners > 0).astype(int), len(corners)
@@ -330,7 +330,7 @@ def _corners(field: VectorField) -> FloatArray:
 
 
 def _pushing(field: VectorField, first: int, count: int) -> list[bool]:
-    """Of each of `count` variables from this column: does it only add constants to ẋ, always?"""
+    """Say which of `count` variables from this column only add constants to ẋ, always."""
     rows = np.concatenate([p.exponents for equations in field.pieces for p in equations])
     return [bool((rows[rows[:, first + j] > 0].sum(axis=1) == 1).all()) for j in range(count)]
 

@@ -217,7 +217,7 @@ def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
 
 
 def largest_defect(nominal: Nominal) -> float:
-    """By how much ẋ₀ may miss the dynamics."""
+    """How far ẋ₀ may miss the dynamics."""
     rate = float(np.abs(nominal.x.derivative().control).max())
     size = float(np.abs(nominal.x.control).max()) / float(np.ptp(nominal.t))
     return DEFECT * max(rate, AT_REST * max(size, 1.0))

@@ -218,7 +218,7 @@ class _Curves:
 
     @classmethod
     def of(cls, funnel: ContinuousFunnel, pieces: Pieces, polynomials: Graded) -> "_Curves":
-        """Of pieces whose Gram matrices are nearly those of the polynomials."""
+        """Make the curves of pieces whose Gram matrices are nearly those of the polynomials."""
         basis = pieces.basis
         c, rows = together(polynomials, basis.shape[1])
         N = c.shape[1] - 1

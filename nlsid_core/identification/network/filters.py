@@ -261,7 +261,7 @@ def _with_phases(cascade: Cascade, trials: tuple[Trial, ...], phases: int) -> Ca
 
 
 def _past(signal: int, at: IntArray) -> tuple[Taps, ...]:
-    """Of a signal itself; a filter without poles has none."""
+    """The taps of a signal's own past; a filter without poles has none."""
     return (Taps(signal, at, 1),) if len(at) else ()
 
 

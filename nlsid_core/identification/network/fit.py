@@ -156,7 +156,7 @@ class Problem:
         return np.concatenate(parts)
 
     def mean_square(self, theta: FloatArray) -> float:
-        """Of the errors."""
+        """The mean square of the errors."""
         return float(np.mean(np.square(self.errors(theta))))
 
     def residual(self, theta: FloatArray) -> FloatArray:

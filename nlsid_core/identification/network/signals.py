@@ -128,7 +128,7 @@ class Signals:
         return np.array([1.0, *(-weight for weights in own for _, weight in weights)])
 
     def radius(self, theta: FloatArray) -> float:
-        """Of the slowest pole of the signals whose past passes no map."""
+        """The radius of the slowest pole of the signals whose past passes no map."""
         slowest = 0.0
         for number, node in enumerate(self.nodes, self.inputs + 1):
             if isinstance(node, Signal) and not self.own_maps(number):
