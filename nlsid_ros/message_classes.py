@@ -6,7 +6,6 @@ from functools import cache
 from typing import Any, Final
 
 from bags.recordings.definitions import types_from
-from bags.recordings.message_types import standard_types
 from nlsid_core.errors import BagError
 
 _NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)", re.ASCII)
@@ -30,17 +29,16 @@ def message_class(msgtype: str) -> Any:
 def installed_types(msgtype: str) -> Any:
     """The type store of `msgtype` and of what it is made of, as they are installed.
 
-    Raises BagError if the type is neither standard nor installed.
+    The standard definitions are not asked: to read them all takes longer than to describe one.
+    Raises BagError if the type is not installed.
     """
-    if msgtype in standard_types().fielddefs:
-        return standard_types()
     texts: dict[str, str] = {}
     _describe(msgtype, texts)
-    return types_from(msgtype, texts)
+    return types_from(texts)
 
 
 def _describe(msgtype: str, texts: dict[str, str]) -> None:
-    """The .msg text of a type and of those in it that are not standard."""
+    """The .msg text of a type and of those in it."""
     lines = []
     for name, kind in message_class(msgtype).get_fields_and_field_types().items():
         written, suffix = kind, ""
@@ -52,7 +50,7 @@ def _describe(msgtype: str, texts: dict[str, str]) -> None:
         if "/" in written:
             package, _, inner = written.partition("/")
             written = f"{package}/msg/{inner}"
-            if written not in texts and written not in standard_types().fielddefs:
+            if written not in texts:
                 _describe(written, texts)
             written = f"{package}/{inner}"
         lines.append(f"{_WRITTEN.get(written, written)}{suffix} {name}")

@@ -15,7 +15,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.validate_topic_name import validate_topic_name
 
 from bags.recordings.cdr import ENCAPSULATION, Gatherer
-from bags.recordings.message_types import HEADER, is_stamped, standard_types
+from bags.recordings.message_types import HEADER, is_stamped
 from bags.signals.message_reader import SignalVector
 from bags.signals.signal import SignalPath, numeric_paths
 from nlsid_core import files
@@ -240,7 +240,7 @@ def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> 
 @lru_cache(maxsize=16)
 def _blank(names: tuple[str, ...], frame: str) -> tuple[bytes, int]:
     """A serialised JointState of these names, and where its positions are."""
-    types, none = standard_types(), np.zeros(0)
+    types, none = installed_types(_NUMBERS), np.zeros(0)
     header = types.types[HEADER](types.types["builtin_interfaces/msg/Time"](0, 0), frame)
     message = types.types[_NUMBERS](header, list(names), np.zeros(len(names)), none, none)
     data = bytes(types.serialize_cdr(message, _NUMBERS))  # rclpy's has bytes of memory at its end

@@ -127,11 +127,9 @@ def run(
 
 def _launch_arguments(given: list[str]) -> list[str]:
     """NAME:=VALUE as they are; a design's folder in front of them as its funnel."""
-    from bags.designs import documents
-
     if not given or ":=" in given[0]:
         return given
-    return [f"funnel:={documents.funnel_of(Path(given[0]))}", *given[1:]]
+    return [f"funnel:={Path(given[0]).absolute()}", *given[1:]]
 
 
 def _refuse_without_rclpy() -> None:

@@ -44,13 +44,16 @@ class Bundle:
     contents: Mapping[str, bytes]
 
     @classmethod
-    def load(cls, funnel: Path | str) -> "Bundle":
-        """The files of the proof beside `funnel`; of a composition's proof, those of its stages.
+    def load(cls, path: Path | str) -> "Bundle":
+        """The files of the proof in a design's folder, or beside its funnel; of a composition's
+        proof, those of its stages.
 
         Raises CertificateMismatch if the proof is about another funnel, DocumentError if it is no
-        proof or the files are too large to be published; OS errors for the proof pass through.
+        proof, the folder has none or the files are too large to be published; OS errors for the
+        proof pass through.
         """
-        funnel = Path(funnel)
+        path = Path(path)
+        funnel = _funnel_of(path) if path.is_dir() else path
         folder = funnel.parent
         composed = funnel.name == designs.COMPOSITION
         named = funnel.read_bytes()
@@ -77,7 +80,8 @@ class Bundle:
         texts = files.member(document, "files", dict, source="bundle")
         if len(texts) > MAX_ROLES or not all(isinstance(each, str) for each in texts.values()):
             raise DocumentError(f"bundle: files should be at most {MAX_ROLES} texts by role")
-        return cls({role: _bytes(each) for role, each in texts.items()})
+        # The kernel refuses what is no text.
+        return cls({role: each.encode("utf-8", "surrogatepass") for role, each in texts.items()})
 
     def text(self) -> str:
         """One line of JSON: the files' texts by role."""
@@ -229,6 +233,17 @@ def _design(
     return design
 
 
+def _funnel_of(folder: Path) -> Path:
+    """What is read of a design folder: a proof of several funnels, or its funnel."""
+    for name in (designs.COMPOSITION, designs.FUNNEL):
+        if (folder / name).is_file():
+            return folder / name
+    raise DocumentError(
+        f"{folder} has no {designs.FUNNEL}: `nlsid funnel {folder}` writes it. A design's folder "
+        "stands before the bags"
+    )
+
+
 def _beside(folder: Path, proof: bytes) -> dict[str, bytes]:
     """The files by role that a proof in `folder` is about; the kernel says which is missing."""
     found = {}
@@ -245,10 +260,6 @@ def _names(proof: bytes) -> dict[str, str]:
     about = files.member(claim, "about", dict, source=PROOF)
     names = {role: files.member(about[role], "file", str, source=PROOF) for role in about}
     return {role: name for role, name in names.items() if Path(name).name == name}
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogatepass")  # the kernel refuses what is no text
 
 
 def _refuse_size(text: str) -> None:

@@ -36,25 +36,8 @@ def load(path: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:
     CertificateMismatch if a file is another than the proof is about, DocumentError if it is not the
     proof of a funnel. OS errors for funnel and proof pass through.
     """
-    path = Path(path)
-    bundle = Bundle.load(funnel_of(path) if path.is_dir() else path)
+    bundle = Bundle.load(path)
     return bundle.design(wiring, bundle.decided())
-
-
-def funnel_of(folder: Path) -> Path:
-    """What `load` reads in a design folder: a proof of several funnels, or its funnel.
-
-    Raises DocumentError if it has neither.
-    """
-    for name in (designs.COMPOSITION, FUNNEL):
-        if (folder / name).is_file():
-            return folder / name
-    if folder.is_file():
-        raise DocumentError(f"{folder} is a file: give the design's folder, {folder.parent}")
-    raise DocumentError(
-        f"{folder} has no {FUNNEL}: `nlsid funnel {folder}` writes it. A design's folder stands "
-        "before the bags"
-    )
 
 
 def load_unproved(folder: Path | str, *, wiring: Wiring | None = None) -> AnyDesign:

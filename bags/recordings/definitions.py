@@ -70,28 +70,38 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
     What the texts use and do not define is taken from the standard types. Raises BagError if a text
     is not a message definition or uses a type that is not known.
     """
-    parsed: Typesdict = {}
-    for msgtype, text in texts.items():
-        form = MessageDefinitionFormat.IDL if _IDL.search(text) else MessageDefinitionFormat.MSG
-        with defining(f"'{msgtype}'"):
-            parsed.update(parse(msgtype, MessageDefinition(form, text)))
-    found = {}
+    parsed, found = _parsed(texts), {}
     for msgtype in texts:
         with defining(f"'{msgtype}'"):
-            used = completed({msgtype: parsed[msgtype]}, parsed)
-            refuse_what_code_cannot_be(used)
-            types = get_typestore(Stores.EMPTY)
-            types.register(used)
+            types = _registered(completed({msgtype: parsed[msgtype]}, parsed))
             text = types.generate_msgdef(msgtype, ros_version=2)[0]
             type_hash = types.hash_rihs01(msgtype) if "/msg/" in msgtype else ""
             found[msgtype] = Definition(msgtype, text, type_hash)
     return found
 
 
-def types_from(msgtype: str, texts: Mapping[str, str]) -> Typestore:
-    """What the .msg `texts`, by their types' names, define of `msgtype`; as `definitions_from`."""
-    text = definitions_from(texts)[msgtype].text
-    return types_in_bag(msgtype, MessageDefinition(MessageDefinitionFormat.MSG, text))
+def types_from(texts: Mapping[str, str]) -> Typestore:
+    """What .msg `texts`, by their types' names, define; they leave out nothing that they use."""
+    with defining(", ".join(texts)):
+        return _registered(_parsed(texts))
+
+
+def _parsed(texts: Mapping[str, str]) -> Typesdict:
+    """What .msg or .idl texts, by their types' names, define themselves."""
+    parsed: Typesdict = {}
+    for msgtype, text in texts.items():
+        form = MessageDefinitionFormat.IDL if _IDL.search(text) else MessageDefinitionFormat.MSG
+        with defining(f"'{msgtype}'"):
+            parsed.update(parse(msgtype, MessageDefinition(form, text)))
+    return parsed
+
+
+def _registered(used: Typesdict) -> Typestore:
+    """A store of these types and no others; ValueError if they cannot be code."""
+    refuse_what_code_cannot_be(used)
+    types = get_typestore(Stores.EMPTY)
+    types.register(used)
+    return types
 
 
 def texts_of(definitions: Mapping[str, Definition]) -> list[tuple[str, str]]:

@@ -67,9 +67,8 @@ class _Laid:
 
     def fits(self, data: bytes) -> bool:
         """Whether a message has this layout."""
-        if not self._least <= len(data) <= self._most:
-            return False
-        return all(data[start:end] == wanted for start, end, wanted in self._fixed)
+        known = (data[start:end] == wanted for start, end, wanted in self._fixed)
+        return self._least <= len(data) <= self._most and all(known)
 
     def numbers(self, data: bytes) -> list[float]:
         """The numbers of a message that fits, in the order of the gatherer's targets."""
