@@ -11,6 +11,7 @@ rests on. Source: docs/certificate_tube.md.
 import copy
 import math
 from collections.abc import Sequence
+from functools import reduce
 from itertools import chain, repeat
 from operator import add, gt, mul, sub, truediv
 from typing import Any, NamedTuple
@@ -74,6 +75,7 @@ class TubeRun:
         if y_box is not None and u_box is not None:
             self._box = y_box.tolist(), u_box.tolist(), y_box.tolist() * (n // p)
         self._assuming = assuming(tubes)
+        self._ever = [] if any(t.samples for t in tubes) else list(range(len(tubes)))
         self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
         self._carried = self._linear.carried if self._linear is not None else None
         self.restart()
@@ -217,6 +219,8 @@ class TubeRun:
     def _fault(self, t: float, y: list[float], u: list[float]) -> str:
         if len(y) != len(self._names) or len(u) != len(self._stepper.u):
             return f"{len(y)} outputs and {len(u)} inputs at t = {t:g} s"
+        if all(map(math.isfinite, (*y, *u))):
+            return ""
         for value, signal in zip((*y, *u), self._signals, strict=True):
             if not math.isfinite(value):
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
@@ -405,6 +409,8 @@ class TubeRun:
 
     def _lasting(self, k: int) -> list[int]:
         """The tubes whose proof covers k samples."""
+        if self._ever:
+            return self._ever
         return [j for j, tube in enumerate(self._tubes) if k <= (tube.samples or k)]
 
     def _unknown(self, t: float, y: list[float], reason: str) -> Reading:
@@ -425,12 +431,12 @@ def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
 class Limits(NamedTuple):
     """What one tube's samples are held against, as floats; all is rounded towards an alarm.
 
-    up: by what e'Re is multiplied, so that it is never below its exact value. peak: (p,), and
+    columns: of L. up: by what e'Re is multiplied, so that it is never below its exact value. peak: (p,), and
     single: the most that one sample spends under it; inf where nothing is assumed of one sample.
     """
 
     rho: float
-    L: Rows
+    columns: Rows
     R: Rows
     up: float
     level: float
@@ -446,7 +452,7 @@ class Limits(NamedTuple):
         peak = np.full(p, math.inf) if tube.peak is None else tube.peak.at_most
         return cls(
             tube.rho * (1.0 + 8.0 * UNIT),
-            tube.L.tolist(),
+            tube.L.T.tolist(),
             R.tolist(),
             1.0 + 8.0 * (p * p + 4) * UNIT * spread,
             tube.level * (1.0 - ROUNDING),
@@ -462,10 +468,13 @@ class Limits(NamedTuple):
 
     def corrected(self, after: list[float], e: list[float]) -> list[float]:
         """The observer's next state: the model's, and L e."""
-        return [each + sum(map(mul, row, e)) for each, row in zip(after, self.L, strict=True)]
+        first, *others = map(_scaled, self.columns, e)
+        return list(map(add, after, reduce(_added, others, first)))
 
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
+        if math.isinf(self.single):
+            return 0.0
         parts = list(map(truediv, e, self.peak))
         return float(max(map(mul, parts, parts)))
 
@@ -485,12 +494,22 @@ class Limits(NamedTuple):
 
 def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> list[float]:
     """By what each tube's level is multiplied at the next sample, whose inputs are u (n_u,)."""
+    if not meters:
+        return g
     return [meters[j].update(u) if j in meters else each for j, each in enumerate(g)]
+
+
+def _scaled(column: list[float], by: float) -> list[float]:
+    return list(map(mul, column, repeat(by)))
+
+
+def _added(one: list[float], other: list[float]) -> list[float]:
+    return list(map(add, one, other))
 
 
 def _floats(values: Any) -> list[float]:
     """One number, or those of a vector."""
-    if isinstance(values, float | int):
+    if isinstance(values, (float, int)):  # noqa: UP038 - a union is made anew at every sample
         return [float(values)]
     return np.array(values, dtype=np.float64).ravel().tolist()
 
