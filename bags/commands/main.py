@@ -1,6 +1,7 @@
 """The entry point `nlsid`: runs a verb, and says in one line what is wrong.
 
-The verbs of `nlsid bag` need none of what the others import, and are found without them.
+`nlsid run` and the verbs of `nlsid bag` need none of what the others import, and are found without
+them.
 """
 
 import io
@@ -65,10 +66,15 @@ def main() -> None:
     _prepare_streams()
     try:
         try:
-            if sys.argv[1:2] == ["bag"]:
+            verb, given = "".join(sys.argv[1:2]), sys.argv[2:]
+            if verb == "bag":
                 from bags.commands.bag_cli import bag_app
 
-                bag_app(sys.argv[2:], prog_name="nlsid bag")
+                bag_app(given, prog_name="nlsid bag")
+            elif verb == "run":
+                from bags.commands.running_cli import run_app
+
+                run_app(given, prog_name="nlsid run")
             else:
                 from bags.commands.cli import app
 

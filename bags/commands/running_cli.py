@@ -125,6 +125,10 @@ def run(
     raise typer.Exit(run_together(commands, respawn="respawn:=true" in given))
 
 
+run_app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+run_app.command()(run)
+
+
 def _launch_arguments(given: list[str]) -> list[str]:
     """NAME:=VALUE as they are; a design's folder in front of them as its funnel."""
     if not given or ":=" in given[0]:
