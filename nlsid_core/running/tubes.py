@@ -431,8 +431,9 @@ def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
 class Limits(NamedTuple):
     """What one tube's samples are held against, as floats; all is rounded towards an alarm.
 
-    columns: of L. up: by what e'Re is multiplied, so that it is never below its exact value. peak: (p,), and
-    single: the most that one sample spends under it; inf where nothing is assumed of one sample.
+    columns: of L. up: by what e'Re is multiplied, so that it is never below its exact value. peak:
+    (p,), and single: the most that one sample spends under it; inf where nothing is assumed of one
+    sample.
     """
 
     rho: float
@@ -509,7 +510,7 @@ def _added(one: list[float], other: list[float]) -> list[float]:
 
 def _floats(values: Any) -> list[float]:
     """One number, or those of a vector."""
-    if isinstance(values, (float, int)):  # noqa: UP038 - a union is made anew at every sample
+    if isinstance(values, (float, int)):  # a union would be made at every sample
         return [float(values)]
     return np.array(values, dtype=np.float64).ravel().tolist()
 

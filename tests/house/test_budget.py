@@ -12,9 +12,9 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_113,
-    ("bags",): 11_927,
-    ("nlsid_ros",): 2_659,
+    ("nlsid_core",): 18_126,
+    ("bags",): 11_933,
+    ("nlsid_ros",): 2_662,
     ("tests",): 22_338,
     ("benchmarks", "examples"): 3_798,
 }
