@@ -11,7 +11,6 @@ rests on. Source: docs/certificate_tube.md.
 import copy
 import math
 from collections.abc import Sequence
-from functools import reduce
 from itertools import chain, repeat
 from operator import add, gt, mul, sub, truediv
 from typing import Any, NamedTuple
@@ -469,8 +468,10 @@ class Limits(NamedTuple):
 
     def corrected(self, after: list[float], e: list[float]) -> list[float]:
         """The observer's next state: the model's, and L e."""
-        first, *others = map(_scaled, self.columns, e)
-        return list(map(add, after, reduce(_added, others, first)))
+        injected, *others = map(_scaled, self.columns, e)
+        for other in others:
+            injected = list(map(add, injected, other))
+        return list(map(add, after, injected))
 
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
@@ -502,10 +503,6 @@ def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> 
 
 def _scaled(column: list[float], by: float) -> list[float]:
     return list(map(mul, column, repeat(by)))
-
-
-def _added(one: list[float], other: list[float]) -> list[float]:
-    return list(map(add, one, other))
 
 
 def _floats(values: Any) -> list[float]:

@@ -12,7 +12,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_126,
+    ("nlsid_core",): 18_125,
     ("bags",): 11_933,
     ("nlsid_ros",): 2_662,
     ("tests",): 22_338,
