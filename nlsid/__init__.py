@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from bags.designs.documents import load
+    from bags.monitoring.replay import replay
     from bags.pictures.notebook import plot, to_control
     from bags.samples import f1tenth
     from bags.signals.grid import read_dataset as read_bags
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
         SampledTracking,
         design,
         integrate_nominal,
-        nominal_through,
         plan_motion,
     )
     from nlsid_core.designs import Design
@@ -85,10 +85,10 @@ __all__ = [
     "identify",
     "integrate_nominal",
     "load",
-    "nominal_through",
     "plan_motion",
     "plot",
     "read_bags",
+    "replay",
     "standard_errors",
     "taylor_field",
     "to_control",
@@ -105,9 +105,10 @@ _FAMILIES: Final = (
 )
 _METHODS: Final = ("LeastSquares", "Rie", "Rse", "Sem")
 _PROBLEMS: Final = ("OutputTube", "SampledTracking", "ContinuousTracking", "Goal")
-_MOTIONS: Final = ("integrate_nominal", "nominal_through", "plan_motion")
+_MOTIONS: Final = ("integrate_nominal", "plan_motion")
 _HOMES: Final = {
     "bags.pictures.notebook": ("plot", "to_control"),
+    "bags.monitoring.replay": ("replay",),
     "bags.samples": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),

@@ -1,6 +1,6 @@
 """Array aliases used in signatures, and members of dataclasses that are arrays."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -13,10 +13,35 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 Json: TypeAlias = dict[str, Any]
 
-__all__ = ["ArrayLike", "BoolArray", "FloatArray", "IntArray", "Json", "freeze", "keep"]
+__all__ = [
+    "ArrayLike",
+    "BoolArray",
+    "FloatArray",
+    "IntArray",
+    "Json",
+    "freeze",
+    "keep",
+    "objects",
+    "objects_at",
+]
 
 
 Shape: TypeAlias = tuple[int | None, ...]
+
+
+def objects(entries: Sequence[object]) -> NDArray[Any]:
+    """An array (n,) of these objects, arrays among them too."""
+    array = np.empty(len(entries), dtype=object)
+    array[:] = entries
+    return array
+
+
+def objects_at(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], object]) -> NDArray[Any]:
+    """An array of this shape with the object that `entry` gives for each index."""
+    array = np.empty(shape, dtype=object)
+    for index in np.ndindex(*shape):
+        array[index] = entry(index)
+    return array
 
 
 def freeze(owner: object, what: str, shapes: Mapping[str, Shape]) -> None:

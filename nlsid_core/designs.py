@@ -23,6 +23,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.stage import Stage
+from nlsid_core.shown import card
 
 # The files in a design's folder; a claim calls each by its name without the ending.
 MODEL = "model.json"
@@ -88,6 +89,9 @@ class Design(Generic[D, P, F, S]):
 
     def __repr__(self) -> str:
         return f"<Design of {self.name}: {getattr(self.decision, 'statement', 'not decided')}>"
+
+    def _repr_html_(self) -> str:
+        return card(repr(self)) if self.decision is None else self.decision._repr_html_()
 
     @property
     def verdict(self) -> Verdict:

@@ -114,4 +114,5 @@ def _wake_on_signals() -> socket.socket:
     for number in STOP_SIGNALS:
         if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda _number, _frame: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # `nlsid run` starts it deaf to SIGINT
     return receiver

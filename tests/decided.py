@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
-from nlsid_core.proofs import Verdict, decide
+from nlsid_core import files
+from nlsid_core.identification import prove_stability
+from nlsid_core.models import StableModel
+from nlsid_core.proofs import Verdict, check, decide
 
 
 def decided(proof: Path) -> Verdict:
@@ -12,3 +15,12 @@ def decided(proof: Path) -> Verdict:
     """
     beside = {path.name: path.read_bytes() for path in proof.parent.iterdir() if path.is_file()}
     return decide(proof.read_bytes(), beside)
+
+
+def checked(model: StableModel, folder: Path) -> str:
+    """The sentence of a model's stability, from its files."""
+    proof = prove_stability(model)
+    assert proof is not None
+    files.write_document(folder / "model.json", model.document())
+    files.write_document(folder / "model.proof.json", proof.document(model, "model.json"))
+    return check(folder / "model.proof.json").statement

@@ -24,8 +24,7 @@ def saved(design: FunnelDesign, folder: Path) -> Files:
 
 def copy_of(files: Files) -> Files:
     """The same documents, to be changed."""
-    copied: Files = json.loads(json.dumps(files))
-    return copied
+    return dict(json.loads(json.dumps(files)))
 
 
 def bind(files: Files) -> None:

@@ -4,9 +4,20 @@ from typing import Any
 
 import numpy as np
 
-from nlsid import Goal, Nominal, VectorField
+from nlsid import Goal, Nominal, VectorField, integrate_nominal
 from nlsid_core import files
 from nlsid_core.arrays import Json
+
+
+def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
+    """A pendulum to third order, with torque, at rest for 2 s."""
+
+    def pendulum(x: Any, u: Any) -> Any:
+        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
+
+    field = VectorField.from_function(pendulum, 2, 1)
+    t = np.linspace(0, 2, knots)
+    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
 def document(field: VectorField, nominal: Nominal, goal: Goal, **options: Any) -> Json:

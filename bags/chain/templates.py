@@ -93,9 +93,9 @@ def option_texts(kind: type[Any]) -> dict[str, str]:
     return {name: said[1].rstrip(".;, ") if said else "" for name, said in found.items()}
 
 
-def _same(*keys: str) -> dict[str, str]:
-    """Keys that are called as the options are."""
-    return {key: key for key in keys}
+def _same(*options: str, ends: str = "") -> dict[str, str]:
+    """Keys that are called as the options are, and then `ends`."""
+    return {f"{option}{ends}": option for option in options}
 
 
 TEMPLATES: Mapping[str, Template] = MappingProxyType(
@@ -110,14 +110,14 @@ TEMPLATES: Mapping[str, Template] = MappingProxyType(
             "Linear in the outputs, polynomial in the inputs",
             Degrees,
             _same("lags", "delays")
-            | {"leading_degree": "leading", "lagged_degree": "lagged", "right_degree": "inputs"}
+            | _same("leading", "lagged", "inputs", ends="_degree")
             | _same("input_range", "on_out_of_range"),
             needed=("lags",),
         ),
         "monotone": Template(
             "e(y) affine in past outputs and in inputs, e increasing",
             Degrees,
-            _same("lags", "delays") | {"degree": "left"},
+            _same("lags", "delays") | _same("left", ends="_degree"),
             {"left": 3, "set": "3.8"},
             ("lags",),
         ),
@@ -125,8 +125,7 @@ TEMPLATES: Mapping[str, Template] = MappingProxyType(
             "e(y(t)) = f(past outputs, inputs), in a stable set",
             Degrees,
             _same("lags", "delays", "set")
-            | {"left_degree": "left", "right_degree": "past", "input_degree": "inputs"}
-            | {"lagged_degree": "lagged"}
+            | _same("left", "past", "inputs", "lagged", ends="_degree")
             | _same("output_range", "input_range"),
             {"left": 3, "set": "2.11"},
         ),

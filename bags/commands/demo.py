@@ -95,8 +95,7 @@ def _driven(out: Path, console: Console, shown: Shown) -> bool:
     show.say(console, "It simulates what will be measured from the commands alone.")
 
     _step(console, "2  prove a tube around it", f"funnel {out}")
-    design = designs_cli.tube(out, settings)
-    show.say(console, show.promise(design))
+    show.say(console, show.promise(designs_cli.tube(out, settings)))
     show.say(console, "A robot outside the tube does what it did in none of these trials.")
 
     _step(console, "3  check both proofs", f"check {out}")

@@ -132,12 +132,16 @@ def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) ->
 
 
 def _end_with(parent: int) -> Callable[[], None] | None:
-    """What a new process does so that it gets SIGTERM when its parent is gone; Linux only."""
+    """What a new process does so that it gets SIGTERM when its parent is gone; Linux only.
+
+    SIGINT waits until the node is ready for it: Python ends an import with a traceback.
+    """
     if not sys.platform.startswith("linux"):
         return None
     prctl = ctypes.CDLL(None).prctl
 
     def ask() -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # it was gone before
             os.kill(os.getpid(), signal.SIGTERM)
@@ -149,7 +153,7 @@ def _command(node: Element, values: Mapping[str, str]) -> list[str]:
     def filled(element: Element, attribute: str) -> str:
         return _filled(element.attrib[attribute], values)
 
-    namespace = "/" + filled(node, "namespace").lstrip("/")  # as ROS launch takes `robot1`
+    namespace = "/" + filled(node, "namespace").strip("/")  # as ROS launch takes `robot1`
     renamed = [("__node", filled(node, "name")), ("__ns", namespace)]
     renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
     settings = filled(node, "ros_args").split()

@@ -80,7 +80,8 @@ class Bundle:
         texts = files.member(document, "files", dict, source="bundle")
         if len(texts) > MAX_ROLES or not all(isinstance(each, str) for each in texts.values()):
             raise DocumentError(f"bundle: files should be at most {MAX_ROLES} texts by role")
-        return cls({role: _bytes(each) for role, each in texts.items()})
+        # The kernel refuses what is no text.
+        return cls({role: each.encode("utf-8", "surrogatepass") for role, each in texts.items()})
 
     def text(self) -> str:
         """One line of JSON: the files' texts by role."""
@@ -259,10 +260,6 @@ def _names(proof: bytes) -> dict[str, str]:
     about = files.member(claim, "about", dict, source=PROOF)
     names = {role: files.member(about[role], "file", str, source=PROOF) for role in about}
     return {role: name for role, name in names.items() if Path(name).name == name}
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode("utf-8", "surrogatepass")  # the kernel refuses what is no text
 
 
 def _refuse_size(text: str) -> None:

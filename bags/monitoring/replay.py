@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
@@ -20,12 +20,14 @@ from bags.signals.columns import read_columns
 from bags.signals.reader import bag_digest
 from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sampler, said_filled
 from nlsid_core import files
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import BagError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status, cause
 from nlsid_core.running.tubes import BEYOND
+from nlsid_core.shown import BLUE, GREY, card, line
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -101,7 +103,7 @@ class Clock:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Replay:
     """One bag's readings, and what a summary says of them.
 
@@ -111,12 +113,29 @@ class Replay:
 
     name: str
     readings: tuple[Reading, ...]
-    stamps_ns: tuple[int, ...]
     axis: str
     unit: str
     half_width: float
     period: float = 0.0
+    stamps_ns: tuple[int, ...] = ()
     noted: Clock | None = None
+
+    def __repr__(self) -> str:
+        worst = self.first_bad or self.worst
+        at = f", margin {worst.margin:.2f} at {worst.t:.3f} s" if worst else ""
+        return f"{self.name}: {self.verdict}{at}" + (self.reason and f": {self.reason}")
+
+    def _repr_html_(self) -> str:
+        """The same, and the first signal as measured (blue), with the tube around its nominal."""
+        rows = [
+            (r.t, r.measured[0], r.nominal[0], [*r.half_widths, self.half_width][0])
+            for r in self.judged
+            if r.measured and r.nominal
+        ]
+        t, y, middle, width = np.array(rows or [(0.0,) * 4]).T
+        drawn = [(middle - width, GREY), (middle + width, GREY), (y, BLUE)]
+        span = np.concatenate([values for values, _ in drawn])
+        return card(repr(self), *(line(t, values, colour, span) for values, colour in drawn))
 
     @property
     def start_ns(self) -> int:
@@ -229,7 +248,8 @@ class Replay:
                     yield Stretch(first, last, lost, (f"{said} missing",)), True
             why = () if reading.waits else (reading.reason,)
             unknown = reading.status is Status.UNKNOWN
-            yield Stretch(reading.t, reading.t, 1, why) if unknown else None, _unjudged(reading)
+            loses = unknown and not reading.waits and not _filled(reading)
+            yield Stretch(reading.t, reading.t, 1, why) if unknown else None, loses
             before = reading
 
     @property
@@ -297,10 +317,6 @@ def _filled(reading: Reading) -> bool:
     return reading.reason.startswith(FILLED)
 
 
-def _unjudged(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and not reading.waits and not _filled(reading)
-
-
 @dataclass(frozen=True)
 class ToJudge:
     """Bags to hold against a design, and those that it was made with, each with its use.
@@ -327,8 +343,7 @@ def to_judge(design: AnyDesign, bags: Sequence[Path]) -> ToJudge:
     A verdict on a recording that made a design says little.
     """
     made_with = design.made_with
-    uses = {bag: made_with.get(bag_digest(bag)) for bag in bags}
-    used = {bag: use for bag, use in uses.items() if use}
+    used = {bag: made_with[digest] for bag in bags if (digest := bag_digest(bag)) in made_with}
     return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
 
 
@@ -346,18 +361,40 @@ def replay_bag(
     """
     clock = Clock()
     stamped = replay_messages(design, bag, centre=centre, definitions=definitions, clock=clock)
+    readings = tuple(entry.reading for entry in stamped)
+    stamps_ns = tuple(entry.stamp_ns for entry in stamped)
+    return replace(_replayed(design, Path(bag).name, readings), stamps_ns=stamps_ns, noted=clock)
+
+
+def replay(design: AnyDesign, run: Trajectory) -> Replay:
+    """Hold a run that is in memory against a funnel, sample by sample.
+
+    Args:
+        design: with a proof.
+        run: what was measured (y) and commanded (u); the state (y) of other funnels than tubes.
+
+    Returns:
+        What the monitor says of it; it prints as one sentence.
+
+    Raises:
+        DataError: if the funnel cannot be monitored in float64.
+    """
+    monitor, rows = design.monitor(), zip(run.t.tolist(), run.y, run.u, strict=True)
+    return _replayed(design, run.name, tuple(monitor.update(*row) for row in rows))
+
+
+def _replayed(design: AnyDesign, name: str, readings: tuple[Reading, ...]) -> Replay:
+    """The replay without what only a bag has."""
     unit, half_width = "", 0.0
     if isinstance(design.funnel, TubeFunnel) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, float(design.funnel.half_widths[0])
     return Replay(
-        name=Path(bag).name,
-        readings=tuple(entry.reading for entry in stamped),
-        stamps_ns=tuple(entry.stamp_ns for entry in stamped),
+        name=name,
+        readings=readings,
         axis=design.name,
         unit=unit,
         half_width=half_width,
         period=design.period,
-        noted=clock,
     )
 
 

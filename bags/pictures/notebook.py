@@ -29,8 +29,12 @@ def plot(data: Dataset, models: Mapping[str, Model], output: int = 0) -> Any:
 def to_control(model: DifferenceEquation) -> Any:
     """Make a linear model a discrete TransferFunction of python-control: steps, Bode, margins.
 
+    Its input and output are called as the model's, with "_" for "." (python-control allows none).
     The constant c is the output's offset, and no part of it. Source: (4.1).
     """
     import control
 
-    return control.TransferFunction(model.b, np.append(1.0, -model.a), model.period)
+    u, y = (signal.name.replace(".", "_") for signal in (model.u, model.y))
+    return control.TransferFunction(
+        model.b, np.append(1.0, -model.a), model.period, inputs=[u], outputs=[y]
+    )

@@ -94,7 +94,8 @@ def catching_table(catching: Catching) -> Table:
         funnel = row.funnel
         parts = (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
         counts = [str(count) for count in parts]
-        others = [_soon(row.others[name]) for name in detectors]
+        caught = [row.others[name] for name in detectors]
+        others = [f"{each.count} {_after(each)}" for each in caught]
         least = max((other.count for other in row.others.values()), default=0)
         style = "dark_orange3" if least > funnel.count else ""
         table.add_row(row.fault, *counts, _after(funnel), *others, style=style)
@@ -114,10 +115,6 @@ def _after(caught: Caught) -> str:
         return "-"
     digits = next((d for d, least in ((0, 100.0), (1, 10.0)) if caught.after >= least), 2)
     return f"{caught.after:.{digits}f}"
-
-
-def _soon(caught: Caught) -> str:
-    return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
 
 
 def warn(console: Console, line: str) -> None:

@@ -233,8 +233,7 @@ def index_entries(record: bytes, channel: int, where: str) -> Any:
 
 def index_offsets(record: bytes, channel: int, where: str) -> IntArray:
     """Read where the same messages begin in the chunk."""
-    offsets: IntArray = index_entries(record, channel, where)["offset"].astype(np.int64)
-    return offsets
+    return np.asarray(index_entries(record, channel, where)["offset"].astype(np.int64))
 
 
 def index_times(record: bytes, channel: int, where: str) -> IntArray:
@@ -283,5 +282,4 @@ def _decompress(compression: str, raw: bytes, size: int) -> bytes:
 def _time(stamps: Any, where: str) -> IntArray:
     if len(stamps) and stamps.max() >= 2**63:
         raise BagError(f"{where} points at a message with time {stamps.max()} ns")
-    times: IntArray = stamps.astype(np.int64)
-    return times
+    return np.asarray(stamps.astype(np.int64))

@@ -20,9 +20,9 @@ HEAD: Final = (
 def yaml_text(proposal: Proposal) -> str:
     """The whole file; what the later steps will meet stands at its head."""
     expected = proposal.expectation
-    lines = [*_comment(HEAD), *_comment(f"{expected[0].upper()}{expected[1:]}.")]
-    for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]):
-        lines += _comment(f"Mind: {wall}")
+    minded = (f"Mind: {wall}" for wall in dict.fromkeys([*proposal.doubts, *proposal.walls]))
+    said = (HEAD, f"{expected[0].upper()}{expected[1:]}.", *minded)
+    lines = [line for text in said for line in _comment(text)]
     return "\n".join([*lines, *_section(proposal.content, Config, proposal.why, 0)]) + "\n"
 
 

@@ -367,8 +367,7 @@ def _slopes(before_ns: IntArray, values: FloatArray) -> FloatArray:
     t = before_ns / 1e9
     t -= t.mean(axis=1, keepdims=True)
     rise = values - values[:, -1:]
-    slopes: FloatArray = (t * rise).sum(axis=1) / (t * t).sum(axis=1)
-    return slopes
+    return np.asarray((t * rise).sum(axis=1) / (t * t).sum(axis=1))
 
 
 def turn_of(unit: str) -> float:

@@ -368,10 +368,8 @@ def _refuse_other_clocks(path: Path, read: Mapping[str, Samples], wanted: str) -
 
 def skipped_samples(dataset: Dataset) -> int:
     """How many samples `split_gaps` left out of the bags of `dataset`."""
-    bags = {}
-    for trial in dataset:
-        bags[trial.digest] = int(json.loads(trial.provenance or "{}").get("skipped", 0))
-    return sum(bags.values())
+    read = {trial.digest: json.loads(trial.provenance or "{}") for trial in dataset}
+    return sum(int(bag.get("skipped", 0)) for bag in read.values())
 
 
 def filled_samples(dataset: Dataset) -> int:

@@ -67,9 +67,8 @@ class _Laid:
 
     def fits(self, data: bytes) -> bool:
         """Whether a message has this layout."""
-        if not self._least <= len(data) <= self._most:
-            return False
-        return all(data[start:end] == wanted for start, end, wanted in self._fixed)
+        known = (data[start:end] == wanted for start, end, wanted in self._fixed)
+        return self._least <= len(data) <= self._most and all(known)
 
     def numbers(self, data: bytes) -> list[float]:
         """The numbers of a message that fits, in the order of the gatherer's targets."""
@@ -87,9 +86,20 @@ class SignalVector:
     paths: tuple[SignalPath, ...]
 
     @classmethod
-    def parse(cls, texts: Iterable[str]) -> "SignalVector":
-        """Read where each expression is; BagError if they are not all on one topic."""
-        paths = tuple(Expression.parse(text).path for text in texts)
+    def parse(cls, texts: Iterable[str], also: str = "unit") -> "SignalVector":
+        """Read where each expression is.
+
+        Raises BagError if they are not all on one topic, or if more is done to one than to name its
+        unit or `also`: what is meant then is not the number in a message.
+        """
+        signals = list(map(Expression.parse, texts))
+        for signal in signals:
+            if done := [each for each in signal.operations if each.name not in ("unit", also)]:
+                raise BagError(
+                    f"{signal}: |{done[0]} makes other numbers than those in messages; such a "
+                    "signal can be monitored, and not driven"
+                )
+        paths = tuple(signal.path for signal in signals)
         topics = {path.topic for path in paths}
         if len(topics) != 1:
             raise BagError(

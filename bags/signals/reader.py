@@ -127,8 +127,7 @@ def expanded(bag: Bag, texts: Sequence[str]) -> dict[str, Expression]:
 
 def bag_digest(bag: Path | str) -> str:
     """`sha256:<hex>` of the bag's data file (of its data files, joined in their order)."""
-    digest: str = bag_origin(bag)["digest"]
-    return digest
+    return str(bag_origin(bag)["digest"])
 
 
 def bag_origin(bag: Bag | Path | str) -> Json:

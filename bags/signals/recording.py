@@ -210,9 +210,10 @@ class Recording:
             "messages": sum(self.bag.counts.values()),
             "lost": sum(lost.values()),
         }
-        lines = {}
-        for topic in sorted(lost, key=lambda topic: -lost[topic])[:most]:
-            lines[topic] = ", ".join(f"{what} {counts[f'{topic} {what}']}" for what in COUNTED)
+        lines = {
+            topic: ", ".join(f"{what} {counts[f'{topic} {what}']}" for what in COUNTED)
+            for topic in sorted(lost, key=lambda topic: -lost[topic])[:most]
+        }
         return {name: str(value) for name, value in values.items()} | lines
 
     def warnings(self) -> list[str]:

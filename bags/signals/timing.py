@@ -142,9 +142,7 @@ def _drift(t: FloatArray, ahead: FloatArray) -> float:
     slope, level = np.polyfit(x - x.mean(), y, 1)
     scatter = float(np.std(y - slope * (x - x.mean()) - level))
     total = abs(slope) * float(t[-1] - t[0])
-    if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter):
-        return 0.0
-    return float(slope)
+    return 0.0 if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter) else float(slope)
 
 
 def missing(sequence: IntArray) -> int | None:

@@ -12,14 +12,14 @@ import math
 import re
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
 
-from bags.viewing.scene import MONITORING, Event, Sample, Scene
+from bags.viewing.scene import MONITORING, Sample, Scene
 from nlsid_core.errors import DataError
 
 LOCAL: Final = "127.0.0.1"
@@ -126,7 +126,7 @@ def _news(scene: Scene, closing: threading.Event) -> Iterator[dict[str, Any]]:
             "names": scene.names,
             "samples": [_sample(sample, now) for sample in samples],
             "forecasts": [_forecast(each, len(scene.names)) for each in forecasts],
-            "events": [_event(event) for event in events],
+            "events": [[e.stamp_ns / 1e9, e.level, e.node, e.text] for e in events],
             "nodes": [
                 [name, said.level, said.text, round(now - said.came, 1)]
                 for name, said in sorted(scene.nodes().items())
@@ -152,10 +152,6 @@ def _forecast(forecast: Sample, signals: int) -> list[Any]:
     return [forecast.stamp_ns / 1e9, ends]
 
 
-def _event(event: Event) -> Sequence[Any]:
-    return [event.stamp_ns / 1e9, event.level, event.node, event.text]
-
-
 def _number(value: float) -> float | str | None:
     """JSON has no NaN (null) and no infinity (a word)."""
     if math.isfinite(value):
@@ -165,9 +161,10 @@ def _number(value: float) -> float | str | None:
 
 def _policy(page: bytes) -> str:
     """The page's own script and style, by digest; its own stream; nothing else."""
-    parts = {}
-    for kind, text in _INLINE.findall(page.decode()):
-        parts[kind] = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    parts = {
+        kind: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        for kind, text in _INLINE.findall(page.decode())
+    }
     return (
         f"default-src 'none'; script-src 'sha256-{parts['script']}'; "
         f"style-src 'sha256-{parts['style']}'; connect-src 'self'; "

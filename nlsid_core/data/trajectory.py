@@ -2,16 +2,15 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from typing import Any
 
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.errors import DataError, ShapeError, counted
+from nlsid_core.shown import BLUE, GREY, card, line
 
 ROUNDING = 1e-5  # ns; a mean step this close to whole nanoseconds was not meant to differ from them
-POINTS = 80  # of a line in a notebook
 GRID_TOLERANCE = 1e-6  # relative; stamps are integer nanoseconds, so a grid repeats to far better
 
 
@@ -20,7 +19,7 @@ class Trajectory:
     """Signals of one motion on its own time stamps; arrays are checked once and read-only.
 
     t: (N,) s, strictly increasing. y: (N, n_y) responses. u: (N, n_u) excitations, held constant
-    until the next sample. x: (N, n_x) states where they are known, else None.
+    until the next sample.
     Names, units and paths (`topic:field`, empty: not from a topic) go with the columns. `group` is
     the same for repeats of one excitation (empty: not a repeat). `digest` names the recording it
     came from (empty: none), `provenance` is JSON text that says how it was read from it.
@@ -31,7 +30,6 @@ class Trajectory:
     t: FloatArray
     y: FloatArray
     u: FloatArray
-    x: FloatArray | None = None
     y_names: tuple[str, ...] = ()
     u_names: tuple[str, ...] = ()
     y_units: tuple[str, ...] = ()
@@ -48,11 +46,8 @@ class Trajectory:
         if t.ndim != 1:
             raise ShapeError(f"{self._label}: t should have shape (N,), has {t.shape}")
         object.__setattr__(self, "t", t)
-        for key in ("y", "u", "x"):
-            values = getattr(self, key)
-            if values is None:
-                continue
-            array = _frozen(values)
+        for key in ("y", "u"):
+            array = _frozen(getattr(self, key))
             array = array[:, None] if array.ndim == 1 else array
             if array.ndim != 2 or len(array) != len(t):
                 raise ShapeError(
@@ -97,7 +92,6 @@ class Trajectory:
             t=self.t[part],
             y=self.y[part],
             u=self.u[part],
-            x=None if self.x is None else self.x[part],
             name=self.name if name is None else name,
         )
 
@@ -149,7 +143,12 @@ class Dataset:
 
     @classmethod
     def from_pandas(
-        cls, frames: Mapping[str, Any] | Any, *, y: Sequence[str] | str, u: Sequence[str] | str
+        cls,
+        frames: Mapping[str, Any] | Any,
+        *,
+        y: Sequence[str] | str,
+        u: Sequence[str] | str,
+        paths: Mapping[str, str] | None = None,
     ) -> "Dataset":
         """Make a dataset of pandas DataFrames, one a trial, on one grid of time.
 
@@ -158,6 +157,8 @@ class Dataset:
                 in s or as a DatetimeIndex; `frame` reads bags so, with a period.
             y: the columns of the responses, what is measured.
             u: the columns of the excitations, what drives the robot.
+            paths: where a monitor finds columns in bags and on topics, such as
+                {"speed": "/odom:twist.twist.linear.x"}. A column called `/topic:field` needs none.
 
         Returns:
             The dataset; its signals are called as the columns.
@@ -167,7 +168,9 @@ class Dataset:
                 where they are not equally far apart in time.
         """
         trials = []
-        y, u = ((one,) if isinstance(one, str) else one for one in (y, u))
+        y, u = ((one,) if isinstance(one, str) else tuple(one) for one in (y, u))
+        topics = {name: name for name in (*y, *u) if name.startswith("/") and ":" in name}
+        known = topics | dict(paths or {})
         for name, table in (frames if isinstance(frames, Mapping) else {"data": frames}).items():
             if missing := [str(column) for column in (*y, *u) if column not in table]:
                 raise DataError(f"{name}: no column {missing[0]}; there are {list(table.columns)}")
@@ -184,8 +187,10 @@ class Dataset:
                     t=t,
                     y=table[list(y)],
                     u=table[list(u)],
-                    y_names=tuple(y),
-                    u_names=tuple(u),
+                    y_names=y,
+                    u_names=u,
+                    y_paths=tuple(known.get(column, "") for column in y),
+                    u_paths=tuple(known.get(column, "") for column in u),
                     name=name,
                 )
             )
@@ -200,11 +205,8 @@ class Dataset:
 
     def _repr_html_(self) -> str:
         """The same, and the first trial's first excitation and response, each over its range."""
-        first = self.trajectories[0]
-        drives = _svg_line(first.t, first.u[:, 0], "#9aa0a6")
-        answers = _svg_line(first.t, first.y[:, 0], "#1f6fb4")
-        drawn = f'<svg viewBox="0 0 600 100" width="600" height="100">{drives}{answers}</svg>'
-        return f"<div>{escape(repr(self))}<br>{drawn}</div>"
+        t, y, u = (getattr(self.trajectories[0], name) for name in "tyu")
+        return card(repr(self), line(t, u[:, 0], GREY), line(t, y[:, 0], BLUE))
 
     def __len__(self) -> int:
         return len(self.trajectories)
@@ -241,15 +243,6 @@ class Dataset:
             if trajectory.group:
                 groups.setdefault(trajectory.group, []).append(trajectory)
         return {group: tuple(members) for group, members in groups.items() if len(members) > 1}
-
-
-def _svg_line(t: FloatArray, values: FloatArray, colour: str) -> str:
-    """Values (N,) over t (N,) as a line of an SVG picture of 600 x 100."""
-    rows = np.linspace(0, len(t) - 1, min(len(t), POINTS)).astype(int)
-    across = 600.0 * (t[rows] - t[0]) / (t[-1] - t[0])
-    up = 95.0 - 90.0 * (values[rows] - values.min()) / (np.ptp(values) or 1.0)
-    points = " ".join(f"{x:.0f},{y:.0f}" for x, y in zip(across, up, strict=True))
-    return f'<polyline points="{points}" fill="none" stroke="{colour}"/>'
 
 
 def _frozen(values: ArrayLike) -> FloatArray:

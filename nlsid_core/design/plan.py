@@ -17,8 +17,7 @@ def lqr_gain(model: DifferenceEquation, *, output_weight: float, input_weight: f
     """K (n,) minimising Σ output_weight·(C x̄)² + input_weight·ū², x̄⁺ = A x̄ + B ū, ū = -K x̄."""
     A, B, C = model.A, model.B, model.C
     S = solve_riccati(A, B, output_weight * C.T @ C, np.array([[input_weight]]))
-    gain: FloatArray = (B.T @ S @ A)[0] / (input_weight + (B.T @ S @ B)[0, 0])
-    return gain
+    return np.asarray((B.T @ S @ A)[0] / (input_weight + (B.T @ S @ B)[0, 0]))
 
 
 def track_profile(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, objects
 from nlsid_core.dynamics.taylor_model import (
     DEGREE,
     ROUNDING,
@@ -121,8 +121,7 @@ class Rates:
     def called(self, z: Sequence[Any]) -> list[Any]:
         """The rates for entries z = (t, x, u, w) of any kind."""
         n, m = self.n, self.m
-        held = np.empty(len(z), dtype=object)
-        held[:] = list(z)
+        held = objects(z)
         parts = {
             "t": z[0],
             "x": held[1 : 1 + n],
@@ -350,8 +349,7 @@ class Cubic:
                 parts = product
             for exponent, c in parts.items():
                 total[exponent] = total.get(exponent, 0) + c
-        coefficients = np.empty(len(total), dtype=object)
-        coefficients[:] = [Fraction(c, 1 << common + 3 * unit) for c in total.values()]
+        coefficients = objects([Fraction(c, 1 << common + 3 * unit) for c in total.values()])
         exponents = np.array(list(total), dtype=np.int64).reshape(-1, len(names))
         return Polynomial(exponents, coefficients, names), (row.bound + lost) * SUMMED
 

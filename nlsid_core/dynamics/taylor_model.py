@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core.arrays import BoolArray, FloatArray, IntArray
+from nlsid_core.arrays import BoolArray, FloatArray, IntArray, objects
 from nlsid_core.errors import DataError
 
 DEGREE = 3  # what L-steps take
@@ -336,9 +336,8 @@ def solve(A: Any, b: Any) -> Any:
             rest = rest - rows[j][i] * found[i]
         found[j] = rest / rows[j][j]
     if any(isinstance(entry, (TaylorModel, np.ndarray)) or not _known(entry) for entry in found):
-        held = np.empty(n, dtype=object)
-        held[:] = found
-        return np.stack(found) if all(isinstance(e, np.ndarray) for e in found) else held
+        stacks = all(isinstance(entry, np.ndarray) for entry in found)
+        return np.stack(found) if stacks else objects(found)
     return np.array(found)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep, objects
 from nlsid_core.errors import DataError, DocumentError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial, trace, variables
@@ -493,8 +493,7 @@ def read_equation(document: Any, names: Sequence[str], *, source: str) -> Polyno
         )
     if any(later <= row for row, later in pairwise(rows)):
         raise DocumentError(f"{source}: monomials should be distinct, in increasing order")
-    coefficients = np.empty(len(values), dtype=object)
-    coefficients[:] = [_number(value, source) for value in values]
+    coefficients = objects([_number(value, source) for value in values])
     exponents = np.array(rows, dtype=np.int64).reshape(-1, len(names))
     return Polynomial(exponents, coefficients, tuple(names))
 

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
+
 from nlsid_core.arrays import Json
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
@@ -12,6 +14,7 @@ from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
 from nlsid_core.models.difference_equation import DifferenceEquation
+from nlsid_core.shown import BLUE, card, line
 
 M = TypeVar("M", bound=Model, covariant=True)
 
@@ -156,3 +159,8 @@ class Fit(Generic[M]):
         )
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The same, and how the search went down."""
+        values = np.array([step.value for step in self.history.steps] or [0.0])
+        return card(str(self), line(np.arange(0.0, len(values)), values, BLUE))

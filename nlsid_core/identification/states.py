@@ -90,11 +90,11 @@ def identify_states(
 def classes_to_try(n: int, p: int) -> list[tuple[int, ...]]:
     """Degrees per variable, [positions; rates; inputs], small first, that a funnel can prove."""
     half = n // 2
-    choices = []
-    for position, rate in product((1, 3, 5), (1, 2, 3)):
-        if rate <= position and comb(n + position, n) <= LARGEST_GRAM:
-            choices.append((position,) * half + (rate,) * (n - half) + (1,) * p)
-    return choices
+    return [
+        (position,) * half + (rate,) * (n - half) + (1,) * p
+        for position, rate in product((1, 3, 5), (1, 2, 3))
+        if rate <= position and comb(n + position, n) <= LARGEST_GRAM
+    ]
 
 
 def free_run_error(model: StateModel, dataset: Dataset, *, in_box: bool = False) -> float:
@@ -227,8 +227,7 @@ def noise_between(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
         else np.mean(np.diff(group[0].y, 3, axis=0) ** 2, axis=0) / 20.0
         for group in groups
     ]
-    spread: FloatArray = np.sqrt(np.mean(variances, axis=0))
-    return spread
+    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 
 def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]]) -> StateModel:

@@ -26,6 +26,7 @@ from nlsid_core.identification.prediction import (
     simulate_trials,
 )
 from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.shown import Table
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
@@ -267,18 +268,28 @@ def cross_correlation(
     return cross, np.sqrt(variances / N)
 
 
-def compare(data: Dataset, models: Mapping[str, Model]) -> dict[str, float]:
-    """Simulate models on the same trials: the error of each in %, 100·‖y - ŷ‖/‖y - mean(y)‖."""
-    return {name: simulation_percent(model, data) for name, model in models.items()}
+def compare(data: Dataset, models: Mapping[str, Model]) -> Table:
+    """Simulate models on the same trials; a row for each, [name] is its error.
+
+    The error is 100·‖y - ŷ‖/‖y - mean(y)‖ in %, the fit 100 % minus it.
+    """
+    errors = {name: simulation_percent(model, data) for name, model in models.items()}
+    rows = {name: (100.0 - error, error) for name, error in errors.items()}
+    return Table(("fit [%]", "simulation error [%]"), rows)
 
 
-def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
-    """Give the standard errors (2n+2,) of a, b and c, in this order, by trials they were fitted to.
+def standard_errors(model: DifferenceEquation, data: Dataset) -> Table:
+    """Give the coefficients with their standard errors, by the trials that they were fitted to.
 
     They are right where the simulation's errors are white; `validate` says whether they are.
     J = ∂ŷ/∂(a, b, c) is the row of the equation through the filter 1/(1 - Σ a_k z⁻ᵏ), and the
     covariance σ² (J'J)⁻¹. Source: Ljung, System Identification, Section 9.3, of an output error.
-    Raises DataError for another class of models, and where the data do not determine all of them.
+
+    Returns:
+        A row for each of a1 ... an, b0 ... bn and c: value, standard error. [name] is the latter.
+
+    Raises:
+        DataError: for another class of models, and where the data do not determine all of them.
     """
     if not isinstance(model, DifferenceEquation):
         raise DataError("standard errors are those of a linear model of one output and one input")
@@ -295,4 +306,6 @@ def standard_errors(model: DifferenceEquation, data: Dataset) -> FloatArray:
     if np.linalg.matrix_rank(J) < J.shape[1]:
         raise DataError("the inputs of these trials do not determine all numbers of the model")
     covariance = np.linalg.inv(J.T @ J) * np.sum(e**2) / (len(e) - J.shape[1])
-    return np.asarray(np.sqrt(np.diag(covariance)))
+    names = [*(f"a{k}" for k in range(1, n + 1)), *(f"b{j}" for j in range(n + 1)), "c"]
+    numbers = zip([*model.a, *model.b, model.c], np.sqrt(np.diag(covariance)), strict=True)
+    return Table(("value", "standard error"), dict(zip(names, numbers, strict=True)))

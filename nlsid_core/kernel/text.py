@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
+from html import escape
 from math import isqrt
 from string import Formatter
 from typing import Any
@@ -42,6 +43,9 @@ class Verdict:
         """The margin as p/q, or rounded down where that is longer than Python would read."""
         longest = max(self.margin.numerator.bit_length(), self.margin.denominator.bit_length())
         return str(self.margin) if longest < LONGEST else below(self.margin)
+
+    def _repr_html_(self) -> str:
+        return f'<div style="border-left: 5px solid #2e7d32"><pre>{escape(str(self))}</pre></div>'
 
     def __str__(self) -> str:
         lines = [f"PROVED {self.statement}, margin {below(self.margin)}"]

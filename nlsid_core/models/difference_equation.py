@@ -75,8 +75,7 @@ class DifferenceEquation(Recorded):
     @property
     def B(self) -> FloatArray:
         """(n, 1): b_i + a_i b_0."""
-        B: FloatArray = (self.b[1:] + self.a * self.b[0])[:, None]
-        return B
+        return np.asarray((self.b[1:] + self.a * self.b[0])[:, None])
 
     @property
     def C(self) -> FloatArray:

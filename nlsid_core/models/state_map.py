@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, freeze, keep
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, freeze, keep, objects
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal, signals
 from nlsid_core.polynomial import Polynomial
@@ -70,8 +70,7 @@ class StateModel:
         points = np.concatenate(
             [np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)], axis=-1
         )
-        next_state: FloatArray = self._monomials(points, self.exponents) @ self.coefficients
-        return next_state
+        return np.asarray(self._monomials(points, self.exponents) @ self.coefficients)
 
     def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """∂f/∂x (n, n) and ∂f/∂u (n, p) at one state (n,) and input (p,)."""
@@ -98,15 +97,12 @@ class StateModel:
     def polynomials(self) -> NDArray[np.object_]:
         """(n,) the equations as polynomials in x0…, u0…."""
         names = [f"x{i}" for i in range(len(self))] + [f"u{i}" for i in range(len(self.u))]
-        rows = [Polynomial(self.exponents, column, tuple(names)) for column in self.coefficients.T]
-        equations = np.empty(len(rows), dtype=object)
-        equations[:] = rows
-        return equations
+        columns = self.coefficients.T
+        return objects([Polynomial(self.exponents, each, tuple(names)) for each in columns])
 
     @staticmethod
     def _monomials(points: FloatArray, exponents: IntArray) -> FloatArray:
-        values: FloatArray = np.prod(points[..., None, :] ** exponents, axis=-1)
-        return values
+        return np.asarray(np.prod(points[..., None, :] ** exponents, axis=-1))
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, keep
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, keep, objects, objects_at
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
 from nlsid_core.polynomial.operations import OPERATORS, REFUSED
 from nlsid_core.polynomial.values import monomial_values
@@ -123,10 +123,9 @@ class Polynomial:
         if points.shape[-1:] != (len(self.names),):
             raise ShapeError(f"points should have shape (..., {len(self.names)}): {self.names}")
         values = monomial_values(self.exponents, points.reshape(-1, len(self.names)))
-        result: FloatArray = (values @ self.coefficients.astype(np.float64)).reshape(
-            points.shape[:-1]
+        return np.asarray(
+            (values @ self.coefficients.astype(np.float64)).reshape(points.shape[:-1])
         )
-        return result
 
     def derivative(self, name: str) -> "Polynomial":
         """The partial derivative with respect to one variable (zero if it does not occur)."""
@@ -265,10 +264,7 @@ class Polynomial:
         self, other: Any, operation: Callable[["Polynomial", "Polynomial"], "Polynomial"]
     ) -> Any:
         if isinstance(other, np.ndarray) and other.ndim:
-            combined = np.empty(other.shape, dtype=object)
-            for index in np.ndindex(other.shape):
-                combined[index] = self._combine(other[index], operation)
-            return combined
+            return objects_at(other.shape, lambda at: self._combine(other[at], operation))
         return operation(self, as_polynomial(other))
 
     # -- text --------------------------------------------------------------------------------
@@ -336,9 +332,7 @@ def _rationals(values: Coefficients) -> Coefficients:
         exact = [Fraction(value) for value in values.tolist()]
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"coefficients should be numbers: {error}") from error
-    result = np.empty(len(exact), dtype=object)
-    result[:] = exact
-    return result
+    return objects(exact)
 
 
 def _aligned(a: Polynomial, b: Polynomial) -> tuple[Polynomial, Polynomial]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, objects, objects_at
 from nlsid_core.errors import NotPolynomial, ShapeError
 from nlsid_core.polynomial.algebra import (
     TRACING,
@@ -31,7 +31,7 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray
     unknowns = [variable.exact() for variable in variables(names)]
     vectors, start = [], 0
     for size in arguments.values():
-        vectors.append(_object_array(unknowns[start : start + size]))
+        vectors.append(objects(unknowns[start : start + size]))
         start += size
     title = getattr(function, "__name__", "function")
     token = TRACING.set(True)
@@ -56,11 +56,8 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray
 def jacobian(polynomials: ArrayLike | Sequence[Polynomial], names: Sequence[str]) -> NDArray[Any]:
     """∂p_i/∂names_j as an object array (..., len(names))."""
     array: Any = np.asarray(polynomials, dtype=object)
-    result = np.empty((*array.shape, len(names)), dtype=object)
-    for index in np.ndindex(array.shape):
-        for j, name in enumerate(names):
-            result[(*index, j)] = array[index].derivative(name)
-    return result
+    shape = (*array.shape, len(names))
+    return objects_at(shape, lambda at: array[at[:-1]].derivative(names[at[-1]]))
 
 
 def monomials(n: int, degrees: Sequence[int]) -> IntArray:
@@ -89,7 +86,7 @@ def combinations(weights: FloatArray, polynomials: Sequence[Polynomial]) -> NDAr
     names = tuple(dict.fromkeys(name for p in polynomials for name in p.names))
     exponents, table = coefficient_table([p.over(names) for p in polynomials])
     rows = weights @ table.T
-    return _object_array([Polynomial(exponents, row, names) for row in rows])
+    return objects([Polynomial(exponents, row, names) for row in rows])
 
 
 def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, FloatArray]:
@@ -102,9 +99,3 @@ def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, Floa
     column = np.repeat(np.arange(len(polynomials)), [len(p) for p in polynomials])
     table[position.ravel(), column] = np.concatenate([p.coefficients for p in polynomials])
     return exponents, table
-
-
-def _object_array(entries: Sequence[Any]) -> NDArray[Any]:
-    array = np.empty(len(entries), dtype=object)
-    array[:] = entries
-    return array

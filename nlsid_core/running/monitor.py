@@ -153,8 +153,7 @@ class Monitor:
             violated = f"outside the tube; {violated}" if violated else f"outside{kept}"
         if not size <= sys.float_info.max:
             self._ended = f"the deviation from the nominal is not finite at t = {t:g} s"
-        if level is None:
-            level = Level.TUBE if size <= 1.0 else Level.NONE
+        level = level or (Level.TUBE if size <= 1.0 else Level.NONE)
         return Reading(
             t,
             status,

@@ -82,8 +82,7 @@ class Stepper:
         """The state after samples that are taken as they are; a network's, by its own search."""
         self._past.clear()
         self._past.extend(u[max(0, len(u) - self._kind.delays - 1) :])
-        state: FloatArray = self._kind.begin(y, u)
-        return state
+        return np.asarray(self._kind.begin(y, u))
 
     def ahead(self) -> "Stepper":
         """Another one in the same place, whose steps leave this one where it is."""

@@ -73,10 +73,7 @@ def _terms(p: Polynomial) -> Terms:
 
 
 def _minus(a: Terms, b: Terms) -> Terms:
-    result = dict(a)
-    for key, value in b.items():
-        result[key] = result.get(key, Fraction(0)) - value
-    return result
+    return {key: a.get(key, Fraction(0)) - b.get(key, Fraction(0)) for key in {**a, **b}}
 
 
 def _times(a: Terms, b: Terms) -> Terms:

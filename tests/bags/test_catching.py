@@ -366,7 +366,7 @@ def test_a_tube_wider_than_what_was_measured_is_said_with_its_share_of_the_sampl
             )
             for k, width in enumerate(widths)
         )
-        return Replay("drive", readings, tuple(range(len(widths))), "speed", "m/s", 0.0, 0.1)
+        return Replay("drive", readings, "speed", "m/s", 0.0, 0.1)
 
     said = replay([0.5] * 6 + [1.5] * 4).said_wide
     assert said.startswith("in 40 % of the samples judged the half-width is more than all that")

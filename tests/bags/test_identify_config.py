@@ -53,7 +53,7 @@ from tests.verbs import nlsid
             {"model": "block_cascade", "orders": [2, 0], "intervals": 8},
             Network(FilterMapFilter((2, 0), intervals=8)),
         ),
-        ({"model": "monotone", "lags": 3, "degree": 1}, Polynomial(3, set="3.8")),
+        ({"model": "monotone", "lags": 3, "left_degree": 1}, Polynomial(3, set="3.8")),
         (
             {
                 "model": "implicit",
@@ -166,12 +166,12 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
         ({"model": "block_cascade", "orders": [0, 0]}, "not both zero"),
         ({"model": "block_cascade", "phases": 9}, "phases: should be a whole number from 1 to 4"),
         (
-            {"model": "monotone", "lags": 2, "degree": 2},
-            r"degree: should be one of 1, 3, 5, 7, 9 \(found 2\)",
+            {"model": "monotone", "lags": 2, "left_degree": 2},
+            r"left_degree: should be one of 1, 3, 5, 7, 9 \(found 2\)",
         ),
         ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.11', .* \(found 2.13\)"),
         ({"model": "implicit", "set": "2.13", "lags": 2}, "set 2.13 is for 1 lag"),
-        ({"model": "implicit", "right_degree": 3}, "needs ranges in set 2.11"),
+        ({"model": "implicit", "past_degree": 3}, "needs ranges in set 2.11"),
         ({"model": "implicit", "lagged_degree": 1}, "stable in ranges only"),
         ({"model": "linear_states", "lags": 1}, "identification.lags: there is no such key"),
     ],

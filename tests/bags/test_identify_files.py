@@ -53,7 +53,7 @@ CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
             "method": "rse",
             "certified": True,
             "iterations": 3,
-            "right_degree": 2,
+            "inputs_degree": 2,
         },
         StateAffineModel,
     ),
@@ -163,7 +163,7 @@ def test_a_stronger_claim_needs_another_proof(made: tuple[str, Path, str], tmp_p
 def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
     coupled: Path, tmp_path: Path
 ) -> None:
-    section = {"model": "state_affine", "lags": 2, "right_degree": 2}
+    section = {"model": "state_affine", "lags": 2, "inputs_degree": 2}
     config = write_config(tmp_path / "c.yaml", section, outputs=2, inputs=2)
     made = nlsid("identify", tmp_path / "out", coupled, "--config", config, "--verbose")
     assert "simulation error of each output:" in made

@@ -275,7 +275,7 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
     content = yaml.safe_load(config.read_text())
     assert content["identification"]["model"] == "state_affine"
     assert content["identification"]["input_range"] == [[0.0, 0.4], [-0.2, 0.2]]
-    assert content["identification"].get("right_degree", 1) in (1, 2, 3)
+    assert content["identification"].get("inputs_degree", 1) in (1, 2, 3)
     assert whole_way(f1tenth()[0].parent, config, tmp_path / "out").count("inside") >= 6
 
 

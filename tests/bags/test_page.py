@@ -163,7 +163,7 @@ def printed(table: object) -> str:
 
 
 def replay(*readings: Reading) -> Replay:
-    return Replay("run_of_a_tank", readings, (), "temperature", "degC", 1.0, period=0.5)
+    return Replay("run_of_a_tank", readings, "temperature", "degC", 1.0, period=0.5)
 
 
 def test_what_a_monitor_says_of_the_worst_bag_is_not_cut() -> None:

@@ -461,7 +461,7 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
     judged = [e.reading.status for k, e in enumerate(after) if k > 0 and k not in unmeasured]
     assert set(judged) == {Status.INSIDE}
     readings = tuple(entry.reading for entry in after)
-    replay = Replay("lossy", readings, (), "speed", "m/s", 1.0, period=0.025)
+    replay = Replay("lossy", readings, "speed", "m/s", 1.0, period=0.025)
     assert (replay.filled, replay.verdict) == (len(lost), verdict.value)
     assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
 

@@ -2,16 +2,18 @@
 
 import ctypes
 import math
+import re
 import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bags.samples import f1tenth
-from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, identify, read_bags
+from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, identify, read_bags, replay
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.c_table import c_table, write_table
@@ -87,6 +89,25 @@ def test_c_says_what_python_says_of_every_sample(
             wanted = expected.margin, expected.assumption, expected.nominal[0]
             assert found == pytest.approx(wanted, rel=CLOSE, abs=CLOSE)
     assert seen == set(Status)
+
+
+def test_the_program_of_the_page_reads_a_table_of_samples(
+    made: OutputTubeDesign, trials: Dataset, tmp_path: Path
+) -> None:
+    compiled(made, tmp_path)  # writes the table
+    page = (CORE.parents[1] / "docs" / "howto-offline.md").read_text()
+    (line,) = re.findall(r"^    (gcc .*)$", page, re.MULTILINE)
+    for source in CORE.glob("*.[ch]"):
+        shutil.copy(source, tmp_path)
+    subprocess.run(line.split(), cwd=tmp_path, check=True)
+    run = replace(trials.trajectories[0], y=0.6 * trials.trajectories[0].y)
+    rows = np.column_stack([run.t, run.y, run.u])
+    np.savetxt(tmp_path / "run.csv", rows, "%.17g", ",", header="t,y,u")
+    with (tmp_path / "run.csv").open() as table:
+        said = subprocess.run(tmp_path / "monitor", stdin=table, capture_output=True, text=True)
+    assert said.returncode == 1
+    words = [text.split(" ", 1)[1].rpartition(" ")[0] for text in said.stdout.splitlines()]
+    assert words == [reading.status.value for reading in replay(made, run).readings]
 
 
 @pytest.mark.parametrize("name", ["two_outputs", "cascade", "following"])

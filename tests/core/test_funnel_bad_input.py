@@ -20,20 +20,10 @@ from nlsid_core.design import ContinuousTracking, Goal, design_funnel, integrate
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
 from tests import funnel_problem
+from tests.funnel_problem import hanging
 from tests.marks import slow_among
 
 KNOTS = 9
-
-
-def hanging() -> tuple[VectorField, Nominal]:
-    """A pendulum to third order, with torque, at rest for 2 s."""
-
-    def pendulum(x: Any, u: Any) -> Any:
-        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
-
-    field = VectorField.from_function(pendulum, 2, 1)
-    t = np.linspace(0, 2, KNOTS)
-    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
 def fair() -> Json:

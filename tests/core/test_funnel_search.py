@@ -21,21 +21,11 @@ from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values
+from tests.funnel_problem import hanging
 
 GOAL = 20 * np.eye(2)
 WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}
 DEFAULTS: Any = {"policy": None} | WEIGHTS
-
-
-def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
-    """A pendulum to third order, with torque, at rest for 2 s."""
-
-    def pendulum(x: Any, u: Any) -> Any:
-        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
-
-    field = VectorField.from_function(pendulum, 2, 1)
-    t = np.linspace(0, 2, knots)
-    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
 def pulsed() -> tuple[VectorField, Nominal]:

@@ -110,19 +110,12 @@ def test_holding_costs_room(held: FunnelDesign) -> None:
     assert 0.2 < held.funnel.volume(0.0) / free.funnel.volume(0.0) < 1
 
 
-def refused(files: Files, reason: str) -> None:
-    """The kernel refuses the documents, all digests fresh."""
-    bind(files)
-    with refusals.refused(reason):
-        proofs.decide(files[PROOF], files)
-
-
 LONG = {"an input that turns more slowly", "rates of one sign", "a rate piece less"}
 
 
 @pytest.mark.parametrize("what", slow_among(HELD_FORGERIES, LONG))
 def test_what_is_a_little_more_than_was_proved_is_refused(files: Files, what: str) -> None:
-    refused(forged_held(files, what), HELD_FORGERIES[what][1])
+    refusals.refused_with_fresh_digests(forged_held(files, what), HELD_FORGERIES[what][1])
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ STATE_AFFINE = {
     "certified": True,
     "iterations": 5,
     "leading_degree": 1,
-    "right_degree": 1,
+    "inputs_degree": 1,
     "input_range": [0.0, 0.5],
 }
 BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "03", "05", "13", "23", "35"}]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid import Dataset, Fit, Polynomial, compare, identify, standard_errors, to_control
+from nlsid import Dataset, Fit, Polynomial, compare, identify, replay, standard_errors, to_control
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models import DifferenceEquation
@@ -16,10 +16,12 @@ LONGEST = 2000  # characters of what a cell's last line prints
 def test_what_a_cell_ends_with_is_short(
     train: Dataset, fit: Fit[DifferenceEquation], design: OutputTubeDesign
 ) -> None:
-    for shown in (train, train.trajectories[0], fit, fit.model, design):
-        assert 20 < len(repr(shown)) <= LONGEST
-    assert "<svg" in train._repr_html_()
-    assert len(train._repr_html_()) <= LONGEST
+    held = replay(design, train.trajectories[0])
+    tables = compare(train, {"fitted": fit.model}), standard_errors(fit.model, train)
+    shown = (train, train.trajectories[0], fit, fit.model, design, design.verdict, held, *tables)
+    assert not [each for each in shown if not 20 < len(repr(each)) <= LONGEST]
+    assert not [each for each in (train, fit, held) if "<svg" not in each._repr_html_()]
+    assert "PROVED tube" in design._repr_html_() == design.verdict._repr_html_()
 
 
 def test_data_frames_are_trials(train: Dataset) -> None:
@@ -31,7 +33,8 @@ def test_data_frames_are_trials(train: Dataset) -> None:
         )
         for trial in train
     }
-    made = Dataset.from_pandas(tables, y="speed", u=["command"])
+    made = Dataset.from_pandas(tables, y="speed", u=["command"], paths={"speed": "/odom:speed"})
+    assert (made.trajectories[0].y_paths, made.trajectories[0].u_paths) == (("/odom:speed",), ("",))
     assert made.names == train.names
     for one, other in zip(made, train, strict=True):
         np.testing.assert_array_equal(np.hstack([one.y, one.u]), np.hstack([other.y, other.u]))
@@ -65,6 +68,7 @@ def test_models_are_compared_on_the_same_trials(
 def test_python_control_steps_like_the_model(fit: Fit[DifferenceEquation]) -> None:
     control = pytest.importorskip("control")
     model = replace(fit.model, c=0.0)
+    assert to_control(model).output_labels == [model.y.name]
     stepped = control.step_response(to_control(model), T=np.arange(50) * model.period)
     inputs = np.concatenate([np.zeros(2), np.ones(50)])
     simulated = model.simulate(inputs, np.zeros(2))[2:]
@@ -87,7 +91,10 @@ def test_standard_errors_are_those_of_the_differences(
     errors = np.concatenate([t.y[2:, 0] for t in train]) - simulated(given)
     covariance = np.linalg.inv(J.T @ J) * (errors @ errors) / (len(errors) - 6)
     expected = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(standard_errors(model, train), expected, rtol=1e-3)
+    found = standard_errors(model, train)
+    assert list(found.rows) == ["a1", "a2", "b0", "b1", "b2", "c"]
+    assert [row[0] for row in found.rows.values()] == given.tolist()
+    np.testing.assert_allclose([found[name] for name in found.rows], expected, rtol=1e-3)
     still = Dataset(tuple(replace(trial, u=0.0 * trial.u) for trial in train))
     with pytest.raises(DataError, match="do not determine"):
         standard_errors(model, still)

@@ -294,9 +294,10 @@ def test_where_float64_has_no_digits_for_a_tube_nothing_is_judged_and_none_is_de
 
 def test_an_input_that_the_model_refuses_or_a_box_that_is_left_is_not_judged() -> None:
     monitor, trial = monitor_of("implicit_box"), trial_of("implicit_box", 100)
-    readings = []
-    for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True)):
-        readings.append(monitor.update(float(t), y, np.array([40.0]) if k == 50 else u))
+    readings = [
+        monitor.update(float(t), y, np.array([40.0]) if k == 50 else u)
+        for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True))
+    ]
     assert readings[49].status is Status.INSIDE
     assert "outside the box" in readings[50].reason
     assert readings[50].status is readings[51].status is Status.UNKNOWN

@@ -155,8 +155,7 @@ def unit(rng: np.random.Generator, count: int) -> FloatArray:
 
 def pieces_of(files: Files) -> list[Any]:
     """The proof's pieces."""
-    found: list[Any] = files["funnel.proof.json"]["proof"]["pieces"]
-    return found
+    return list(files["funnel.proof.json"]["proof"]["pieces"])
 
 
 def limits_widened(files: Files) -> None:

@@ -8,8 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from benchmarks.recorded import heat_exchanger, single
-from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Trajectory, check, identify
-from nlsid_core import files
+from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Trajectory, identify
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
 from nlsid_core.identification import prove_stability, trail
@@ -27,6 +26,7 @@ from nlsid_core.identification.trail import tried
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import DifferenceEquation
 from tests.conftest import synthetic_dataset
+from tests.decided import checked
 from tests.marks import slow_among
 from tests.state_affine_rows import EXACT, near_identity, problem
 
@@ -88,14 +88,6 @@ def test_the_last_step_of_a_linear_model_keeps_its_proof_and_never_goes_up() -> 
     fit = identify(dataset, Polynomial(3))
     again = minimise_simulation_error(regression, np.r_[1.0, -fit.model.a], stable=True)
     assert simulation_percent(again, dataset) <= simulation_percent(fit.model, dataset) * (1 + 1e-9)
-
-
-def checked(model: Any, folder: Path) -> str:
-    proof = prove_stability(model)
-    assert proof is not None
-    files.write_document(folder / "model.json", model.document())
-    files.write_document(folder / "model.proof.json", proof.document(model, "model.json"))
-    return check(folder / "model.proof.json").statement
 
 
 def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Path) -> None:

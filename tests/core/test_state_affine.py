@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError
@@ -23,7 +22,7 @@ from nlsid_core.identification.polynomial.matrix_set import MatrixSet, slowest_r
 from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.proofs import check
+from tests.decided import checked
 from tests.state_affine_rows import problem
 
 
@@ -209,14 +208,6 @@ def left(model: StateAffineModel) -> np.ndarray:
 def smallest(inside: MatrixSet, theta: np.ndarray, extra: np.ndarray) -> float:
     z = np.concatenate([theta, extra])
     return min(float(np.linalg.eigvalsh(part.at(z)).min()) for part in inside.inequalities())
-
-
-def checked(model: StateAffineModel, folder: Path) -> str:
-    proof = prove_stability(model)
-    assert proof is not None
-    files.write_document(folder / "model.json", model.document())
-    files.write_document(folder / "model.proof.json", proof.document(model, "model.json"))
-    return check(folder / "model.proof.json").statement
 
 
 @pytest.mark.parametrize("case", MARKED)

@@ -23,7 +23,6 @@ from nlsid_core.design import (
 )
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.dynamics import (
-    Nominal,
     PiecewisePolynomial,
     VectorField,
     cubic_through,
@@ -38,6 +37,7 @@ from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.decided import decided
 from tests.funnel_files import saved, write
+from tests.funnel_problem import hanging
 from tests.verbs import nlsid
 
 
@@ -52,13 +52,6 @@ def damped(t: Any, x: Any, u: Any) -> Any:
     """A pendulum to third order, hanging, with torque."""
     del t
     return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
-
-
-def hanging(knots: int = 21) -> tuple[VectorField, Nominal]:
-    """The pendulum at rest for 2 s."""
-    field = VectorField.from_function(damped, 2, 1)
-    t = np.linspace(0, 2, knots)
-    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
 def test_a_satellite_funnel_is_proved_for_every_t(satellite: FunnelDesign, tmp_path: Path) -> None:
@@ -88,7 +81,7 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
 
 @pytest.mark.slow
 def test_alternation_ends_where_the_sweep_does() -> None:
-    field, nominal = hanging()
+    field, nominal = hanging(21)
     design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
     steps = LSteps(field, design.policy)
     start = exponential_start(steps, design.funnel.P)
@@ -121,7 +114,7 @@ def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path
 
     bounds = [[-0.02, 0.02], [0.15, 0.25]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds)
-    plain, nominal = hanging()
+    plain, nominal = hanging(21)
     design = design_funnel(ContinuousTracking(field, nominal, goal=20 * np.eye(2)))
     calm = design_funnel(ContinuousTracking(plain, nominal, goal=20 * np.eye(2)))
     assert design.funnel.volume_integral() < calm.funnel.volume_integral()
@@ -137,7 +130,7 @@ def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path
 
 
 def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
-    plain, _ = hanging()
+    plain, _ = hanging(21)
 
     def heavier(x: Any, u: Any) -> Any:
         return np.array([x[1], -2 * x[0] + x[0] ** 3 / 3 - x[1] / 5 + u[0]])
@@ -164,7 +157,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
     valid: list[list[float]] = [[0, -0.2, 0.2], [2, -9, 9]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
-    _, nominal = hanging()
+    _, nominal = hanging(21)
     design = design_funnel(ContinuousTracking(field, nominal, goal=30 * np.eye(2)))
     assert design.found.proved.pieces.kappa is not None
     assert not design.found.proved.pieces.vertex.any()

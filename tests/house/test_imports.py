@@ -40,7 +40,7 @@ BANDS = {
     "run": {"running", "designs"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs"},
-    "base": {"errors", "arrays", "files", "options", "progress", "native"},
+    "base": {"errors", "arrays", "files", "options", "progress", "native", "shown"},
     "kernel": {"kernel"},
 }
 BELOW = {

@@ -43,9 +43,11 @@ def process(module: str, **parameters: object) -> Iterator[subprocess.Popen[str]
     """Run a node's module with ROS parameters, and remappings where a name starts with __ or with a
     slash; killed at the end if it still runs.
     """
-    settings = []
-    for name, value in parameters.items():
-        settings += ["-r" if name.startswith(("__", "/")) else "-p", f"{name}:={value}"]
+    settings = [
+        word
+        for name, value in parameters.items()
+        for word in ("-r" if name.startswith(("__", "/")) else "-p", f"{name}:={value}")
+    ]
     running = subprocess.Popen(
         [sys.executable, "-m", module, "--ros-args", *settings],
         stdout=subprocess.PIPE,

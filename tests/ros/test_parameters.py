@@ -86,11 +86,13 @@ def ros() -> Iterator[None]:
 def test_a_parameter_that_makes_no_sense_is_refused_by_name(
     name: str, parameters: dict[str, object], message: str
 ) -> None:
-    arguments = ["--ros-args"]
-    for key, value in parameters.items():
-        arguments += ["-r" if key.startswith("__") else "-p", f"{key}:={value}"]
+    settings = [
+        word
+        for key, value in parameters.items()
+        for word in ("-r" if key.startswith("__") else "-p", f"{key}:={value}")
+    ]
     with pytest.raises((NlsidError, OSError), match=re.escape(message)):
-        node_class(name)(arguments).start_itself()
+        node_class(name)(["--ros-args", *settings]).start_itself()
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -70,9 +70,7 @@ def search(setting: Setting, progress: Progress) -> Found:
     def held(period: float) -> Found:
         return _held(setting, expansion, replace(hold, period=period), changes, progress)
 
-    if not hold.longest:
-        return held(hold.period)
-    return _longest(held)
+    return _longest(held) if hold.longest else held(hold.period)
 
 
 def _longest(held: Callable[[float], Found]) -> Found:

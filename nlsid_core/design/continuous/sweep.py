@@ -199,6 +199,4 @@ def _root(slack: Callable[[float], float], low: float, high: float) -> float:
     while inside > low and slack(inside) < 0:
         high, inside = inside, inside * step
         step *= step
-    if inside <= low:
-        return low
-    return float(brentq(slack, inside, high, xtol=CLOSE * high))
+    return low if inside <= low else float(brentq(slack, inside, high, xtol=CLOSE * high))

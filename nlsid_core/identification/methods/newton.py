@@ -175,9 +175,7 @@ def minimise(
     if steps is not None:
         return descent.to_minimum(z, mu=descent.weight(z, gap), limit=steps)
     found = descent.freely(z)
-    if found.is_inside:
-        return found
-    return _on_boundary(bound, descent, z, found)
+    return found if found.is_inside else _on_boundary(bound, descent, z, found)
 
 
 def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
@@ -296,8 +294,7 @@ def _newton_step(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
         matrix, side = scale[:, None] * hessian * scale, gradient * scale
     if not (np.isfinite(matrix).all() and np.isfinite(side).all()):
         raise SolverError("Newton's method met derivatives beyond all numbers; try fewer lags")
-    step: FloatArray = -scale * np.linalg.lstsq(matrix, side, rcond=None)[0]
-    return step
+    return np.asarray(-scale * np.linalg.lstsq(matrix, side, rcond=None)[0])
 
 
 class Descent:

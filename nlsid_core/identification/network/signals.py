@@ -123,11 +123,9 @@ class Signals:
 
     def own_filter(self, number: int, theta: FloatArray) -> FloatArray:
         """A = [1, -a₁, …] of a signal's own past, its maps left out."""
-        A = [1.0]
-        for part in self.nodes[number - self.inputs - 1].taps:  # type: ignore[union-attr]
-            if part.source == number:
-                A += [-weight for _, weight in part.weights(theta)]
-        return np.array(A)
+        taps = self.nodes[number - self.inputs - 1].taps  # type: ignore[union-attr]
+        own = [part.weights(theta) for part in taps if part.source == number]
+        return np.array([1.0, *(-weight for weights in own for _, weight in weights)])
 
     def radius(self, theta: FloatArray) -> float:
         """Of the slowest pole of the signals whose past passes no map."""

@@ -162,8 +162,7 @@ class MatrixSet:
 
 def _degrees(problem: StateAffineRows) -> IntArray:
     """(n_w,): of the coefficients of the outputs in each entry of w."""
-    degrees: IntArray = np.max(np.concatenate(problem.left), axis=0)
-    return degrees
+    return np.asarray(np.max(np.concatenate(problem.left), axis=0))
 
 
 def _is_between_ends(problem: StateAffineRows) -> bool:

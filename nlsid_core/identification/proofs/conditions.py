@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nlsid_core.arrays import objects_at
 from nlsid_core.errors import ShapeError
 from nlsid_core.polynomial import Polynomial, constant, jacobian, variables
 from nlsid_core.polynomial.algebra import as_polynomial
@@ -127,10 +128,7 @@ def box(names: Sequence[str], ends: Sequence[Sequence[Number] | tuple[Number, Nu
 
 def constants(rows: Sequence[Sequence[float]]) -> Polynomials:
     """A matrix of numbers as exact constant polynomials."""
-    result = np.empty((len(rows), len(rows)), dtype=object)
-    for i, row in enumerate(rows):
-        result[i] = [constant(Fraction(value)) for value in row]
-    return result
+    return objects_at((len(rows),) * 2, lambda at: constant(Fraction(rows[at[0]][at[1]])))
 
 
 def _used(p: Polynomial) -> set[str]:
@@ -164,7 +162,4 @@ def _identity(n: int) -> Polynomials:
 
 def filled(matrix: Polynomials) -> Polynomials:
     """Every entry a polynomial."""
-    result = np.empty(matrix.shape, dtype=object)
-    for index in np.ndindex(matrix.shape):
-        result[index] = as_polynomial(matrix[index])
-    return result
+    return objects_at(matrix.shape, lambda at: as_polynomial(matrix[at]))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nlsid_core.arrays import objects
 from nlsid_core.errors import DataError
 from nlsid_core.identification.proofs import conditions
 from nlsid_core.identification.proofs.conditions import GAP, Domain, Inequality
@@ -84,10 +85,8 @@ def inequalities(
 
 def exact_polynomials(parts: Polynomials, names: tuple[str, ...]) -> NDArray[np.object_]:
     """The stored polynomials with exact coefficients."""
-    result = np.empty(parts.coefficients.shape[1], dtype=object)
-    for i, column in enumerate(parts.coefficients.T):
-        result[i] = Polynomial(parts.exponents, column, names).exact()
-    return result
+    columns = parts.coefficients.T
+    return objects([Polynomial(parts.exponents, column, names).exact() for column in columns])
 
 
 def _separated(

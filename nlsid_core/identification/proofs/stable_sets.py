@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nlsid_core.arrays import Json
+from nlsid_core.arrays import Json, objects_at
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
 from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.sets import (
@@ -138,10 +137,7 @@ def storage_template(kind: str, names: Names) -> Storage:
 def _valued(storage: Storage, solution: Solution) -> Storage:
     """With the unknowns at their values, exactly these floats."""
     assert storage is not None
-    result: NDArray[np.object_] = np.empty(storage.shape, dtype=object)
-    for index in np.ndindex(*storage.shape):
-        result[index] = solution.value(as_polynomial(storage[index])).exact()
-    return result
+    return objects_at(storage.shape, lambda at: solution.value(as_polynomial(storage[at])).exact())
 
 
 def _solved(

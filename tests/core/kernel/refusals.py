@@ -8,6 +8,8 @@ import pytest
 
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel import REASONS, Rejected
+from nlsid_core.proofs import decide
+from tests.funnel_files import PROOF, Files, bind
 
 
 @contextmanager
@@ -18,3 +20,10 @@ def refused(reason: str) -> Iterator[None]:
         yield
     refusal: Any = found.value
     assert refusal.reason == reason, str(refusal)
+
+
+def refused_with_fresh_digests(files: Files, reason: str) -> None:
+    """The kernel refuses the documents of a funnel, all digests fresh, with this reason."""
+    bind(files)
+    with refused(reason):
+        decide(files[PROOF], files)

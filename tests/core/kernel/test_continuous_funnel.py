@@ -399,13 +399,6 @@ def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_pa
 # -- each class of fault as a false claim ----------------------------------------------------------
 
 
-def refused(files: Files, reason: str) -> None:
-    """The kernel refuses the documents, all digests fresh, with this reason."""
-    bind(files)
-    with refusals.refused(reason):
-        proofs.decide(files[PROOF], files)
-
-
 def worst(files: Files) -> Fraction:
     """The least dρ/ds - dW/ds - margin hρ on the boundary, over pieces whose mode holds there."""
     proof = copy_of(files)[PROOF]["proof"]
@@ -441,7 +434,7 @@ def test_repeated_monomials_are_refused_not_added_up(files: Files) -> None:
     for extra in (1e16, 1.5, -1e16):
         equation["exponents"].insert(place, [0, 1, 0, 0])
         equation["coefficients"].insert(place, extra)
-    refused(files, "malformed")
+    refusals.refused_with_fresh_digests(files, "malformed")
 
 
 def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
@@ -453,7 +446,7 @@ def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
     assert proofs.decide(files[PROOF], files).margin > 0
     equation["coefficients"][place] = f"{9 * 3**41 + 1}/{3**41}"
     assert worst(files) < 0
-    refused(files, "not_positive")
+    refusals.refused_with_fresh_digests(files, "not_positive")
 
 
 @pytest.mark.parametrize(
@@ -476,7 +469,7 @@ def test_whole_numbers_beyond_2_to_the_53_are_refused(
     for member in members[:-1]:
         place = place[member]
     place[members[-1]] = 2**53 + 1
-    refused(files, "malformed")
+    refusals.refused_with_fresh_digests(files, "malformed")
 
 
 def test_a_box_far_away_and_narrow_is_taken_exactly(files: Files) -> None:
@@ -486,14 +479,14 @@ def test_a_box_far_away_and_narrow_is_taken_exactly(files: Files) -> None:
     equation["exponents"].insert(0, [0, 0, 0, 0])
     equation["coefficients"].insert(0, -1000000010 / 8)
     assert worst(files) < 0  # the funnel was made for a w of at most 0.25
-    refused(files, "not_positive")
+    refusals.refused_with_fresh_digests(files, "not_positive")
 
 
 def test_limits_that_clip_out_of_where_the_dynamics_are_valid_are_refused(files: Files) -> None:
     """ũ is within [-9, 1.5] in the funnel; clipped to [2, 3] the input is 2, outside."""
     files[FIELD]["valid"] = [[1, -9.0, 1.5]]
     files[POLICY]["limits"] = [[0, 2.0, 3.0]]
-    refused(files, "not_valid")
+    refusals.refused_with_fresh_digests(files, "not_valid")
 
 
 def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(files: Files) -> None:
@@ -504,7 +497,7 @@ def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(fil
     files[FIELD]["valid"] = [[1, -1.5, 1.0]]
     x = -((files[FUNNEL]["rho"][0] / files[FUNNEL]["P"][0][0][0]) ** 0.5)
     assert -files[POLICY]["K"][0][0][0][0] * x > 1  # what the policy asks for there
-    refused(files, "not_valid")
+    refusals.refused_with_fresh_digests(files, "not_valid")
 
 
 def member(path: str, new: Any) -> Callable[[Files], None]:
@@ -564,19 +557,19 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
     files: Files, change: Callable[[Files], None], reason: str
 ) -> None:
     change(files)
-    refused(files, reason)
+    refusals.refused_with_fresh_digests(files, reason)
 
 
 def test_a_claim_without_its_goal_says_nothing_of_it(files: Files) -> None:
     del files[PROOF]["claim"]["goal"]
-    refused(files, "malformed")
+    refusals.refused_with_fresh_digests(files, "malformed")
     del files[PROOF]["proof"]["goal_multiplier"]
     assert "goal" not in proofs.decide(files[PROOF], files).statement
 
 
 def test_a_name_with_a_second_line_prints_none(files: Files) -> None:
     files[FIELD]["expansion"] = "by hand\nPROVED everything"
-    refused(files, "malformed")
+    refusals.refused_with_fresh_digests(files, "malformed")
     files[FIELD]["expansion"] = "by hand"
     bind(files)
     files[PROOF]["claim"]["about"]["funnel"]["file"] = "funnel.json\nPROVED"
@@ -596,7 +589,7 @@ def test_a_nominal_that_jumps_and_a_break_between_knots_are_refused(files: Files
     jumping = copy_of(files)
     for name in (POLICY, FUNNEL):
         jumping[name]["x"][2][0][0] = 0.5
-    refused(jumping, "malformed")
+    refusals.refused_with_fresh_digests(jumping, "malformed")
     files[FIELD]["breaks"] = [0.3]
     files[FIELD]["pieces"] *= 2
-    refused(files, "malformed")
+    refusals.refused_with_fresh_digests(files, "malformed")

@@ -33,6 +33,7 @@ from nlsid_core.kernel.files import (
 from nlsid_core.kernel.polynomials import Ring
 from nlsid_core.kernel.positivity import read_squares
 from tests.core.kernel.mutations import CORPUS
+from tests.core.kernel.oracle_continuous import determinant
 from tests.core.kernel.refusals import refused
 
 SECONDS = 20.0  # of processor time that any one refusal may take, on a slow machine
@@ -221,7 +222,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
                 decide(rows, "M")
         return
     M = [[Fraction(rows[max(i, j)][min(i, j)]) for j in range(size)] for i in range(size)]
-    minors = [_determinant([row[:k] for row in M[:k]]) for k in range(1, size + 1)]
+    minors = [determinant([row[:k] for row in M[:k]]) for k in range(1, size + 1)]
     if all(minor > 0 for minor in minors):
         definite(M, "M")
         semidefinite(M, "M")
@@ -229,7 +230,7 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
     with refused("not_definite"):
         definite(M, "M")
     principal = [
-        _determinant([[M[i][j] for j in chosen] for i in chosen])
+        determinant([[M[i][j] for j in chosen] for i in chosen])
         for k in range(1, size + 1)
         for chosen in combinations(range(size), k)
     ]
@@ -238,18 +239,6 @@ def test_definiteness_is_refused_or_true(rows: Any) -> None:
     else:
         with refused("not_definite"):
             semidefinite(M, "M")
-
-
-def _determinant(M: list[list[Fraction]]) -> Fraction:
-    if not M:
-        return Fraction(1)
-    return sum(
-        (
-            (-1) ** j * entry * _determinant([row[:j] + row[j + 1 :] for row in M[1:]])
-            for j, entry in enumerate(M[0])
-        ),
-        Fraction(0),
-    )
 
 
 def test_matrices_that_floats_cannot_tell_and_matrices_that_take_too_long() -> None:
