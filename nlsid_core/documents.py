@@ -64,10 +64,7 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
 
 
 def load(path: Path | str) -> Noun:
-    """Read a funnel, policy, vector field or model of any kind; DocumentError says what is wrong.
-
-    For one kind only, ask its class: `ContinuousFunnel.load(path)`, `ContinuousPolicy.load(path)`.
-    """
+    """Read a funnel, policy, vector field or model; DocumentError says what is wrong."""
     return read(files.load_document(path), source=str(path))
 
 

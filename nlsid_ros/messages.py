@@ -29,7 +29,6 @@ from nlsid_ros.running import ManagedNode
 
 _STAMP: Final = struct.Struct("<iI")
 _NAN: Final = struct.pack("<d", math.nan)
-EMPTY: Final = 2 * 4  # bytes of velocity and effort
 ZERO: Final = "zero"
 REFUSED: Final = "refused"
 OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
@@ -247,7 +246,8 @@ def _blank(names: tuple[str, ...], frame: str) -> tuple[bytes, int]:
     message.header.frame_id = frame
     data = serialize_message(message)
     at = data.index(_NAN)  # which no text has
-    return data[: at + 8 * len(names) + EMPTY], at  # rclpy's has bytes of memory at its end
+    # No velocity and no effort are 8 bytes; rclpy's message has bytes of memory after them.
+    return data[: at + 8 * len(names) + 8], at
 
 
 def stamp_ns_of(message: Any) -> int:

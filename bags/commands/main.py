@@ -66,15 +66,14 @@ def main() -> None:
     _prepare_streams()
     try:
         try:
-            verb, given = "".join(sys.argv[1:2]), sys.argv[2:]
-            if verb == "bag":
+            if sys.argv[1:2] == ["bag"]:
                 from bags.commands.bag_cli import bag_app
 
-                bag_app(given, prog_name="nlsid bag")
-            elif verb == "run":
+                bag_app(sys.argv[2:], prog_name="nlsid bag")
+            elif sys.argv[1:2] == ["run"]:
                 from bags.commands.running_cli import run_app
 
-                run_app(given, prog_name="nlsid run")
+                run_app(sys.argv[2:], prog_name="nlsid run")
             else:
                 from bags.commands.cli import app
 

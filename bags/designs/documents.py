@@ -60,8 +60,7 @@ def load_model(path: Path | str) -> DifferenceEquation:
 
 def load_stable_model(path: Path | str) -> StableModel:
     """Read a model of any class that tubes are proved for; DocumentError if the file has none."""
-    model = load_noun(path)
+    model: StableModel = load_noun(path)
     if not isinstance(model, get_args(StableModel)):
         raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
-    found: StableModel = model
-    return found
+    return model

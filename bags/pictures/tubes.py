@@ -76,7 +76,7 @@ def draw_free_run(model: StateModel, validation: Dataset) -> Figure:
     Simulated in each stretch in the box of the model's data, from its measured start, as the class
     was chosen.
     """
-    errors = [free_run_error(model, Dataset((trial,)), in_box=True) for trial in validation]
+    errors = [free_run_error(model, Dataset((trial,))) for trial in validation]
     trial, error = validation.trajectories[int(np.argmax(errors))], max(errors)
     parts = stretches_in_box(model, trial)
     simulated = np.full_like(trial.y, np.nan)

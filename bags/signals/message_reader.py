@@ -72,11 +72,10 @@ class _Laid:
 
     def numbers(self, data: bytes) -> list[float]:
         """The numbers of a message that fits, in the order of the gatherer's targets."""
-        found = []
-        for at, kind, is_bool in self._leaves:
-            number = np.frombuffer(data, kind, 1, at).item()
-            found.append(float(bool(number) if is_bool else number))
-        return found
+        found = (
+            (np.frombuffer(data, kind, 1, at).item(), is_bool) for at, kind, is_bool in self._leaves
+        )
+        return [float(bool(number) if is_bool else number) for number, is_bool in found]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 from math import gamma, pi
-from pathlib import Path
 
 import numpy as np
 
@@ -149,25 +148,12 @@ class ContinuousFunnel:
         volumes = np.array([self.volume(s) for s in self.t])
         return float((volumes[1:] + volumes[:-1]) @ np.diff(self.t) / 2)
 
-    def outline(self, t: float, axes: tuple[int, ...], points: int = 100) -> FloatArray:
-        """Boundary of the projection onto 2 or 3 axes: (points, 2), or (points, points, 3)."""
+    def outline(self, t: float, axes: tuple[int, int], points: int = 100) -> FloatArray:
+        """(points, 2): the boundary of the projection onto two axes."""
         chosen = list(axes)
         shadow = np.linalg.inv(self.shape(t))[np.ix_(chosen, chosen)]
         angle = np.linspace(0, 2 * np.pi, points)
-        if len(chosen) == 2:
-            unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        elif len(chosen) == 3:
-            tilt = np.linspace(0, np.pi, points)[:, None]
-            unit = np.stack(
-                [
-                    np.sin(tilt) * np.cos(angle),
-                    np.sin(tilt) * np.sin(angle),
-                    np.cos(tilt) + 0 * angle,
-                ],
-                axis=-1,
-            )
-        else:
-            raise ShapeError(f"an outline is drawn in 2 or 3 axes, not {len(chosen)}")
+        unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         return np.asarray(self.nominal(t)[chosen] + unit @ np.linalg.cholesky(shadow).T)
 
     def document(self) -> Json:
@@ -196,15 +182,6 @@ class ContinuousFunnel:
             files.member(document, "vector_field", str, source=source),
             files.member(document, "policy", str, source=source),
         )
-
-    @classmethod
-    def load(cls, path: Path | str) -> "ContinuousFunnel":
-        """Read a funnel file; DocumentError says what is wrong with it."""
-        return cls.from_document(files.load_document(path), source=str(path))
-
-    def save(self, path: Path | str) -> None:
-        """Write the funnel; the file appears whole or not at all."""
-        files.write_document(path, self.document())
 
     def _inside(self, t: float) -> float:
         """The time t, or the end that it misses by rounding."""

@@ -38,6 +38,7 @@ STRETCHES = 6  # of a recording, where stretches of time are held out
 FEW = 5  # excitations: of fewer, each is judged in stretches
 STARTS = (10, 20, 30, 45)  # samples that may show how a stretch starts, a fifth of it at most;
 PLACES = (0.0, 0.15, 0.3, 0.45)  # of a trial, where it is tried how many are needed,
+ENOUGH = 8  # trials, spread over all, that it is tried in,
 START_LAGS, START_STEPS, START_CLOSE = 4, 6, 1.04  # by a linear model, and its squared error
 SHORTEST = 20  # samples of a stretch
 SAMPLES = 8000  # that a fold is fitted to, at most
@@ -297,7 +298,7 @@ def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Fit[Model]:
 def _start(data: Dataset, shortest: int) -> int:
     """Samples that show how a stretch starts: the fewest that are about as good as more.
 
-    By the errors of a linear model that starts at several places of every trial.
+    By the errors of a linear model that starts at several places of some trials.
     """
     rows = [min(samples, shortest // 5) for samples in STARTS]
     attempt = Attempt(Polynomial(START_LAGS), Rse(START_STEPS))
@@ -308,7 +309,7 @@ def _start(data: Dataset, shortest: int) -> int:
     errors = []
     for samples in rows:
         squares = []
-        for trial in data:
+        for trial in data.trajectories[:: -(-len(data.trajectories) // ENOUGH)]:
             for first in (int(place * len(trial)) for place in PLACES):
                 part = trial.rows(slice(first, first + min(shortest, SAMPLES // FOLDS)))
                 missed = simulate_started(model, part, samples) - part.y

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -106,19 +107,27 @@ class History:
 class Fit(Generic[M]):
     """What `identify` found: every candidate in order, the chosen one, and their errors.
 
-    errors: simulation error in % by dataset name ("train", "test", those given) and
-    name of the method. max_rate: the slowest rate a sample that was searched, and proofs of which
-    count. fit[name] is the candidate of the method called so.
+    scored: the datasets by name ("train", "test", those given). max_rate: the slowest rate a
+    sample that was searched, and proofs of which count. fit[name] is the candidate of the method
+    called so.
     """
 
     candidates: tuple[Candidate[M], ...]
     method: Method
     history: History
-    errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    scored: Mapping[str, Dataset] = field(default_factory=dict)
     max_rate: float = 1.0
 
     def __getitem__(self, method: str) -> Candidate[M]:
         return next(c for c in self.candidates if c.method.name == method)
+
+    @cached_property
+    def errors(self) -> dict[str, dict[str, float]]:
+        """Simulation error in % by name of the dataset and of the method."""
+        return {
+            name: {c.method.name: c.error_percent(dataset) for c in self.candidates}
+            for name, dataset in self.scored.items()
+        }
 
     @property
     def chosen(self) -> Candidate[M]:

@@ -1,7 +1,6 @@
 """`identify`: a dataset in, one stable model with its proof and the comparators out."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from nlsid_core.data.trajectory import Dataset
@@ -63,18 +62,14 @@ def identify(
         progress=progress,
     )
     trail = search(train, model_class, task)
-    fit = Fit(tuple(trail.candidates), chosen, trail.history, max_rate=slowest)
+    fit = Fit(tuple(trail.candidates), chosen, trail.history, scored, slowest)
     if fit.chosen.proof is None and not allow_unproved:
         remark = fit.chosen.remark and f" ({fit.chosen.remark})"
         raise Infeasible(
             f"no proof of stability for the model of {chosen.title}{remark}; try fewer lags, more "
             "or richer data, or a method that keeps a proof (`certified`)"
         )
-    errors = {
-        name: {c.method.name: c.error_percent(dataset) for c in fit.candidates}
-        for name, dataset in scored.items()
-    }
-    return replace(fit, errors=errors)
+    return fit
 
 
 def _unknown(asked: object, known: Sequence[Method]) -> str:

@@ -22,6 +22,7 @@ from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.starts import nearest_start
 
 Model = StableModel
+Explicit = DifferenceEquation | StateAffineModel | MonotoneEquation | BlockCascade | CellNetwork
 
 
 def history(model: Model) -> int:
@@ -48,15 +49,15 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
 
     The input of a block cascade's first filter is held at its first value before the trial.
     """
-    n = history(model)
+    return simulate_trials(model, [trial])[0]
+
+
+def _simulated(model: Explicit, start: FloatArray, u: FloatArray) -> FloatArray:
+    """(N, n_y) outputs from the first ones (n, n_y)."""
     if isinstance(model, StateAffineModel | CellNetwork):
-        return model.simulate(trial.u, trial.y[:n])
-    if isinstance(model, BlockCascade):
-        return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
-    if isinstance(model, ImplicitModel):
-        return simulate_together(model, [trial])[0]
-    u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
-    return model.simulate(u, trial.y[:n, 0])[:, None]
+        return model.simulate(u, start)
+    inputs = u if isinstance(model, MonotoneEquation) else u[:, 0]
+    return model.simulate(inputs, start[:, 0])[:, None]
 
 
 def simulate_started(model: Model, trial: Trajectory, samples: int) -> FloatArray:
@@ -69,7 +70,9 @@ def simulate_started(model: Model, trial: Trajectory, samples: int) -> FloatArra
     beginning = trial.rows(slice(samples))
 
     def simulated(starts: FloatArray) -> FloatArray:
-        return np.stack([simulate_trial(model, _from(start, beginning)) for start in starts])
+        if isinstance(model, ImplicitModel):
+            return np.stack(simulate_together(model, [_from(s, beginning) for s in starts]))
+        return np.stack([_simulated(model, start, beginning.u) for start in starts])
 
     return simulate_trial(model, _from(nearest_start(simulated, beginning.y, n), trial))
 
@@ -83,7 +86,8 @@ def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArr
     """`simulate_trial` of each; implicit models solve all trials together."""
     if isinstance(model, ImplicitModel):
         return simulate_together(model, trials)
-    return [simulate_trial(model, trial) for trial in trials]
+    n = history(model)
+    return [_simulated(model, trial.y[:n], trial.u) for trial in trials]
 
 
 def one_step_residual(model: Model, trial: Trajectory) -> FloatArray:

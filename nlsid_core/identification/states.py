@@ -14,9 +14,10 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, SolverError
+from nlsid_core.errors import DataError
 from nlsid_core.models.signal import signals_of
 from nlsid_core.models.state_map import StateModel
+from nlsid_core.polynomial.values import monomial_values
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds
 USEFUL = 0.97  # a larger model has to bring the error below this part of the smaller one's
@@ -74,7 +75,7 @@ def identify_states(
             tried.append((tuple(choice), np.inf))
             continue
         model = _model(train, groups, exponents, theta, data)
-        error = free_run_error(model, validation, in_box=True)
+        error = free_run_error(model, validation)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
             best = StateFit(model, error, ())
@@ -97,17 +98,17 @@ def classes_to_try(n: int, p: int) -> list[tuple[int, ...]]:
     ]
 
 
-def free_run_error(model: StateModel, dataset: Dataset, *, in_box: bool = False) -> float:
+def free_run_error(model: StateModel, dataset: Dataset) -> float:
     """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread.
 
-    in_box: only of the stretches in the box of the model's data, each from its measured start;
-    outside it the model is not a claim about anything. Infinite if it diverges or nothing is left.
+    Of the stretches in the box of the model's data, each from its measured start; outside it the
+    model is not a claim about anything. Infinite if it diverges or nothing is left.
     """
     errors = []
     for trial in dataset:
         spread, mean = trial.y.std(axis=0), trial.y.mean(axis=0)
         missed = whole = 0.0
-        for part in stretches_in_box(model, trial) if in_box else [slice(0, len(trial))]:
+        for part in stretches_in_box(model, trial):
             y, u = trial.y[part], trial.u[part]
             with np.errstate(over="ignore", invalid="ignore"):
                 missed += float(np.sum(((y - model.simulate(y[0], u[:-1])) / spread) ** 2))
@@ -127,10 +128,7 @@ def stretches_in_box(model: StateModel, trial: Trajectory) -> list[slice]:
 def where_it_fails(model: StateModel, dataset: Dataset) -> str:
     """The slice of a variable in which one step ahead is worst, in words."""
     points = np.concatenate([np.hstack([t.y[:-1], t.u[:-1]]) for t in dataset])
-    try:
-        missed = np.concatenate([t.y[1:] - model(t.y[:-1], t.u[:-1]) for t in dataset])
-    except SolverError:
-        return "some of its steps have no solution"
+    missed = np.concatenate([t.y[1:] - model(t.y[:-1], t.u[:-1]) for t in dataset])
     size = np.sqrt(np.mean((missed / missed.std(axis=0)) ** 2, axis=1))
     worst, words = 0.0, ""
     for j, signal in enumerate((*model.x, *model.u)):
@@ -157,16 +155,6 @@ def monomials_of(degrees: Sequence[int]) -> IntArray:
     return np.array(rows, dtype=np.int64)
 
 
-def features(exponents: IntArray, points: FloatArray) -> FloatArray:
-    """(N, m) values of the monomials (m, k) at points (N, k)."""
-    values = np.ones((len(points), len(exponents)))
-    for j, column in enumerate(points.T):
-        values *= np.vander(column, int(np.max(exponents[:, j])) + 1, increasing=True)[
-            :, exponents[:, j]
-        ]
-    return values
-
-
 def _instrumented(
     groups: Sequence[Sequence[Trajectory]], exponents: IntArray, scale: FloatArray
 ) -> FloatArray | None:
@@ -175,7 +163,7 @@ def _instrumented(
     moments, target = np.zeros((m, m)), np.zeros((m, n))
 
     def monomials_at(y: FloatArray, u: FloatArray) -> FloatArray:
-        return features(exponents, np.hstack([y[:-1], u]) / scale)
+        return monomial_values(exponents, np.hstack([y[:-1], u]) / scale)
 
     for members in groups:
         total = np.sum([member.y for member in members], axis=0)

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze, keep
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, freeze, keep
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, objects, recorded, tail
 
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
-START_STEPS, FIRST_DAMPING, DIFFERENCE = 40, 1e-3, 1e-7
+START_STEPS, FIRST_DAMPING, FOUND = 40, 1e-3, 1e-7
 LEAST_DAMPING = 1e-12  # with less, the matrix of a step can be singular in float64
 PRIOR = 1e-3  # weight of the usual start beside one measured sample, both in their spreads
 
@@ -49,9 +49,9 @@ class PiecewiseLinear:
         i = self.index(x)
         return np.asarray(self.values[i] + self.slopes[i] * (x - self.knots[i]))
 
-    def index(self, x: FloatArray) -> FloatArray:
+    def index(self, x: FloatArray) -> IntArray:
         """The interval that x is in, the outer ones reaching to infinity."""
-        return np.clip(np.searchsorted(self.knots, x, "right") - 1, 0, len(self.slopes) - 1)
+        return np.searchsorted(self.knots[1:-1], x, "right")
 
     def document(self) -> Json:
         """The JSON form."""
@@ -140,34 +140,53 @@ class CellNetwork(Recorded):
     def start_from(self, y: FloatArray, u: FloatArray) -> FloatArray:
         """x(0) by least squares on the outputs y (k, p) under u (k, q), near the usual start.
 
-        Levenberg-Marquardt steps with differences, which are exact where no knot is passed.
+        Levenberg-Marquardt steps; derivatives are exact, of the pieces that the run is in.
         """
         gains = np.abs(self.output[:, :-1])
         # An output that stands still has no spread, and where maps alone lead to it no direct gain.
         gain = gains[:, len(self.maps) :].max() or gains.max() or 1.0
         spread = np.maximum(np.std(y, axis=0), gain)
 
-        def residual(x: FloatArray) -> FloatArray:
-            error = (self.states(u, x)[0] - y) / spread
-            return np.concatenate([error.ravel(), PRIOR * (x - self.start)])
+        def residual(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            outputs, states = self.states(u, x)
+            error = ((outputs - y) / spread).ravel()
+            return np.concatenate([error, PRIOR * (x - self.start)]), states[:-1]
 
         x, damping = np.array(self.start), FIRST_DAMPING
-        r, moves = residual(x), DIFFERENCE * np.eye(len(x))
+        r, states = residual(x)
         for _ in range(START_STEPS):
-            J = np.column_stack([(residual(x + move) - r) / DIFFERENCE for move in moves])
+            moved = self._moved(u, states) / spread[:, None]
+            J = np.vstack([moved.reshape(-1, len(x)), PRIOR * np.eye(len(x))])
             normal = J.T @ J
             try:
                 step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
-            except np.linalg.LinAlgError:  # a state so large that differences do not move it
+            except np.linalg.LinAlgError:  # derivatives beyond what float64 holds
                 break
-            after = residual(x + step)
+            after, further = residual(x + step)
             better = after @ after < r @ r
             damping = max(damping * (0.1 if better else 10.0), LEAST_DAMPING)
             if better:
-                x, r = x + step, after
-            if np.abs(step).max() < DIFFERENCE * (1.0 + np.abs(x).max()):
+                x, r, states = x + step, after, further
+            if np.abs(step).max() < FOUND * (1.0 + np.abs(x).max()):
                 break
         return x
+
+    def _moved(self, u: FloatArray, x: FloatArray) -> FloatArray:
+        """(k, p, n): ∂y(t)/∂x(0) along a run with inputs u (k, q) and states x (k, n)."""
+        m, n = len(self.maps), len(self.start)
+        s = np.hstack([np.zeros((len(x), m)), x, u, np.ones((len(x), 1))])
+        of_x = np.zeros((len(x), m, n))  # ∂ν/∂x
+        for j, f in enumerate(self.maps):
+            z = s @ self.into[j]
+            s[:, j] = f(z)
+            inner = self.into[j, m : m + n] + self.into[j, :m] @ of_x
+            of_x[:, j] = f.slopes[f.index(z)][:, None] * inner
+        after, seen = (part[:, m : m + n] + part[:, :m] @ of_x for part in (self.next, self.output))
+        moved, found = np.eye(n), []
+        for A, C in zip(after, seen, strict=True):
+            found.append(C @ moved)
+            moved = A @ moved
+        return np.array(found)
 
     def simulate(self, u: ArrayLike, y_start: ArrayLike) -> FloatArray:
         """Outputs (N, p) for inputs u (N, q), from the state that the first outputs y_start show.

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
@@ -144,12 +143,3 @@ class ContinuousPolicy:
             files.member(document, "vector_field", str, source=source),
             files.array(document, "limits", (len(rows), 3), source=source),
         )
-
-    @classmethod
-    def load(cls, path: Path | str) -> "ContinuousPolicy":
-        """Read a policy file; DocumentError says what is wrong with it."""
-        return cls.from_document(files.load_document(path), source=str(path))
-
-    def save(self, path: Path | str) -> None:
-        """Write the policy; the file appears whole or not at all."""
-        files.write_document(path, self.document())

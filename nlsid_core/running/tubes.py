@@ -74,7 +74,6 @@ class TubeRun:
         if y_box is not None and u_box is not None:
             self._box = y_box.tolist(), u_box.tolist(), y_box.tolist() * (n // p)
         self._assuming = assuming(tubes)
-        self._ever = [] if any(t.samples for t in tubes) else list(range(len(tubes)))
         self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
         self._carried = self._linear.carried if self._linear is not None else None
         self.restart()
@@ -109,11 +108,9 @@ class TubeRun:
         """
         measured = _floats(y)
         applied = [math.nan] * len(self._stepper.u) if u is None else _floats(u)
-        fault = self._take(t)
-        if fault:
+        if fault := self._take(t):
             return self._unknown(t, measured, fault)
-        fault = self._fault(t, measured, applied)
-        if fault:
+        if fault := self._fault(t, measured, applied):
             return self._unknown(t, measured, self._without(applied, fault) or fault)
         self._beyond = self._beyond or self._beyond_training(t, applied)
         self._u_before = applied
@@ -218,8 +215,6 @@ class TubeRun:
     def _fault(self, t: float, y: list[float], u: list[float]) -> str:
         if len(y) != len(self._names) or len(u) != len(self._stepper.u):
             return f"{len(y)} outputs and {len(u)} inputs at t = {t:g} s"
-        if all(map(math.isfinite, (*y, *u))):
-            return ""
         for value, signal in zip((*y, *u), self._signals, strict=True):
             if not math.isfinite(value):
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
@@ -408,8 +403,6 @@ class TubeRun:
 
     def _lasting(self, k: int) -> list[int]:
         """The tubes whose proof covers k samples."""
-        if self._ever:
-            return self._ever
         return [j for j, tube in enumerate(self._tubes) if k <= (tube.samples or k)]
 
     def _unknown(self, t: float, y: list[float], reason: str) -> Reading:
@@ -468,17 +461,13 @@ class Limits(NamedTuple):
 
     def corrected(self, after: list[float], e: list[float]) -> list[float]:
         """The observer's next state: the model's, and L e."""
-        injected, *others = map(_scaled, self.columns, e)
-        for other in others:
-            injected = list(map(add, injected, other))
-        return list(map(add, after, injected))
+        parts = [map(mul, column, repeat(by)) for column, by in zip(self.columns, e, strict=True)]
+        return list(map(add, after, map(sum, zip(*parts, strict=True))))
 
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
-        if math.isinf(self.single):
-            return 0.0
-        parts = list(map(truediv, e, self.peak))
-        return float(max(map(mul, parts, parts)))
+        largest = max(map(abs, map(truediv, e, self.peak)))
+        return largest * largest
 
     def sizes(self, deviation: list[float], hidden: list[float]) -> list[float]:
         """(p,) how far out of the tube the outputs can be: 1 on its boundary."""
@@ -496,13 +485,7 @@ class Limits(NamedTuple):
 
 def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> list[float]:
     """By what each tube's level is multiplied at the next sample, whose inputs are u (n_u,)."""
-    if not meters:
-        return g
     return [meters[j].update(u) if j in meters else each for j, each in enumerate(g)]
-
-
-def _scaled(column: list[float], by: float) -> list[float]:
-    return list(map(mul, column, repeat(by)))
 
 
 def _floats(values: Any) -> list[float]:

@@ -51,7 +51,7 @@ def test_the_free_run_is_simulated_in_the_box_only_and_of_the_worst_trial() -> N
         for name, y in (("good", good), ("worse", worse))
     ]
     figure = draw_free_run(model, Dataset(tuple(trials)))
-    error = free_run_error(model, Dataset((trials[1],)), in_box=True)
+    error = free_run_error(model, Dataset((trials[1],)))
     assert f"worse, the worst that was not fitted: {error:.2g} %" in str(figure.get_suptitle())
     outside = ((worse < model.x_range[:, 0]) | (worse > model.x_range[:, 1])).any(axis=1)
     assert outside.any()

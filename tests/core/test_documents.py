@@ -70,8 +70,8 @@ def discrete_documents() -> dict[str, Any]:
 
 def test_a_funnel_reads_back_bit_for_bit_with_every_promised_name(tmp_path: Path) -> None:
     funnel = random_funnel()
-    funnel.save(tmp_path / "funnel.json")
-    again = ContinuousFunnel.load(tmp_path / "funnel.json")
+    files.write_document(tmp_path / "funnel.json", funnel.document())
+    again = ContinuousFunnel.from_document(files.load_document(tmp_path / "funnel.json"))
     assert again.document() == funnel.document()
     assert (again.t0, again.tf) == (funnel.x.t[0], funnel.x.t[-1])
     rng = np.random.default_rng(7)
@@ -101,21 +101,19 @@ def test_the_volume_is_the_share_of_random_points_inside() -> None:
     assert funnel.volume(t) == pytest.approx(share * np.prod(2 * half), rel=0.01)
 
 
-@pytest.mark.parametrize("axes", [(0, 1), (2, 0), (0, 1, 2)])
-def test_an_outline_is_the_tightest_shadow(axes: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("axes", [(0, 1), (2, 0)])
+def test_an_outline_is_the_tightest_shadow(axes: tuple[int, int]) -> None:
     funnel, rng = random_funnel(4), np.random.default_rng(10)
     t = funnel.t0 + 0.3
     directions = rng.normal(size=(20_000, 4))
     boundary = funnel.boundary(t, directions / np.linalg.norm(directions, axis=1)[:, None])
-    outline = funnel.outline(t, axes, points=60).reshape(-1, len(axes))
+    outline = funnel.outline(t, axes, points=60)
     for direction in rng.normal(size=(20, len(axes))):
         reach = (outline @ direction).max() - funnel.nominal(t)[list(axes)] @ direction
         shadow = (boundary[:, list(axes)] @ direction).max() - funnel.nominal(t)[list(axes)] @ (
             direction
         )
         assert reach == pytest.approx(shadow, rel=0.05)
-    with pytest.raises(ShapeError, match="2 or 3 axes"):
-        funnel.outline(t, (0,))
 
 
 def test_an_ellipsoid_is_inside_exactly_up_to_the_boundary() -> None:
@@ -132,8 +130,8 @@ def test_a_policy_of_every_kind_of_gain_reads_back_and_takes_many_states(
     gain: str, tmp_path: Path
 ) -> None:
     policy = random_policy(gain)
-    policy.save(tmp_path / "policy.json")
-    again = ContinuousPolicy.load(tmp_path / "policy.json")
+    files.write_document(tmp_path / "policy.json", policy.document())
+    again = ContinuousPolicy.from_document(files.load_document(tmp_path / "policy.json"))
     assert again.document() == policy.document()
     t, X = 0.4 * policy.t[0] + 0.6 * policy.t[1], np.random.default_rng(1).normal(size=(7, 3))
     u = again(float(t), X)
@@ -168,7 +166,7 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
     discrete = discrete_documents()["discrete"].document()
     files.write_document(tmp_path / "funnel.json", discrete)
     with pytest.raises(DocumentError, match="kind is 'sampled', expected 'continuous'"):
-        ContinuousFunnel.load(tmp_path / "funnel.json")
+        ContinuousFunnel.from_document(files.load_document(tmp_path / "funnel.json"))
     files.write_document(tmp_path / "odd.json", discrete | {"kind": "odd"})
     with pytest.raises(DocumentError, match="no 'nlsid/funnel' of kind 'odd' is known"):
         load(tmp_path / "odd.json")

@@ -76,7 +76,7 @@ def test_a_funnel_in_which_the_input_saturates_is_proved_and_says_so(
     assert "u0 clipped to [-9, 9]" in exact.assumptions[0]
     assert "without" not in exact.assumptions[0]
     assert exact.margin > 0
-    policy = ContinuousPolicy.load(tmp_path / "policy.json")
+    policy = ContinuousPolicy.from_document(documents.load_document(tmp_path / "policy.json"))
     edge = design.funnel.outline(0.0, (0, 1))
     assert np.abs(policy(0.0, edge)).max() == LIMIT
 
@@ -323,7 +323,9 @@ def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> No
     file = tmp_path / "problem.json"
     documents.write_document(file, asked)
     nlsid("funnel", tmp_path, "--problem", file)
-    assert ContinuousPolicy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]
+    assert ContinuousPolicy.from_document(
+        documents.load_document(tmp_path / "policy.json")
+    ).limits.tolist() == [[0, -LIMIT, LIMIT]]
     checked = nlsid("check", tmp_path / "funnel.proof.json")
     assert "u0 clipped to [-9, 9]" in " ".join(checked.split())
 

@@ -58,8 +58,8 @@ def test_a_satellite_funnel_is_proved_for_every_t(satellite: FunnelDesign, tmp_p
     *_, proof = satellite.save(tmp_path)
     assert check(proof).margin > 0
     funnel, policy = (
-        ContinuousFunnel.load(tmp_path / "funnel.json"),
-        ContinuousPolicy.load(tmp_path / "policy.json"),
+        ContinuousFunnel.from_document(files.load_document(tmp_path / "funnel.json")),
+        ContinuousPolicy.from_document(files.load_document(tmp_path / "policy.json")),
     )
     assert (funnel.t0, funnel.tf) == (0.0, 5.0)
     assert funnel.nominal(2.5).shape == (6,)
@@ -270,7 +270,7 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     made = nlsid("funnel", tmp_path, "--problem", problem_file)
     assert "pieces of time decided" in made
     assert "found and proved in" in made
-    assert ContinuousFunnel.load(tmp_path / "funnel.json").tf == 2.0
+    assert ContinuousFunnel.from_document(files.load_document(tmp_path / "funnel.json")).tf == 2.0
     assert (tmp_path / "funnel.png").is_file()
     assert "PROVED funnel" in nlsid("check", tmp_path / "funnel.proof.json")
     nlsid("funnel", tmp_path, status=None)

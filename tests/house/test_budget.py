@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_114,
-    ("bags",): 11_935,
-    ("nlsid_ros",): 2_660,
-    ("tests",): 22_335,
+    ("nlsid_core",): 18_098,
+    ("bags",): 11_930,
+    ("nlsid_ros",): 2_659,
+    ("tests",): 22_333,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -261,7 +261,7 @@ def _looped(
             value += weight * y[t - k]
         for k, weight in weights:
             value += weight * mapped[t - k]
-        y[t] = np.clip(value, -DIVERGED, DIVERGED)
+        np.minimum(np.maximum(value, -DIVERGED), DIVERGED, out=y[t])
         mapped[t] = f(y[t])
     return y.T
 
