@@ -42,11 +42,9 @@ class MessageReader:
         found = self._layout.numbers(data)
         if len(found) == len(self._paths):
             return found
-        values, left = [], iter(found)
-        for path, group in zip(self._paths, self._targets, strict=True):
-            parts = [np.array([next(left)]) for _ in group]
-            values.append(float(path.combine(parts)[0]))
-        return values
+        left = iter(found)
+        parts = ([np.array([next(left)]) for _ in group] for group in self._targets)
+        return [float(p.combine(part)[0]) for p, part in zip(self._paths, parts, strict=True)]
 
 
 class _Laid:
@@ -98,14 +96,13 @@ class SignalVector:
                     f"{signal}: |{done[0]} makes other numbers than those in messages; such a "
                     "signal can be monitored, and not driven"
                 )
-        paths = tuple(signal.path for signal in signals)
-        topics = {path.topic for path in paths}
+        topics = {signal.path.topic for signal in signals}
         if len(topics) != 1:
             raise BagError(
                 f"live and replayed samples come from one topic, not {', '.join(sorted(topics))}; "
                 "publish the whole state in one message"
             )
-        return cls(paths)
+        return cls(tuple(signal.path for signal in signals))
 
     def __str__(self) -> str:
         fields = [str(path).removeprefix(f"{self.topic}:") for path in self.paths]

@@ -461,8 +461,11 @@ class Limits(NamedTuple):
 
     def corrected(self, after: list[float], e: list[float]) -> list[float]:
         """The observer's next state: the model's, and L e."""
-        parts = [map(mul, column, repeat(by)) for column, by in zip(self.columns, e, strict=True)]
-        return list(map(add, after, map(sum, zip(*parts, strict=True))))
+        each = zip(self.columns, e, strict=True)
+        first, *others = [list(map(mul, column, repeat(by))) for column, by in each]
+        for other in others:
+            first = list(map(add, first, other))
+        return list(map(add, after, first))
 
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""

@@ -12,8 +12,8 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_098,
-    ("bags",): 11_930,
+    ("nlsid_core",): 18_101,
+    ("bags",): 11_927,
     ("nlsid_ros",): 2_659,
     ("tests",): 22_333,
     ("benchmarks", "examples"): 3_798,
