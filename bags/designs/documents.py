@@ -60,7 +60,8 @@ def load_model(path: Path | str) -> DifferenceEquation:
 
 def load_stable_model(path: Path | str) -> StableModel:
     """Read a model of any class that tubes are proved for; DocumentError if the file has none."""
-    model: StableModel = load_noun(path)
+    model = load_noun(path)
     if not isinstance(model, get_args(StableModel)):
         raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
-    return model
+    found: StableModel = model
+    return found

@@ -470,7 +470,7 @@ class Limits(NamedTuple):
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
         largest = max(map(abs, map(truediv, e, self.peak)))
-        return largest * largest
+        return float(largest * largest)
 
     def sizes(self, deviation: list[float], hidden: list[float]) -> list[float]:
         """(p,) how far out of the tube the outputs can be: 1 on its boundary."""
