@@ -95,7 +95,8 @@ def launch_file(workflow: str) -> LaunchFile:
 
 
 def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) -> int:
-    """Run until a stop signal or until one ends, then end all; the worst of their exit statuses.
+    """Run until a stop signal or until one ends, then end all; the worst of their exit statuses, but
+    for those that ended by being asked to.
 
     respawn: one that fails is started again, RESPAWN_DELAY later. On Linux they also end when this
     process is killed, by SIGTERM as if each had been asked to.
@@ -128,7 +129,8 @@ def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) ->
                 process.kill()
         for number, handler in before.items():
             signal.signal(number, handler)
-    return max(abs(process.wait()) for process in running)
+    statuses = [process.wait() for process in running]
+    return max((abs(each) for each in statuses if each != -signal.SIGINT), default=0)
 
 
 def _end_with(parent: int) -> Callable[[], None] | None:
