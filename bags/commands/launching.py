@@ -95,8 +95,9 @@ def launch_file(workflow: str) -> LaunchFile:
 
 
 def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) -> int:
-    """Run until a stop signal or until one ends, then end all; the worst of their exit statuses, but
-    for those that ended by being asked to.
+    """Run until a stop signal or until one ends, then end all; the worst of their exit statuses.
+
+    That a node was ended by the signal that asks it to end is no failure.
 
     respawn: one that fails is started again, RESPAWN_DELAY later. On Linux they also end when this
     process is killed, by SIGTERM as if each had been asked to.
