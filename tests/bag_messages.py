@@ -21,6 +21,7 @@ ODOM_TYPE, CMD_TYPE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"
 SPEED = f"{ODOM}:twist.twist.linear.x"
 COMMAND = f"{CMD}:twist.linear.x"
 JOINT_TYPE = "sensor_msgs/msg/JointState"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 def serialised(msgtype: str, message: object) -> bytes:
@@ -70,6 +71,23 @@ def joints(stamp_ns: int, position: Iterable[float]) -> bytes:
         np.zeros(0),
     )
     return serialised(JOINT_TYPE, message)
+
+
+def transforms(stamp_ns: int, moved: Mapping[str, tuple[FloatArray, float]]) -> bytes:
+    """A message of TRANSFORMS: of each child frame where it is, (3,), and its yaw."""
+    types = standard_types().types
+    parts = [
+        types["geometry_msgs/msg/TransformStamped"](
+            header(stamp_ns),
+            child,
+            types["geometry_msgs/msg/Transform"](
+                types["geometry_msgs/msg/Vector3"](*place),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)),
+            ),
+        )
+        for child, (place, yaw) in moved.items()
+    ]
+    return serialised(TRANSFORMS, types[TRANSFORMS](parts))
 
 
 def put(bag: BagWriter, at_ns: int, topic: str, msgtype: str, data: bytes) -> None:

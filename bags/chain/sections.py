@@ -57,7 +57,7 @@ class SignalConfig(Section):
         str,
         Key(
             "`topic:field.path[index]`, or `[name=elbow]`, and what is done to it, `|unwrap`, "
-            "`|derivative(0.2 s)`, `|washout(2 s)`; of an excitation also `|delay(0.1 s)`, "
+            "`|derivative(0.2 s)`, `|washout(2 s)`; of an excitation also "
             "`|lag(0.1 s)` and the product `A * B` of two",
             example="/odom:twist.twist.linear.x",
         ),

@@ -3,7 +3,7 @@
 A command imports what it runs when it is called.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,14 +31,18 @@ if TYPE_CHECKING:
     from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
-PICTURE = Path("signals.png")
 
 bag_app = typer.Typer(
     name="bag",
     help="Look into recordings, check, repair and convert them.",
     no_args_is_help=True,
 )
-out = Console(width=None if Console().is_terminal else WIDTH_IN_FILES)
+out = Console(
+    width=None if Console().is_terminal else WIDTH_IN_FILES,
+    markup=False,
+    emoji=False,
+    highlight=False,
+)
 
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="What to write; must not be there.")]
@@ -50,16 +54,6 @@ SignalsOption = Annotated[
         help=r"topic:field.path\[0], [*] or \[name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
-
-
-@dataclass(frozen=True)
-class Source:
-    """How a recording is read."""
-
-    definitions: DefinitionsOption = None
-    unfinished: Annotated[
-        bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
-    ] = False
 
 
 @bag_app.command()
@@ -103,11 +97,10 @@ def signals(
     Joints are named, orientations have a yaw, transforms their frames.
     """
     from bags.commands import bag_show
-    from bags.recordings.bag import Bag
     from bags.tools.listing import bag_signals
 
     with (
-        Bag(bag, unfinished=True, definitions=_definitions(definitions)) as source,
+        _opened(bag, definitions) as source,
         progress_bar("reading") as progress,
     ):
         found = bag_signals(source, progress=progress)
@@ -118,28 +111,28 @@ def signals(
 
 
 @bag_app.command()
-@flat
 def plot(
     bag: BagArgument,
-    source: Source,
     signals: SignalsOption = None,
-    clock: ClockOption = Clock.HEADER,
-    picture: Annotated[Path, typer.Option("--out", help="A .png or .svg file.")] = PICTURE,
+    definitions: DefinitionsOption = None,
+    picture: Annotated[Path, typer.Option("--out", help="A .png or .svg file.")] = Path(
+        "signals.png"
+    ),
 ) -> None:
     """Draw signals over time; without -s a response and the command that it follows best."""
     from bags.pictures.signal_plots import draw_signals, write_picture
     from bags.signals.reader import read_signals
-    from bags.signals.sampling import Grid
 
-    drawn = signals or [signal for part in _likeliest([bag], source.definitions) for signal in part]
-    texts = [Grid(clock=clock.value).path(text, response=True) for text in drawn]
+    drawn = signals or [signal for part in _likeliest([bag], definitions) for signal in part]
     with (
-        _opened(bag, source) as opened,
+        _opened(bag, definitions) as opened,
         progress_bar("reading") as progress,
     ):
-        samples = read_signals(opened, texts, progress=progress)
+        samples = read_signals(opened, drawn, progress=progress)
+    if opened.ending is not None:
+        out.print(f"unfinished: {opened.ending}", soft_wrap=True)
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)))
-    out.print(f"wrote {picture}", soft_wrap=True, markup=False)
+    out.print(f"wrote {picture}", soft_wrap=True)
 
 
 @bag_app.command()
@@ -162,7 +155,7 @@ def check(
     folders = expand_bags(bags)
     y, u = _likeliest(folders, definitions, signals.response or (), signals.excitation or ())
     if not (signals.response and signals.excitation) and not as_json:
-        out.print(f"of {', '.join(y)} under {', '.join(u)}", soft_wrap=True, markup=False)
+        out.print(f"of {', '.join(y)} under {', '.join(u)}", soft_wrap=True)
     results = check_fitness(
         folders,
         excitations=u,
@@ -189,9 +182,9 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
     with progress_bar("recovering") as progress:
         found = recover(bag, bag_out or _beside(bag, "recovered"), progress=progress)
     for topic, count in found.counts.items():
-        out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
+        out.print(f"{count:9d} messages on {topic}", soft_wrap=True)
     for what in found.lost:
-        out.print(f"lost: {what}", soft_wrap=True, markup=False)
+        out.print(f"lost: {what}", soft_wrap=True)
     if found.lost:
         verdict = "what was lost is said above"
     elif found.statements:
@@ -203,23 +196,21 @@ def recover_command(bag: BagArgument, bag_out: OutOption = None) -> None:
     out.print(
         f"wrote {found.out}, {found.messages} messages, read back and compared; {verdict}",
         soft_wrap=True,
-        markup=False,
     )
     if found.lost:
         raise typer.Exit(1)
 
 
 @bag_app.command("export")
-@flat
 def export_command(
     bag: BagArgument,
-    source: Source,
     target: OutOption = None,
     form: Annotated[str, typer.Option("--format", "-f", help="csv or parquet.")] = "csv",
     signals: Annotated[
         list[str] | None,
         typer.Option("--signal", "-s", help="Signals, or topics; default: every field of all."),
     ] = None,
+    definitions: DefinitionsOption = None,
 ) -> None:
     """Write topics as CSV or Parquet, a table of each in the folder BAG_tables.
 
@@ -230,14 +221,14 @@ def export_command(
 
     target = target or _beside(bag, "tables")
     with (
-        _opened(bag, source) as opened,
+        _opened(bag, definitions) as opened,
         progress_bar("exporting") as progress,
     ):
         rows = export_topics(opened, target, form=form, signals=signals or (), progress=progress)
     for file, count in rows.counts.items():
-        out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+        out.print(f"wrote {file}, {count} rows", soft_wrap=True)
     for what in rows.left_out:
-        out.print(f"left out: {what}", soft_wrap=True, markup=False)
+        out.print(f"left out: {what}", soft_wrap=True)
     _say_notes(rows.notes)
 
 
@@ -247,7 +238,7 @@ def convert_command(
     bags: BagsArgument,
     what: What,
     into: Into,
-    source: Source,
+    definitions: DefinitionsOption = None,
     bag_out: OutOption = None,
 ) -> None:
     """Copy bags into a new bag, or parts: a stretch of time, some topics, several bags as one.
@@ -262,12 +253,12 @@ def convert_command(
     folders = expand_bags(bags)
     target = bag_out or _beside(folders[0], "converted")
     with ExitStack() as stack:
-        opened = [stack.enter_context(_opened(folder, source)) for folder in folders]
+        opened = [stack.enter_context(_opened(folder, definitions)) for folder in folders]
         progress = stack.enter_context(progress_bar("copying"))
         copied = convert(opened, target, what, into, progress=progress)
     for part in copied.parts:
-        out.print(f"wrote {part}", soft_wrap=True, markup=False)
-    out.print(f"{copied.messages} messages", soft_wrap=True, markup=False)
+        out.print(f"wrote {part}", soft_wrap=True)
+    out.print(f"{copied.messages} messages", soft_wrap=True)
     _say_notes(copied.notes)
 
 
@@ -308,13 +299,13 @@ def import_command(
         custom=_pairs(custom or (), "--custom"),
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in imported.counts.items())
-    out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
-    out.print(imported.times, soft_wrap=True, markup=False)
+    out.print(f"wrote {bag_out}: {listed}", soft_wrap=True)
+    out.print(imported.times, soft_wrap=True)
 
 
 def _say_notes(notes: "Sequence[str]") -> None:
     for note in notes:
-        out.print(f"not as stated: {note}", soft_wrap=True, markup=False)
+        out.print(f"not as stated: {note}", soft_wrap=True)
 
 
 def _beside(bag: Path, what: str) -> Path:
@@ -337,11 +328,11 @@ def _likeliest(
     return choose(look(bags, definitions=_definitions(definitions)), responses, excitations)
 
 
-def _opened(bag: Path, source: Source) -> "Bag":
-    """The recording, to be read as the options say."""
+def _opened(bag: Path, definitions: list[Path] | None) -> "Bag":
+    """The recording; of one that was not closed what there is."""
     from bags.recordings.bag import Bag
 
-    return Bag(bag, unfinished=source.unfinished, definitions=_definitions(source.definitions))
+    return Bag(bag, unfinished=True, definitions=_definitions(definitions))
 
 
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":

@@ -120,7 +120,7 @@ def _topic(topic: TopicInfo) -> dict[str, object]:
         "topic": topic.topic,
         "type": topic.msgtype,
         "count": topic.count,
-        **asdict(topic.times),
+        **topic.times._asdict(),
         "offered_qos_profiles": [profile.document() for profile in topic.offered],
         "messages": None if topic.messages is None else asdict(topic.messages),
     }

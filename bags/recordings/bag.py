@@ -530,9 +530,11 @@ def _described(path: Path, *, salvage: bool) -> tuple[BagFiles, list[str]]:
     try:
         found = bag_files(path)
     except BagError as error:
-        files = data_files(path) if salvage and path.is_dir() else ()
+        files = data_files(path) if path.is_dir() else ()
         if not files:
             raise
+        if not salvage:
+            raise BagError(f"{error}; {RECOVER} reads the files without it") from error
         return BagFiles(files), [str(error)]
     if not salvage or not path.is_dir():
         return found, []

@@ -168,7 +168,7 @@ def _metadata(file: Path) -> dict[str, Any]:
     try:
         content = yaml.load(file.read_bytes(), Loader=LOADER)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise _bad(file, f"it is not YAML: {str(error)[:200]}") from error
+        raise _bad(file, f"it is not YAML: {' '.join(str(error).split())[:200]}") from error
     found = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(found, dict):
         raise _bad(file, "it has no rosbag2_bagfile_information")

@@ -6,7 +6,6 @@ run beside each other, and a request that fails is repeated for a stated time. o
 protocols; credentials are those of the environment or of a profile, and are never part of a name.
 """
 
-import hashlib
 import os
 import random
 import re
@@ -229,6 +228,8 @@ class RemotePath(PosixPath):
         """What tells the file from others without reading it: its entry, its last bytes and, but
         for S3, whose tags are of the content, its URL: other tags tell versions of one URL apart.
         """
+        import hashlib  # a slow part of the standard library, for what is fetched only
+
         size = self.entry.size
         tail = self.read_range(max(0, size - MARK_BYTES), size)
         url = "" if str(self).startswith("s3://") else f" {self}"
@@ -306,8 +307,6 @@ def place(given: Path | str, *, patience: float | None = None) -> Path:
     text = str(given).lstrip()
     if not isinstance(given, RemotePath):
         found = _URL.match(text)
-        if text.startswith("file:/"):
-            return Path("/" + text.removeprefix("file:").lstrip("/"))
         if found is None:
             return Path(given)
         protocol, rest = found.group(1).lower(), text[found.end() :]

@@ -14,7 +14,6 @@ These say when the signal is sampled (`bags.signals.sampling`):
 - `clock(log)`: its stamps are the times of logging (live: of arrival), not the header's.
 - `hold(T s)`: a sample takes the latest value, if that is at most T s old.
 - `linear(T s)`: a sample is interpolated between values at most T s apart.
-- `delay(T s)`: of what drives, a value holds from T s after its stamp on.
 - `lag(T s)`: of what drives, a sample takes what a first-order lag of time constant T makes of the
   held values, beginning at the first of them.
 
@@ -49,12 +48,10 @@ OPERATIONS: Final = (
     "clock",
     "hold",
     "linear",
-    "delay",
     "lag",
 )
-TIMED: Final = ("derivative", "washout", "hold", "linear", "delay", "lag")  # these take a time
-SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
-DRIVING: Final = ("delay", "lag")  # of what drives only
+TIMED: Final = ("derivative", "washout", "hold", "linear", "lag")  # these take a time
+SAMPLING: Final = ("clock", "hold", "linear", "lag")
 SIGNAL_CLOCKS: Final = ("header", "log")
 TURNS: Final = {"deg": 360.0, "rev": 1.0}  # a whole turn by the number's unit; others are rad
 LONGEST: Final = 1e6  # s, of a time behind a path
@@ -96,7 +93,7 @@ class Expression:
         signal = SignalPath.parse(path.rstrip() if parts else path)
         operations = tuple(_operation(part, text) for part in parts)
         names = [operation.name for operation in operations]
-        once = (("clock",), ("hold", "linear"), ("delay",), ("lag",))
+        once = (("clock",), ("hold", "linear"), ("lag",))
         if any(sum(names.count(name) for name in group) > 1 for group in once):
             raise BagError(f"'{text}' says twice when the signal is sampled")
         if "lag" in names and "linear" in names:
@@ -128,12 +125,6 @@ class Expression:
         if self.operation(*kinds) is not None:
             return self
         return replace(self, operations=(*self.operations, Operation(name, unit, window)))
-
-    @property
-    def delay_ns(self) -> int:
-        """Ns after its stamp from which a value holds."""
-        found = self.operation("delay")
-        return 0 if found is None else round(found.window * 1e9)
 
     @property
     def washed_out(self) -> float | None:

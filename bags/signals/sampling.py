@@ -19,7 +19,7 @@ besides the model has to be known:
   which every signal has a value. `hold`: the latest value at or before, at most T s old.
   `linear`: on the line between the values before and after, at most T s apart.
 - An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`;
-  `|delay(T s)` adds T to its stamp, `|lag(T s)` filters what is held, `A * B` multiplies two such.
+  `|lag(T s)` filters what is held, `A * B` multiplies two such.
 - Signals may come from any number of topics, each of one or more of them.
 - Responses that are samples as they come and up to MOST_LOST periods apart have `LOST` samples
   between them, a period apart: no response, and the commands of their time if they are known.
@@ -43,7 +43,6 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.message_types import header_stamp_ns, is_stamped
 from bags.signals.expressions import (
-    DRIVING,
     Expression,
     Running,
     factors,
@@ -235,7 +234,7 @@ class Sampler:
     def newest_command_ns(self) -> float:
         """The newest stamp of a command; -inf before the first."""
         commands = self._kept[len(self.responses) :]
-        return max(kept.newest_ns - kept.delay_ns for kept in commands)
+        return max(kept.newest_ns for kept in commands)
 
     def flush(self, until_ns: int | None = None) -> list[Sample]:
         """Stop waiting: for commands of samples up to `until_ns`, or for anything (None).
@@ -254,7 +253,7 @@ class Sampler:
         running = self._running.get(k)
         if running is None:
             running = self._running[k] = self._signals[k].numbers.running("")
-        if running.remembers and stamp_ns + self._kept[k].delay_ns <= self._kept[k].newest_ns:
+        if running.remembers and stamp_ns <= self._kept[k].newest_ns:
             if k >= len(self.responses):
                 self.late += 1
             elif stamp_ns == self._kept[k].newest_ns:
@@ -267,7 +266,6 @@ class Sampler:
     def add(self, k: int, stamp_ns: int, value: float) -> None:
         """What `feed` takes; the samples come with the next call that gives any."""
         kept = self._kept[k]
-        stamp_ns += kept.delay_ns
         if k == 0 and not self.on_grid:
             at = bisect_left(self._waiting, stamp_ns)
             if stamp_ns == self._released_ns or self._waiting[at : at + 1] == [stamp_ns]:
@@ -400,7 +398,6 @@ class _Kept:
         self.match_ns = match_ns if rule is None else None
         lag = signal.operation("lag")
         self.lag_ns: float = 0.0 if lag is None else lag.window * 1e9
-        self.delay_ns = signal.delay_ns
         self.stamps: list[int] = []
         self.values: list[float] = []
         self.targets: list[float] = []  # with a lag, what the values go to
@@ -512,8 +509,8 @@ def held_values(
     kept.limit_ns = math.inf
     found = []
     for at in at_ns:
-        while k < len(stamps) and stamps[k] + kept.delay_ns <= at:
-            kept.add(stamps[k] + kept.delay_ns, numbers[k])
+        while k < len(stamps) and stamps[k] <= at:
+            kept.add(stamps[k], numbers[k])
             k += 1
         found.append(kept.value_at(at))
     return found
@@ -521,8 +518,8 @@ def held_values(
 
 def _response(signal: str | Expression) -> Expression:
     found = _factors(signal)
-    if len(found) > 1 or any(found[0].operation(name) for name in DRIVING):
-        raise BagError(f"{signal}: products, delay and lag are for what drives, not for a response")
+    if len(found) > 1 or found[0].operation("lag"):
+        raise BagError(f"{signal}: products and lag are for what drives, not for a response")
     return found[0]
 
 

@@ -29,7 +29,7 @@ QUATERNION: Final = "geometry_msgs/msg/Quaternion"
 NO_FIELD: Final = "structure_needs_at_least_one_member"  # what a type without fields has in CDR
 ANGLES: Final = ("roll", "pitch", "yaw")
 
-_TOPIC: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # ROS 1: without a slash
+_TOPIC: Final = re.compile(r"/?\w[\w.-]*(/\w[\w.-]*)*")  # not of ROS only: speed, /a-1
 _STEP: Final = re.compile(
     r"([A-Za-z]\w*)(?:\[(?:(\d{1,9})|(\*)|([A-Za-z]\w*)=([^\]=]{1,200}))\])?", re.ASCII
 )

@@ -7,7 +7,7 @@ from every message, in two more integers each and one chunk.
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,18 @@ from bags.recordings.cdr import STAMP, Gatherer, UnreadableMessageError
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
 from bags.recordings.quality import Profile
-from bags.signals.timing import ClockRelation, clock_relation, missing
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 from nlsid_core.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from bags.signals.timing import ClockRelation
 
 GAP: Final = 5.0  # median intervals without a message
 LOST: Final = " lost"  # how the recorder's counts of lost messages end, after the topic
 
 
-@dataclass(frozen=True)
-class LogTimes:
+class LogTimes(NamedTuple):
     """When messages were logged, in ns; of the intervals, in s, NaN with fewer than two messages.
 
     rate: Hz, how many intervals there are by how long they last together. interval: the median.
@@ -49,7 +50,7 @@ class Stamps:
 
     backward: int
     duplicates: int
-    clock: ClockRelation | None
+    clock: "ClockRelation | None"
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +224,8 @@ class _Collector:
 
     def messages(self, order: IntArray, log_ns: IntArray) -> Messages:
         """What was found; order: of the messages by their log times."""
+        from bags.signals.timing import missing  # only where messages are read
+
         counted = [missing(np.concatenate(parts)) for parts in self.sequence.values()]
         known = [count for count in counted if count is not None]
         stamps = None
@@ -258,6 +261,8 @@ def _quantile(values: FloatArray, share: float) -> float:
 
 
 def _stamps(stamp_ns: IntArray, log_ns: IntArray) -> Stamps:
+    from bags.signals.timing import clock_relation
+
     steps = np.diff(stamp_ns)
     clock = clock_relation(stamp_ns, log_ns) if stamp_ns.any() else None
     return Stamps(int((steps < 0).sum()), int((steps == 0).sum()), clock)

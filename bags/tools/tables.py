@@ -129,7 +129,8 @@ def frame(
 
     Its index is the time, to the nanosecond. Columns are called as the fields, of several topics
     with the topic before it, `/odom:pose.pose.position.x`. Rows are the messages of the first
-    topic, or every `period`; of other topics a row has the newest message at or before it.
+    topic, or every `period`; of other topics a row has the newest message at or before it, of a
+    transform the newest that has it.
 
     Args:
         bag: where it is, or one that is open.
@@ -138,8 +139,9 @@ def frame(
         period: s between rows.
 
     Returns:
-        The DataFrame; integers, booleans and strings as such, arrays as NumPy arrays. Its
-        `attrs["left_out"]` says which arrays are too long for a table: pixels, points.
+        The DataFrame; integers, booleans and strings as such, arrays as NumPy arrays; integers and
+        booleans of pandas' nullable types where rows come before them. Its `attrs["left_out"]` says
+        which arrays are too long for a table: pixels, points.
 
     Raises:
         BagError: without pandas, as `read_signals` for damage, and if nothing is there.
@@ -155,15 +157,16 @@ def frame(
         for topic, table in _tables(source, tables, None, silent):
             parts.setdefault(topic, []).append(table)
         frames = []
-        for topic in tables:
+        framed: set[str] = set()
+        for topic, columns in tables.items():
             if topic not in parts:
                 raise BagError(f"{source.path}: {topic} has no messages")
             rows = {n: np.concatenate([p[n] for p in parts[topic]]) for n in parts[topic][0]}
             by = "stamp_ns" if clock == "header" and "stamp_ns" in rows else "log_time_ns"
             index = pandas.DatetimeIndex(rows[by].view("M8[ns]"), name="time")
-            named = {n: v for n, v in rows.items() if n not in TIMES}
-            if len(tables) > 1:
-                named = {f"{topic}:{n}": v for n, v in named.items()}
+            prefix = f"{topic}:" if len(tables) > 1 else ""
+            named = {f"{prefix}{n}": v for n, v in rows.items() if n not in TIMES}
+            framed |= {f"{prefix}{n}" for n, signal in columns.items() if signal.path.framed}
             frames.append(pandas.DataFrame(named, index).sort_index(kind="stable"))
     joined = frames[0]
     if period is not None:
@@ -172,6 +175,15 @@ def frame(
             index=pandas.date_range(first, last, freq=pandas.Timedelta(period, "s"), name="time")
         )
     for other in frames[0 if period is not None else 1 :]:
+        held = [name for name in other if name in framed]
+        other[held] = other[held].ffill()  # the newest message may be of other transforms
+        if other.index[0] > joined.index[0]:
+            kinds = {
+                name: pandas.array(column[:0].to_numpy()).dtype  # which may be missing
+                for name, column in other.items()
+                if column.dtype.kind in "iub"
+            }
+            other = other.astype(kinds)  # NaN would make floats of them
         joined = pandas.merge_asof(joined, other, left_index=True, right_index=True)
     joined.attrs["left_out"] = left_out
     return joined

@@ -27,6 +27,7 @@ from bags.signals.signal import numeric_paths
 from bags.tools.convert import convert
 from bags.tools.info import bag_info
 from bags.tools.recover import recover
+from bags.tools.tables import export_topics
 from nlsid_core.errors import BagError, DataError, NlsidError
 from tests.bag_messages import (
     CMD,
@@ -40,6 +41,7 @@ from tests.bag_messages import (
     command,
     joints,
     odometry,
+    put,
     speed_bag,
 )
 from tests.mcap_files import write_mcap
@@ -207,6 +209,33 @@ def test_a_truncated_file_is_called_truncated_in_a_folder_or_alone(bag: Path, ke
         assert str(file) in message
         assert "truncated or unfinished" in message
         assert "copy it again, or recover" in message
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"rosbag2_bagfile_information:\n\tversion: 9\n", b"\0" * 9]
+)
+def test_damaged_metadata_are_refused_in_a_line_that_says_what_reads_the_bag(
+    tmp_path: Path, content: bytes
+) -> None:
+    """As a computer leaves them that lost its power; `recover` needs none."""
+    bag = speed_bag(tmp_path / "run", [0.1, 0.2], [0.3, 0.4])
+    (bag / "metadata.yaml").write_bytes(content)
+    message = refused(bag)
+    assert message.endswith("; `nlsid bag recover` reads the files without it")
+    assert "\n" not in message
+    assert recover(bag, tmp_path / "whole").messages == 4
+
+
+def test_topics_of_other_systems_are_exported(tmp_path: Path) -> None:
+    topic = "/ünit-1/speed.x"
+    with BagWriter(tmp_path / "run") as writer:
+        for k in range(3):
+            put(writer, k, topic, CMD_TYPE, command(k, float(k)))
+    with Bag(tmp_path / "run") as source:
+        rows = export_topics(source, tmp_path / "tables", form="csv")
+    assert (list(rows.counts.values()), rows.left_out) == ([3], ())
+    read = read_signals(tmp_path / "run", [f"{topic}:twist.linear.x|clock(log)"])
+    assert [list(samples.values) for samples in read.values()] == [[0.0, 1.0, 2.0]]
 
 
 def test_an_unfinished_recording_is_called_unfinished(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from bags.commands.cli import app
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import definitions_from
 from bags.recordings.folders import expand_bags
-from bags.recordings.message_types import types_in_bag
+from bags.recordings.message_types import standard_types, types_in_bag
 from bags.recordings.writer import BagWriter
 from bags.samples import schunk
 from bags.signals.reader import bag_origin, read_signals
@@ -41,11 +41,14 @@ from tests.bag_messages import (
     PERIOD_NS,
     SPEED,
     START_NS,
+    TRANSFORMS,
     command,
     joints,
     odometry,
     put,
+    serialised,
     speed_bag,
+    transforms,
 )
 from tests.conftest import SHARED
 from tests.mcap_files import write_mcap
@@ -486,6 +489,46 @@ def test_a_frame_has_one_time_base(bag: Path) -> None:
     assert fifth.index[1].value - fifth.index[0].value == 500_000_000
     with pytest.raises(BagError, match="has no topic /nothing"):
         frame(bag, ["/nothing"])
+
+
+def test_a_frame_keeps_large_integers_where_rows_come_before_them(tmp_path: Path) -> None:
+    """NaN in the first rows would make floats of them, which have 53 bits."""
+    large = {2: 2**60 + 1, 3: 2**60 + 3}
+    with BagWriter(tmp_path / "late") as writer:
+        for k in range(4):
+            put(writer, k, CMD, CMD_TYPE, command(k, float(k)))
+            for kind, value in (("Int64", large[k]), ("Bool", k == 2)) if k > 1 else ():
+                msgtype = f"std_msgs/msg/{kind}"
+                message = standard_types().types[msgtype](value)
+                put(writer, k, f"/{kind}", msgtype, serialised(msgtype, message))
+    rows = frame(tmp_path / "late", [COMMAND, "/Int64", "/Bool"], clock="log")
+    assert rows["/Int64:data"].isna().tolist() == [True, True, False, False]
+    assert rows["/Int64:data"].dropna().tolist() == list(large.values())
+    assert rows["/Bool:data"].dropna().tolist() == [True, False]
+    assert (
+        frame(tmp_path / "late", ["/Int64", COMMAND], clock="log")["/Int64:data"].dtype == "int64"
+    )
+
+
+def test_the_chain_of_transforms_that_the_page_shows_is_that_of_the_frames(tmp_path: Path) -> None:
+    """Its program, on two links that turn: each beside other publishers, one of them static."""
+    page = (Path(__file__).parents[2] / "docs" / "howto-bags.md").read_text()
+    program = next(part for part in page.split("```")[1::2] if "from_quat" in part)
+    angles, turn = 0.1 * np.arange(5), 0.3
+    with BagWriter(tmp_path / "run") as writer:
+        for k, angle in enumerate(angles):
+            at, still = (k + 1) * 10**9, (np.zeros(3), 0.0)
+            sent = [("/tf", "odom", (np.array([2.0, 0.0, 0.0]), angle)), ("/tf", "camera", still)]
+            if k == 0:
+                base = np.array([1.0, 0.0, 0.0]), turn
+                sent += [("/tf_static", "base_link", base), ("/tf_static", "lidar", still)]
+            for topic, child, moved in sent:
+                put(writer, at, topic, TRANSFORMS, transforms(at, {child: moved}))
+    known: dict[str, Any] = {"BAG": tmp_path / "run"}
+    exec(program.partition("\n")[2], known)  # the program of the page
+    np.testing.assert_allclose(known["pose"][:, 0, 3], 2.0 + np.cos(angles), atol=1e-12)
+    np.testing.assert_allclose(known["pose"][:, 1, 3], np.sin(angles), atol=1e-12)
+    np.testing.assert_allclose(known["pose"][:, 0, 0], np.cos(angles + turn), atol=1e-12)
 
 
 def test_a_good_recording_is_called_fit_and_bad_ones_say_why(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.typesys import Stores, get_typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch, joined
@@ -23,7 +21,6 @@ from bags.recordings.writer import BagWriter
 from bags.signals.message_reader import MessageReader
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_origin, read_signals
 from bags.signals.signal import SignalPath
-from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import (
     COMMAND,
@@ -40,7 +37,6 @@ from tests.bag_messages import (
     twist,
 )
 
-TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 RESOURCES = Path(__file__).parents[2].parent / "shared" / "data" / "rosbag2_resources"
 
 
@@ -99,31 +95,6 @@ def test_bags_that_ros2_recorded_itself_are_read(storage: str) -> None:
     samples = read_signals(bag, [path])[path]
     assert samples.clock == LOG_TIME
     assert len(samples) > 0
-
-
-def test_a_ros_1_bag_reads_as_its_ros_2_twin(tmp_path: Path) -> None:
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Ros1Writer(tmp_path / "old.bag") as writer:
-        connection = writer.add_connection("/cmd", TWIST_STAMPED, typestore=types)
-        for k in range(3):
-            stamp = types.types["builtin_interfaces/msg/Time"](sec=100 + k, nanosec=5)
-            header = types.types["std_msgs/msg/Header"](seq=k, stamp=stamp, frame_id="base")
-            vector = types.types["geometry_msgs/msg/Vector3"]
-            twist = types.types["geometry_msgs/msg/Twist"](
-                linear=vector(x=0.1 * k, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=-1.0)
-            )
-            message = types.types[TWIST_STAMPED](header=header, twist=twist)
-            data = types.serialize_ros1(message, TWIST_STAMPED)
-            writer.write(connection, START_NS + k, data)
-    read = read_signals(tmp_path / "old.bag", ["/cmd:twist.linear.x", "/cmd:twist.angular.z"])
-    assert read["/cmd:twist.linear.x"].values.tolist() == [0.0, 0.1, 0.2]
-    assert read["/cmd:twist.angular.z"].values.tolist() == [-1.0] * 3
-    assert read["/cmd:twist.linear.x"].stamp_ns.tolist() == [
-        (100 + k) * 10**9 + 5 for k in range(3)
-    ]
-    recover(tmp_path / "old.bag", tmp_path / "new")
-    again = read_signals(tmp_path / "new", ["/cmd:twist.linear.x"])["/cmd:twist.linear.x"]
-    assert again.values.tolist() == [0.0, 0.1, 0.2]
 
 
 # -- Fields gathered from serialised messages are those of a full decoder, bit for bit

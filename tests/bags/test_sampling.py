@@ -32,11 +32,13 @@ from tests.bag_messages import (
     ODOM_TYPE,
     SPEED,
     START_NS,
+    TRANSFORMS,
     command,
-    header,
     odometry,
+    put,
     serialised,
     speed_bag,
+    transforms,
     twist,
 )
 
@@ -88,9 +90,9 @@ def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Samp
 def test_numbers_taken_together_give_the_samples_of_numbers_taken_one_by_one(
     seed: int, together: int
 ) -> None:
-    """Recordings are read so: messages lost, stamps that repeat, NaN, delays and lags in them."""
+    """Recordings are read so: messages lost, stamps that repeat, NaN and lags in them."""
     rng, other = np.random.default_rng(seed), "/imu:angular_velocity.z"
-    driving = [f"{U}|hold(0.12 s)", f"{U}|delay(0.03 s)|lag(0.1 s)"]
+    driving = [f"{U}|hold(0.12 s)", f"{U}|lag(0.1 s)"]
     one, many = (Sampler([Y, other], driving, period=0.05) for _ in range(2))
     events = []
     for k, (every, scatter) in enumerate([(50, 2), (50, 1), (70, 30), (40, 20)]):
@@ -258,9 +260,9 @@ def test_messages_give_the_same_bits_as_identification_reads(
         assert np.abs(trial.y[:, 0] - 4.0).max() < 0.5  # rad/s, by stamps with 3 ms of jitter
 
 
-def driven(values: Series, at: int, *, delay_ns: int, lag_ns: float, limit_ns: int) -> float:
-    """A delayed, held, lagged command at `at`, step by step from the first value on."""
-    came = [(stamp + delay_ns, value) for stamp, value in values if stamp + delay_ns <= at]
+def driven(values: Series, at: int, *, lag_ns: float, limit_ns: int) -> float:
+    """A held, lagged command at `at`, step by step from the first value on."""
+    came = [(stamp, value) for stamp, value in values if stamp <= at]
     if not came or at - came[-1][0] > limit_ns:
         return math.nan
     if not lag_ns:
@@ -274,18 +276,18 @@ def driven(values: Series, at: int, *, delay_ns: int, lag_ns: float, limit_ns: i
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_products_of_delayed_and_lagged_signals_are_what_the_words_say(seed: int) -> None:
+def test_products_of_lagged_signals_are_what_the_words_say(seed: int) -> None:
     rng = np.random.default_rng(seed)
     columns = [series(rng, 0.01, 60) for _ in range(3)]
-    drives = [f"{U}|delay(0.025 s)|lag(0.1 s)|hold(0.03 s)", f"{Z}|hold(0.02 s)"]
+    drives = [f"{U}|lag(0.1 s)|hold(0.03 s)", f"{Z}|hold(0.02 s)"]
     sampler = Sampler([Y], [f"{drives[0]} * {drives[1]}", drives[1]], period=0.01)
     assert sampler.topics == ("/y", "/u", "/z")
     events = interleaved(rng, columns)
     again = [(k, stamp, value) for k, stamp, value in events if k == 2]
     given = fed(sampler, sorted([*events, *((3, *e[1:]) for e in again)], key=lambda e: e[1]))
     options = (
-        {"delay_ns": 25 * MS, "lag_ns": 100.0 * MS, "limit_ns": 30 * MS},
-        {"delay_ns": 0, "lag_ns": 0.0, "limit_ns": 20 * MS},
+        {"lag_ns": 100.0 * MS, "limit_ns": 30 * MS},
+        {"lag_ns": 0.0, "limit_ns": 20 * MS},
     )
     truth: list[list[float]] = []
     for at, y in columns[0]:
@@ -331,7 +333,7 @@ def test_signals_of_several_topics_and_products_give_the_same_bits(
 ) -> None:
     """Responses on two topics, drives made of two, as identification reads and as replay does."""
     bag = drive(tmp_path / "drive")
-    steering = f"{CMD}:twist.linear.x|delay(0.03 s)|lag(0.1 s)"
+    steering = f"{CMD}:twist.linear.x|lag(0.1 s)"
     yaw = f"{ODOM}:pose.pose.orientation.yaw|unwrap"
     [trial] = read_bags(
         [bag],
@@ -467,27 +469,12 @@ def test_samples_that_nobody_measured_are_counted_and_not_judged(
 
 
 def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
-    types = standard_types().types
-    kind = "tf2_msgs/msg/TFMessage"
     with BagWriter(tmp_path / "tf") as bag:
         for k in range(60):
             stamp = START_NS + k * 10 * MS
             names = ("camera",) if k % 3 == 2 else ("odom", "base")
-            transforms = [
-                types["geometry_msgs/msg/TransformStamped"](
-                    header(stamp),
-                    name,
-                    types["geometry_msgs/msg/Transform"](
-                        types["geometry_msgs/msg/Vector3"](0.1 * k, 0.0, float(len(name))),
-                        types["geometry_msgs/msg/Quaternion"](
-                            0.0, 0.0, math.sin(0.01 * k), math.cos(0.01 * k)
-                        ),
-                    ),
-                )
-                for name in names
-            ]
-            data = serialised(kind, types[kind](transforms))
-            bag.write("/tf", kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+            moved = {name: (np.array([0.1 * k, 0.0, len(name)]), 0.02 * k) for name in names}
+            put(bag, stamp, "/tf", TRANSFORMS, transforms(stamp, moved))
     base = "/tf:transforms[child_frame_id=base].transform"
     signals = [f"{base}.translation.x", f"{base}.rotation.yaw", f"{base}.translation.z"]
     read = read_signals(tmp_path / "tf", signals)
@@ -523,7 +510,6 @@ def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Pa
     [
         ([f"{Y} * {Z}"], U, "for what drives, not for a response"),
         ([f"{Y}|lag(1 s)"], U, "for what drives, not for a response"),
-        ([f"{Y}|delay(1 s)"], U, "for what drives, not for a response"),
         ([Y], f"{U}|lag(1 s)|linear(1 s)", "leave out linear"),
         ([Y], " * ".join([U] * 5), "at most 4"),
         ([Y], f"{U}|clock(log)", "two clocks cannot be paired: /y:data by its header time"),

@@ -35,7 +35,7 @@ from tests.bag_messages import (
         "",
         "/odom",
         "/odom:",
-        "odom-:twist",
+        "-odom:twist",
         "/odom/:twist",
         "/odom:twist..x",
         "/odom:twist.x[",
@@ -46,7 +46,7 @@ from tests.bag_messages import (
         "/odom:twist.x ",
         "/odom:twist.x\n",
         "/odom:x[٣]",
-        "/ödom:x",
+        "/a b:x",
         "/odom:x[1234567890]",
     ],
 )

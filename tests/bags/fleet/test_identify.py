@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 from bags.chain.config import Config, load_config
 from bags.chain.steps import identify_bags, identify_trials
@@ -27,10 +26,11 @@ from bags.recordings.definitions import standard_definition
 from bags.samples import f1tenth
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import silent
-from tests.bag_messages import CMD, CMD_TYPE, ODOM, START_NS, command
+from tests.bag_messages import CMD, CMD_TYPE, ODOM
 from tests.bags.fleet.conftest import Bucket
 from tests.bags.fleet.deadly import Deadly
 from tests.bags.fleet.storage import drive, web_server
+from tests.mcap_files import write_mcap
 
 CONFIG = """\
 robot: car
@@ -166,13 +166,18 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
     (folder / "robot_0" / "cut.mcap").write_bytes(good[: len(good) // 2])
     (folder / "robot_0" / "text.mcap").write_bytes(b"no bag")
     (folder / "robot_1" / "copy.mcap").write_bytes(good)
+    text = standard_definition(CMD_TYPE).text
+    write_mcap(folder / "robot_1" / "other.mcap", dict.fromkeys((ODOM, CMD), (CMD_TYPE, text)))
     found = run(folder / "*" / "*.mcap", config, tmp_path / "out")
-    assert set(found.left_out) == {"robot_0/cut", "robot_0/text", "robot_1/copy"}
+    assert set(found.left_out) == {
+        f"robot_{name}" for name in ("0/cut", "0/text", "1/copy", "1/other")
+    }
     assert "truncated or unfinished" in found.left_out["robot_0/cut"]
     assert "is no MCAP, SQLite or ROS 1 file" in found.left_out["robot_0/text"]
+    assert "twist.twist" in found.left_out["robot_1/other"]
     assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
     assert (set(found.unread), set(found.unusable), set(found.copies)) == (
-        {"robot_0/cut", "robot_0/text"},
+        {"robot_0/cut", "robot_0/text", "robot_1/other"},
         set(),
         {"robot_1/copy"},
     )
@@ -364,34 +369,3 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
         (answer,) = ask(Name(), bags, Workers(), manifest)
     assert isinstance(answer, Answer)
     assert (answer.content, answer.requests, answer.kept) == (b"a.mcap a", 0, False)
-
-
-@pytest.mark.slow
-def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: Path) -> None:
-    """Busy for ever, vanished after it was listed, busy for a while, of another type: each once."""
-    pytest.importorskip("obstore")
-    for k in range(4):
-        drive(tmp_path / "web" / f"drive_{k}.mcap", seed=k, samples=120)
-    with (tmp_path / "web" / "drive_4.mcap").open("wb") as stream:
-        other = Writer(stream)
-        other.start(profile="ros2")
-        text = standard_definition(CMD_TYPE).text.encode()
-        schema = other.register_schema(CMD_TYPE, "ros2msg", text)
-        for topic in (ODOM, CMD):
-            channel = other.register_channel(topic, "cdr", schema)
-            other.add_message(channel, START_NS, command(START_NS, 1.0), START_NS)
-        other.finish()  # type: ignore[no-untyped-call]
-
-    def fault(path: str, number: int) -> int | None:
-        answers = {"/drive_1.mcap": 503, "/drive_2.mcap": 404}
-        return answers.get(path, 503 if number <= 2 else None)
-
-    with web_server(tmp_path / "web", fault) as url:
-        urls = [Path(f"{url}/drive_{k}.mcap") for k in range(5)]
-        found = identified(named_bags(urls, patience=2.0), load_config(config), tmp_path / "out")
-    assert set(found.left_out) == {"drive_1", "drive_2", "drive_4"}
-    assert "2 s were lost with failing requests" in found.left_out["drive_1"]
-    assert found.left_out["drive_2"] == "it is not there any more"
-    assert "twist.twist" in found.left_out["drive_4"]
-    used = (*found.trials.train, *found.trials.test)
-    assert sorted(trial.name for trial in used) == ["drive_0", "drive_3"]

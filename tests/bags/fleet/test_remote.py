@@ -119,8 +119,7 @@ def test_a_path_keeps_its_entry_on_the_way_to_another_process(tmp_path: Path) ->
 
 
 def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
-    assert type(place("file:///a/b.mcap")) is type(place("/a/b.mcap")) is type(Path("x"))
-    assert str(place("file:///a/b.mcap")) == "/a/b.mcap"
+    assert type(place("/a/b.mcap")) is type(Path("x"))
     assert is_url(Path("s3://bucket/key"))
     assert not is_url(tmp_path)
     path = remote("s3://bucket/a/b.mcap")
