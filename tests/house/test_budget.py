@@ -13,7 +13,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_101,
-    ("bags",): 11_922,
+    ("bags",): 11_919,
     ("nlsid_ros",): 2_659,
     ("tests",): 22_319,
     ("benchmarks", "examples"): 3_798,
