@@ -121,6 +121,11 @@ class FunnelMonitor(ManagedNode):
         """s without a response."""
         return patience(self.values.stale_after, self._watch.design.period if self._watch else 0.0)
 
+    @property
+    def _oldest(self) -> float:
+        """s that a stamp may be off this node's clock, but for a recording that is played."""
+        return math.inf if self.values.allow_old_stamps else self._patient_for
+
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
         self._watch = None
@@ -305,7 +310,8 @@ class FunnelMonitor(ManagedNode):
                 heard.numbers.update(info["publication_sequence_number"])
             responds = topic in watch.pairing.response_topics
             if not responds:
-                unfit = "" if logged else self._off_clock(topic, stamp_ns, clock_ns)
+                most = max(self._oldest, math.inf if logged else LATEST_COMMAND)
+                unfit = off_clock(stamp_ns, clock_ns, most, f"a command on {topic}")
                 self._unfit_commands[topic] = unfit
                 if unfit:  # nor does a stamp far ahead say that no other command is still to come
                     self._publish(watch.missing(unfit, doubted=True))
@@ -349,16 +355,8 @@ class FunnelMonitor(ManagedNode):
             said = said or each.alternating
         if said or clock_ns is None:
             return said
-        most = math.inf if self.values.allow_old_stamps else self._patient_for
-        said = self._topics[topic].distrust(data, clock_ns, most)
+        said = self._topics[topic].distrust(data, clock_ns, self._oldest)
         return said or next(filter(None, self._unfit_commands.values()), "")
-
-    def _off_clock(self, topic: str, stamp_ns: int, clock_ns: int) -> str:
-        """Why the stamp of a command is none; empty if it is one, or a recording is played."""
-        if self.values.allow_old_stamps:
-            return ""
-        most = max(self._patient_for, LATEST_COMMAND)
-        return off_clock(stamp_ns, clock_ns, most, f"a command on {topic}")
 
     def _on_release(self) -> None:
         """Let go of samples whose command did not come in time."""

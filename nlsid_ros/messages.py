@@ -12,10 +12,12 @@ from typing import Any, Final
 import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.exceptions import InvalidTopicNameException
+from rclpy.serialization import serialize_message
 from rclpy.validate_topic_name import validate_topic_name
+from sensor_msgs.msg import JointState
 
-from bags.recordings.cdr import ENCAPSULATION, Gatherer
-from bags.recordings.message_types import HEADER, is_stamped
+from bags.recordings.cdr import ENCAPSULATION
+from bags.recordings.message_types import is_stamped
 from bags.signals.message_reader import SignalVector
 from bags.signals.signal import SignalPath, numeric_paths
 from nlsid_core import files
@@ -26,7 +28,7 @@ from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.running import ManagedNode
 
 _STAMP: Final = struct.Struct("<iI")
-_NUMBERS: Final = "sensor_msgs/msg/JointState"
+_NAN: Final = struct.pack("<d", math.nan)
 ZERO: Final = "zero"
 REFUSED: Final = "refused"
 OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
@@ -240,13 +242,12 @@ def numbers_at(stamp_ns: int, numbers: Mapping[str, float], frame: str = "") -> 
 @lru_cache(maxsize=16)
 def _blank(names: tuple[str, ...], frame: str) -> tuple[bytes, int]:
     """A serialised JointState of these names, and where its positions are."""
-    types, none = installed_types(_NUMBERS), np.zeros(0)
-    header = types.types[HEADER](types.types["builtin_interfaces/msg/Time"](0, 0), frame)
-    message = types.types[_NUMBERS](header, list(names), np.zeros(len(names)), none, none)
-    data = bytes(types.serialize_cdr(message, _NUMBERS))  # rclpy's has bytes of memory at its end
-    first = SignalPath.parse("/numbers:position[0]").steps
-    (group,) = Gatherer(_NUMBERS, types, [first]).layout(data).groups
-    return data, int(group.offsets[0])
+    message = JointState(name=names, position=[math.nan] * len(names))
+    message.header.frame_id = frame
+    data = serialize_message(message)
+    at = data.index(_NAN)  # which no text has
+    # No velocity and no effort are 8 bytes; rclpy's message has bytes of memory after them.
+    return data[: at + 8 * len(names) + 8], at
 
 
 def stamp_ns_of(message: Any) -> int:

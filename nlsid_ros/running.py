@@ -399,7 +399,7 @@ def _let_go(*_given: object) -> None:
 
 
 def unreadable(error: Exception) -> DataError:
-    """What ROS cannot use of arguments or names, without where its code says so."""
-    said = str(error).partition(". Error:")[0].partition(", at /")[0]
+    """What ROS cannot use of arguments or names, and why, without where its code says so."""
+    said = str(error).partition(", at /")[0].removesuffix(". Error: error not set")
     hint = "; a namespace begins with a slash: /robot1" if "__ns" in said else ""
     return DataError(f"ROS refuses: {' '.join(said.split())}{hint}")

@@ -1,6 +1,7 @@
 """How every node starts and ends: its `main`, the signals that stop it, and its watchdog."""
 
 import gc
+import inspect
 import os
 import signal
 import socket
@@ -53,6 +54,7 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
             nodes.append(make())
             if nodes[-1].autostart:
                 nodes[-1].start_itself()
+        inspect.getframeinfo(sys._getframe())  # as rclpy does to log: the first takes 0.05 s
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         with _watched(nodes):
@@ -112,4 +114,5 @@ def _wake_on_signals() -> socket.socket:
     for number in STOP_SIGNALS:
         if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda _number, _frame: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # `nlsid run` starts it deaf to SIGINT
     return receiver

@@ -323,8 +323,7 @@ def _likeliest(
     """The responses and the excitations, for those not named the likeliest."""
     if responses and excitations:
         return list(responses), list(excitations)
-    from bags.setup.candidates import look
-    from bags.setup.proposing import choose
+    from bags.setup.candidates import choose, look
 
     return choose(look(bags, definitions=_definitions(definitions)), responses, excitations)
 

@@ -18,9 +18,9 @@ from bags.commands.options import progress_bar
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
-from bags.setup.candidates import Found, look
+from bags.setup.candidates import Found, choose, look
 from bags.setup.proposal import Proposal
-from bags.setup.proposing import Chosen, choose, propose
+from bags.setup.proposing import Chosen, propose
 from bags.setup.written import yaml_text
 from bags.signals.reader import expanded
 from nlsid_core.errors import BagError, DataError, counted, percent

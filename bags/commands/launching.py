@@ -97,6 +97,8 @@ def launch_file(workflow: str) -> LaunchFile:
 def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) -> int:
     """Run until a stop signal or until one ends, then end all; the worst of their exit statuses.
 
+    That a node was ended by the signal that asks it to end is no failure.
+
     respawn: one that fails is started again, RESPAWN_DELAY later. On Linux they also end when this
     process is killed, by SIGTERM as if each had been asked to.
     """
@@ -128,16 +130,21 @@ def run_together(commands: Sequence[Sequence[str]], *, respawn: bool = False) ->
                 process.kill()
         for number, handler in before.items():
             signal.signal(number, handler)
-    return max(abs(process.wait()) for process in running)
+    statuses = [process.wait() for process in running]
+    return max((abs(each) for each in statuses if each != -signal.SIGINT), default=0)
 
 
 def _end_with(parent: int) -> Callable[[], None] | None:
-    """What a new process does so that it gets SIGTERM when its parent is gone; Linux only."""
+    """What a new process does so that it gets SIGTERM when its parent is gone; Linux only.
+
+    SIGINT waits until the node is ready for it: Python ends an import with a traceback.
+    """
     if not sys.platform.startswith("linux"):
         return None
     prctl = ctypes.CDLL(None).prctl
 
     def ask() -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # it was gone before
             os.kill(os.getpid(), signal.SIGTERM)
@@ -149,7 +156,7 @@ def _command(node: Element, values: Mapping[str, str]) -> list[str]:
     def filled(element: Element, attribute: str) -> str:
         return _filled(element.attrib[attribute], values)
 
-    namespace = "/" + filled(node, "namespace").lstrip("/")  # as ROS launch takes `robot1`
+    namespace = "/" + filled(node, "namespace").strip("/")  # as ROS launch takes `robot1`
     renamed = [("__node", filled(node, "name")), ("__ns", namespace)]
     renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
     settings = filled(node, "ros_args").split()

@@ -1,6 +1,7 @@
 """The entry point `nlsid`: runs a verb, and says in one line what is wrong.
 
-The verbs of `nlsid bag` need none of what the others import, and are found without them.
+`nlsid run` and the verbs of `nlsid bag` need none of what the others import, and are found without
+them.
 """
 
 import io
@@ -69,6 +70,10 @@ def main() -> None:
                 from bags.commands.bag_cli import bag_app
 
                 bag_app(sys.argv[2:], prog_name="nlsid bag")
+            elif sys.argv[1:2] == ["run"]:
+                from bags.commands.running_cli import run_app
+
+                run_app(sys.argv[2:], prog_name="nlsid run")
             else:
                 from bags.commands.cli import app
 

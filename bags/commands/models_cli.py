@@ -67,7 +67,7 @@ def proposed(
 ) -> Proposal:
     """Write the first configuration; Exit with status 1 if nothing can be identified."""
     from bags.commands.init import run_init
-    from bags.setup.proposal import Unfit
+    from bags.setup.candidates import Unfit
     from bags.setup.proposing import Chosen
 
     chosen = Chosen(

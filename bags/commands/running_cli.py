@@ -120,16 +120,15 @@ def run(
         raise typer.Exit(2)
     if workflow not in WORKFLOWS:
         raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
-    given = _launch_arguments(arguments or [])
+    given = arguments or []
+    if given and ":=" not in given[0]:  # a design's folder
+        given[0] = f"funnel:={Path(given[0]).absolute()}"
     commands = launch_file(workflow).commands(given)
     raise typer.Exit(run_together(commands, respawn="respawn:=true" in given))
 
 
-def _launch_arguments(given: list[str]) -> list[str]:
-    """NAME:=VALUE as they are; a design's folder in front of them as its funnel."""
-    if not given or ":=" in given[0]:
-        return given
-    return [f"funnel:={Path(given[0]).absolute()}", *given[1:]]
+run_app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+run_app.command()(run)
 
 
 def _refuse_without_rclpy() -> None:

@@ -45,7 +45,7 @@ def read_at(design: AnyDesign) -> SignalVector:
 
 def written_at(design: AnyDesign) -> SignalVector:
     """Where a policy writes the inputs; BagError if they are not on one topic."""
-    return SignalVector.parse(_texts(design)[1])
+    return SignalVector.parse(_texts(design)[1], "hold")
 
 
 def _texts(design: AnyDesign) -> tuple[Sequence[str], Sequence[str]]:

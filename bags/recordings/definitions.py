@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.message_types import (
@@ -20,7 +19,7 @@ from bags.recordings.message_types import (
     fields_of,
     is_stamped,
     parse,
-    refuse_what_code_cannot_be,
+    registered,
     standard_types,
     types_in_bag,
 )
@@ -73,7 +72,7 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
     parsed, found = _parsed(texts), {}
     for msgtype in texts:
         with defining(f"'{msgtype}'"):
-            types = _registered(completed({msgtype: parsed[msgtype]}, parsed))
+            types = registered(completed({msgtype: parsed[msgtype]}, parsed))
             text = types.generate_msgdef(msgtype, ros_version=2)[0]
             type_hash = types.hash_rihs01(msgtype) if "/msg/" in msgtype else ""
             found[msgtype] = Definition(msgtype, text, type_hash)
@@ -83,7 +82,7 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
 def types_from(texts: Mapping[str, str]) -> Typestore:
     """What .msg `texts`, by their types' names, define; they leave out nothing that they use."""
     with defining(", ".join(texts)):
-        return _registered(_parsed(texts))
+        return registered(_parsed(texts))
 
 
 def _parsed(texts: Mapping[str, str]) -> Typesdict:
@@ -94,14 +93,6 @@ def _parsed(texts: Mapping[str, str]) -> Typesdict:
         with defining(f"'{msgtype}'"):
             parsed.update(parse(msgtype, MessageDefinition(form, text)))
     return parsed
-
-
-def _registered(used: Typesdict) -> Typestore:
-    """A store of these types and no others; ValueError if they cannot be code."""
-    refuse_what_code_cannot_be(used)
-    types = get_typestore(Stores.EMPTY)
-    types.register(used)
-    return types
 
 
 def texts_of(definitions: Mapping[str, Definition]) -> list[tuple[str, str]]:

@@ -114,9 +114,7 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
         else:
             parsed = parse(msgtype, embedded)
         parsed = completed(parsed, noetic) | {name: standard[name] for name in ROS1_DIFFERS}
-        refuse_what_code_cannot_be(parsed)
-        types = get_typestore(Stores.EMPTY)
-        types.register(parsed)
+        types = registered(parsed)
         text, _ = types.generate_msgdef(msgtype, ros_version=2)
     return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
@@ -139,9 +137,7 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
             for name, (_, fields) in parsed.items()
         ):
             return standard
-        refuse_what_code_cannot_be(parsed)
-        types = get_typestore(Stores.EMPTY)
-        types.register(parsed)
+        types = registered(parsed)
         types.get_msgdef(msgtype)
     return types
 
@@ -208,6 +204,14 @@ def _elements(name: str, types: Typesdict, sizes: dict[str, int]) -> int:
             raise ValueError(f"'{name}' has more than {MAX_ELEMENTS} fields")
         sizes[name] = total
     return sizes[name]
+
+
+def registered(used: Typesdict) -> Typestore:
+    """A store of these types and no others; ValueError if they cannot be code."""
+    refuse_what_code_cannot_be(used)
+    types = get_typestore(Stores.EMPTY)
+    types.register(used)
+    return types
 
 
 def refuse_what_code_cannot_be(types: Typesdict) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.setup.proposal import Unfit
 from bags.signals.columns import Columns, expand_path, read_columns
 from bags.signals.expressions import derivative, turn_of
 from bags.signals.signal import ANGLES, SignalPath
@@ -79,6 +78,10 @@ IGNORED_FIELDS: Final = re.compile(
     r"|orientation\.[xyzw]$|rotation\.[xyzw]$"
 )
 POSITION: Final = re.compile(r"position|translation|(^|\.)(roll|pitch|yaw)$|angle$")
+
+
+class Unfit(BagError):  # noqa: N818 - an answer, not a fault
+    """Bags from which nothing can be identified, whatever a configuration says."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,54 @@ def look(bags: Sequence[Path], *, definitions: Mapping[str, Definition] | None =
         raise Unfit(f"no number varies in {', '.join(path.name for path in explored)}")
     constant = tuple(c for c in candidates.values() if c.low == c.high)
     return Found(varying, tuple(_pairs(varying, series)), constant)
+
+
+def choose(
+    found: Found, responses: Sequence[str] = (), excitations: Sequence[str] = ()
+) -> tuple[list[str], list[str]]:
+    """The signals that were named, and for a side that was not the best that goes with the other.
+
+    Raises Unfit if nothing goes with anything.
+    """
+    if responses and excitations:
+        return list(responses), list(excitations)
+    constant = {each.text for each in found.constant}
+    unmoved = [u for u in excitations if u in constant] if excitations else _unmoved(found)
+    if unmoved:
+        raise Unfit(
+            f"the command never varies ({', '.join(unmoved)}): a model is identified from how a "
+            "robot answers to one that does; if another number drives it, name that with -u"
+        )
+    best = []
+    for response in responses or [""]:
+        pairs = [
+            pair
+            for pair in found.pairs
+            if (not response or is_named(pair.response.text, response))
+            and (not excitations or is_named(pair.command.text, excitations[0]))
+            and (pair.score > 0.0 or response or excitations)
+        ]
+        if not pairs:
+            what = f"{response} follows no command" if response else "no number follows another"
+            still = f"; always the same: {', '.join(found.still)}" if found.still else ""
+            raise Unfit(
+                f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
+                f"there is){still}"
+            )
+        best.append(pairs[0])
+    commands = dict.fromkeys(pair.command.text for pair in best)
+    return list(responses) or [best[0].response.text], list(excitations) or list(commands)
+
+
+def _unmoved(found: Found) -> list[str]:
+    """Commands that never vary, where nothing else that may be one leads anything."""
+    others = any(pair.command.command >= 0.5 and pair.score > 0.0 for pair in found.pairs)
+    return [] if others else found.constant_commands
+
+
+def is_named(candidate: str, named: str) -> bool:
+    """Whether a candidate is what was named, with operations or without."""
+    return candidate == named or candidate.partition("|")[0] == named
 
 
 def _of_bag(

@@ -7,15 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from bags.chain.config import Config
-from nlsid_core.errors import BagError
 from nlsid_core.identification import Choice
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
-
-
-class Unfit(BagError):  # noqa: N818 - an answer, not a fault
-    """Bags from which nothing can be identified, whatever a configuration says."""
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup import ladder
-from bags.setup.candidates import Found, Pair, slope_window
+from bags.setup.candidates import Found, Pair, Unfit, is_named, slope_window
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
-from bags.setup.proposal import GRADES, POOR, Proposal, Signal, Unfit
+from bags.setup.proposal import GRADES, POOR, Proposal, Signal
 from bags.signals.columns import read_columns
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.signal import SignalPath
@@ -41,49 +41,6 @@ ROUNDED: Final = 1e-9  # relative: what varies by less is the same number, round
 WASHOUT: Final = 2.0  # s
 OTHERS: Final = 3  # commands that are named besides
 SHOWN: Final = 6  # of the models that were tried
-
-
-def choose(
-    found: Found, responses: Sequence[str] = (), excitations: Sequence[str] = ()
-) -> tuple[list[str], list[str]]:
-    """The signals that were named, and for a side that was not the best that goes with the other.
-
-    Raises Unfit if nothing goes with anything.
-    """
-    if responses and excitations:
-        return list(responses), list(excitations)
-    constant = {each.text for each in found.constant}
-    unmoved = [u for u in excitations if u in constant] if excitations else _unmoved(found)
-    if unmoved:
-        raise Unfit(
-            f"the command never varies ({', '.join(unmoved)}): a model is identified from how a "
-            "robot answers to one that does; if another number drives it, name that with -u"
-        )
-    best = []
-    for response in responses or [""]:
-        pairs = [
-            pair
-            for pair in found.pairs
-            if (not response or _same(pair.response.text, response))
-            and (not excitations or _same(pair.command.text, excitations[0]))
-            and (pair.score > 0.0 or response or excitations)
-        ]
-        if not pairs:
-            what = f"{response} follows no command" if response else "no number follows another"
-            still = f"; always the same: {', '.join(found.still)}" if found.still else ""
-            raise Unfit(
-                f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
-                f"there is){still}"
-            )
-        best.append(pairs[0])
-    commands = dict.fromkeys(pair.command.text for pair in best)
-    return list(responses) or [best[0].response.text], list(excitations) or list(commands)
-
-
-def _unmoved(found: Found) -> list[str]:
-    """Commands that never vary, where nothing else that may be one leads anything."""
-    others = any(pair.command.command >= 0.5 and pair.score > 0.0 for pair in found.pairs)
-    return [] if others else found.constant_commands
 
 
 @dataclass(frozen=True)
@@ -294,17 +251,13 @@ def _unwrapped(text: str) -> bool:
     return "|unwrap" in text and "|derivative" not in text
 
 
-def _same(candidate: str, named: str) -> bool:
-    return candidate == named or candidate.partition("|")[0] == named
-
-
 def _signal(found: Found, text: str, named: Sequence[str]) -> Signal:
     known = next((c for c in found.candidates if c.text == text), None)
-    known = known or next((c for c in found.candidates if _same(c.text, text)), None)
+    known = known or next((c for c in found.candidates if is_named(c.text, text)), None)
     if known is None:
         path = text.partition("|")[0]
         numbers = (
-            c for c in found.candidates if _same(c.text, path) and "|derivative" not in c.text
+            c for c in found.candidates if is_named(c.text, path) and "|derivative" not in c.text
         )
         recorded = None if len(factors(text)) > 1 else next((c.unit for c in numbers), None)
         unit = "" if recorded is None else Expression.parse(text).unit_of(recorded)

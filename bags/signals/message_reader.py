@@ -42,11 +42,9 @@ class MessageReader:
         found = self._layout.numbers(data)
         if len(found) == len(self._paths):
             return found
-        values, left = [], iter(found)
-        for path, group in zip(self._paths, self._targets, strict=True):
-            parts = [np.array([next(left)]) for _ in group]
-            values.append(float(path.combine(parts)[0]))
-        return values
+        left = iter(found)
+        parts = ([np.array([next(left)]) for _ in group] for group in self._targets)
+        return [float(p.combine(part)[0]) for p, part in zip(self._paths, parts, strict=True)]
 
 
 class _Laid:
@@ -72,11 +70,10 @@ class _Laid:
 
     def numbers(self, data: bytes) -> list[float]:
         """The numbers of a message that fits, in the order of the gatherer's targets."""
-        found = []
-        for at, kind, is_bool in self._leaves:
-            number = np.frombuffer(data, kind, 1, at).item()
-            found.append(float(bool(number) if is_bool else number))
-        return found
+        found = (
+            (np.frombuffer(data, kind, 1, at).item(), is_bool) for at, kind, is_bool in self._leaves
+        )
+        return [float(bool(number) if is_bool else number) for number, is_bool in found]
 
 
 @dataclass(frozen=True)
@@ -86,16 +83,26 @@ class SignalVector:
     paths: tuple[SignalPath, ...]
 
     @classmethod
-    def parse(cls, texts: Iterable[str]) -> "SignalVector":
-        """Read where each expression is; BagError if they are not all on one topic."""
-        paths = tuple(Expression.parse(text).path for text in texts)
-        topics = {path.topic for path in paths}
+    def parse(cls, texts: Iterable[str], also: str = "unit") -> "SignalVector":
+        """Read where each expression is.
+
+        Raises BagError if they are not all on one topic, or if more is done to one than to name its
+        unit or `also`: what is meant then is not the number in a message.
+        """
+        signals = list(map(Expression.parse, texts))
+        for signal in signals:
+            if done := [each for each in signal.operations if each.name not in ("unit", also)]:
+                raise BagError(
+                    f"{signal}: |{done[0]} makes other numbers than those in messages; such a "
+                    "signal can be monitored, and not driven"
+                )
+        topics = {signal.path.topic for signal in signals}
         if len(topics) != 1:
             raise BagError(
                 f"live and replayed samples come from one topic, not {', '.join(sorted(topics))}; "
                 "publish the whole state in one message"
             )
-        return cls(paths)
+        return cls(tuple(signal.path for signal in signals))
 
     def __str__(self) -> str:
         fields = [str(path).removeprefix(f"{self.topic}:") for path in self.paths]

@@ -2,7 +2,7 @@
 
 from enum import Enum
 
-from nlsid_core.running.reading import Reading
+from nlsid_core.running.reading import Reading, Status
 
 
 class State(Enum):
@@ -28,7 +28,7 @@ def state_of(reading: Reading, warning_margin: float = 0.0) -> State:
 
     0 warns of none; a margin that is no number is below any other.
     """
-    state = State(reading.status.value)
-    if state is State.INSIDE and warning_margin > 0.0 and not reading.margin >= warning_margin:
-        return State.WARNING
-    return state
+    if reading.status is not Status.INSIDE:
+        return State(reading.status.value)
+    warned = warning_margin > 0.0 and not reading.margin >= warning_margin
+    return State.WARNING if warned else State.INSIDE

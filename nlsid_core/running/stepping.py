@@ -9,8 +9,6 @@ computed once for them. The state is that of docs/certificate_stability.md, "The
 import copy
 from collections import deque
 from collections.abc import Callable
-from itertools import repeat
-from operator import add, mul
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -139,8 +137,8 @@ class _Linear:
         outputs, after = [], []
         for first, *others in x:
             outputs.append([first + direct])
-            shifted = map(add, map(mul, self._a, repeat(first)), (*others, 0.0))
-            after.append(list(map(add, shifted, force)))
+            rows = zip(self._a, (*others, 0.0), force, strict=True)
+            after.append([a * first + next_one + now for a, next_one, now in rows])
         return outputs, after
 
 

@@ -108,11 +108,9 @@ class TubeRun:
         """
         measured = _floats(y)
         applied = [math.nan] * len(self._stepper.u) if u is None else _floats(u)
-        fault = self._take(t)
-        if fault:
+        if fault := self._take(t):
             return self._unknown(t, measured, fault)
-        fault = self._fault(t, measured, applied)
-        if fault:
+        if fault := self._fault(t, measured, applied):
             return self._unknown(t, measured, self._without(applied, fault) or fault)
         self._beyond = self._beyond or self._beyond_training(t, applied)
         self._u_before = applied
@@ -425,12 +423,13 @@ def refuse_far(model: StableModel, funnel: TubeFunnel, trials: Dataset) -> None:
 class Limits(NamedTuple):
     """What one tube's samples are held against, as floats; all is rounded towards an alarm.
 
-    up: by what e'Re is multiplied, so that it is never below its exact value. peak: (p,), and
-    single: the most that one sample spends under it; inf where nothing is assumed of one sample.
+    columns: of L. up: by what e'Re is multiplied, so that it is never below its exact value. peak:
+    (p,), and single: the most that one sample spends under it; inf where nothing is assumed of one
+    sample.
     """
 
     rho: float
-    L: Rows
+    columns: Rows
     R: Rows
     up: float
     level: float
@@ -446,7 +445,7 @@ class Limits(NamedTuple):
         peak = np.full(p, math.inf) if tube.peak is None else tube.peak.at_most
         return cls(
             tube.rho * (1.0 + 8.0 * UNIT),
-            tube.L.tolist(),
+            tube.L.T.tolist(),
             R.tolist(),
             1.0 + 8.0 * (p * p + 4) * UNIT * spread,
             tube.level * (1.0 - ROUNDING),
@@ -462,12 +461,16 @@ class Limits(NamedTuple):
 
     def corrected(self, after: list[float], e: list[float]) -> list[float]:
         """The observer's next state: the model's, and L e."""
-        return [each + sum(map(mul, row, e)) for each, row in zip(after, self.L, strict=True)]
+        each = zip(self.columns, e, strict=True)
+        first, *others = [list(map(mul, column, repeat(by))) for column, by in each]
+        for other in others:
+            first = list(map(add, first, other))
+        return list(map(add, after, first))
 
     def sharpest(self, e: list[float]) -> float:
         """The largest of an innovation's squares beside what is assumed of one sample."""
-        parts = list(map(truediv, e, self.peak))
-        return float(max(map(mul, parts, parts)))
+        largest = max(map(abs, map(truediv, e, self.peak)))
+        return float(largest * largest)
 
     def sizes(self, deviation: list[float], hidden: list[float]) -> list[float]:
         """(p,) how far out of the tube the outputs can be: 1 on its boundary."""
@@ -490,7 +493,7 @@ def _followed(meters: dict[int, LevelMeter], g: list[float], u: list[float]) -> 
 
 def _floats(values: Any) -> list[float]:
     """One number, or those of a vector."""
-    if isinstance(values, float | int):
+    if isinstance(values, (float, int)):  # a union would be made at every sample
         return [float(values)]
     return np.array(values, dtype=np.float64).ravel().tolist()
 

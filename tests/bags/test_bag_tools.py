@@ -113,7 +113,8 @@ def test_bag_tools_need_no_solver_and_what_does_says_which_extra(bag: Path, tmp_
     copy = tmp_path / "copy"
     verbs: dict[int, list[tuple[object, ...]]] = {
         0: [
-            ("bag", "check", bag, "-u", COMMAND, "-y", SPEED),
+            ("bag", "check", bag),
+            ("bag", "plot", bag, "--out", tmp_path / "signals.png"),
             ("bag", "convert", bag, "--out", copy),
         ],
         2: [("identify", copy, bag)],

@@ -23,9 +23,9 @@ from bags.commands.init import said_briefly
 from bags.designs import documents
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
-from bags.setup.candidates import look
+from bags.setup.candidates import choose, look
 from bags.setup.proposal import Proposal
-from bags.setup.proposing import choose, take_next
+from bags.setup.proposing import take_next
 from bags.tools.fitness import check_fitness
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory

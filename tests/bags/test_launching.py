@@ -63,6 +63,8 @@ def test_arguments_fill_parameters_names_and_remappings_and_conditions_choose_no
     assert renamed["__ns"] == "/a"
     assert renamed["odom"] == "/a/odom"
     assert renamed["cmd_vel"] == "cmd_vel"
+    slashed = commands("monitor", "funnel:=f.json", "namespace:=fleet/unit_7/")
+    assert flags(slashed["funnel_monitor"], "-r")["__ns"] == "/fleet/unit_7"
     all_alike = commands("monitor", "funnel:=f.json", "/imu:=/a/imu", "use_sim_time:=true")
     for command in all_alike.values():
         assert flags(command, "-r")["/imu"] == "/a/imu"

@@ -181,9 +181,19 @@ def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_no_motion_is_not_returned() -> None:
-    with pytest.raises(Infeasible, match="more seconds"):
-        plan_motion(pendulum, start=[0, 0], end=[3, 0], seconds=1, u=[0], limits=[[-1, 1]])
+@pytest.mark.parametrize(
+    ("rate", "start", "end", "why"),
+    [
+        (pendulum, [0, 0], [3, 0], "more seconds"),
+        (lambda x, u: [x[1], -(u[0] ** 2) * x[1]], [0, 1], [1, 1.2], r"x1 changes by 0\.2 more"),
+    ],
+    ids=["too weak", "only brakes"],
+)
+def test_what_is_no_motion_is_not_returned(
+    rate: Any, start: list[float], end: list[float], why: str
+) -> None:
+    with pytest.raises(Infeasible, match=why):
+        plan_motion(rate, start=start, end=end, seconds=1, u=[0], limits=[[-1, 1]])
 
 
 # -- goals, limits, weights ----------------------------------------------------------------------

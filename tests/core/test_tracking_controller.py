@@ -156,9 +156,22 @@ def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_sta
     assert {e.reading.status for e in judged} == {Status.INSIDE}
 
 
-def test_signals_on_several_topics_cannot_be_one_sample() -> None:
-    with pytest.raises(BagError, match="/a, /b"):
-        SignalVector.parse(["/a:data", "/b:data"])
+@pytest.mark.parametrize(
+    ("paths", "says"),
+    [
+        (["/a:data", "/b:data"], "/a, /b"),
+        (
+            ["/a:data[0]", "/a:data[1]|derivative(0.2 s)"],
+            r"derivative\(0.2 s\) makes",
+        ),
+        (["/a:data|to(deg)"], "makes other numbers"),
+        (["/a:data|delay(0.1 s)"], "makes other numbers"),
+        (["/a:data|linear(0.1 s)"], "makes other numbers"),
+    ],
+)
+def test_what_is_no_number_in_a_message_is_not_driven(paths: list[str], says: str) -> None:
+    with pytest.raises(BagError, match=says):
+        SignalVector.parse(paths, "hold")
 
 
 # -- The live side of a sampled funnel: verdicts, the assumption, levels, missing samples

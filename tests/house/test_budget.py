@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_101,
-    ("bags",): 11_924,
+    ("bags",): 11_919,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_322,
+    ("tests",): 22_319,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -292,19 +292,37 @@ def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
                 )
 
 
-def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
-    command = [sys.executable, "-m", "bags.commands.main", "run", "control"]
+@pytest.mark.parametrize(
+    ("given", "status", "says"),
+    [
+        ("params_file:=nowhere.yaml", 1, "nowhere.yaml'. Error: Error opening YAML file"),
+        ("/odom:=/9 x", 1, "Couldn't parse remap rule: '-r /odom:=/9 x'\n"),
+        ("plants:=true", 2, "'plants:=true' is not one of the arguments of monitor.launch.xml"),
+        ("plants:=true", 2, "stale_after:=0.0"),
+    ],
+)
+def test_what_a_workflow_cannot_use_is_said_with_the_reason_and_no_traceback(
+    given: str, status: int, says: str
+) -> None:
+    """The first node that ends has the others end while they are still starting."""
+    command = [sys.executable, "-m", "bags.commands.main", "run", "monitor", "funnel:=x.json"]
     done = subprocess.run(
-        [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=STARTED,
-        check=False,
+        [*command, given], capture_output=True, text=True, cwd=ROOT, timeout=STARTED, check=False
     )
-    assert done.returncode == 2
-    assert "'plants:=true' is not one of the arguments of control.launch.xml" in done.stderr
-    assert "stale_after:=0.0" in done.stderr
+    assert done.returncode == status
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_node_that_is_ended_while_it_starts_says_nothing_of_it() -> None:
+    code = (
+        "import sys; from bags.commands.launching import run_together; python = sys.executable; "
+        "first, node = [python, '-c', 'raise SystemExit(3)'], [python, '-m', sys.argv[1]]; "
+        "sys.exit(run_together([first, node]))"
+    )
+    command = [sys.executable, "-c", code, "nlsid_ros.funnel_monitor"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=STARTED, check=False)
+    assert (done.returncode, done.stderr) == (3, "")
 
 
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/diagnostics']"

@@ -38,6 +38,7 @@ AT_REST = 1e-9  # of the way, in the whole time
 ROUNDS = 8  # of convex programs, each with the states' sizes that the last one left
 OTHER_STARTS, BENT = 4, 0.3  # guesses beside the first, bent by that of the states' sizes
 STALLED = 1e-5  # of the cost: less is not worth another program
+NEARER = 0.9  # of the largest defect: programs that leave more are not repeated
 STEP = 1e-6  # of the sizes, for central differences: errors of 1e-10
 
 
@@ -187,15 +188,10 @@ class _Mesh:
                 self.rates(float(s), row[None, : self.n], row[None, self.n :])[0]
                 for s, row in zip(t, z, strict=True)
             ]
-            if self.alone
+            if self.rates.depends_on_time
             else [self.rates(float(self.t[0]), z[:, : self.n], z[:, self.n :])]
         )
         return np.asarray(np.vstack(rows))
-
-    @property
-    def alone(self) -> bool:
-        """True if the rates depend on t."""
-        return self.rates.depends_on_time
 
     def free(self, z: FloatArray) -> BoolArray:
         """What may change: not the states at both ends, nor the input where it is held."""
@@ -261,12 +257,17 @@ class _Mesh:
                 f"x = {z[k, : self.n].tolist()} and x = {z[k + 1, : self.n].tolist()}. Plan in "
                 "parts, between states from which they are"
             )
+        least = np.inf
         for _ in range(ROUNDS):
             z = self._descended(z, self.sizes(z))
             try:
                 return self.settled(z)
             except Infeasible as refusal:
                 said = refusal
+            missed = float(np.abs(self.defects(z) / self.way).max())
+            if not missed < NEARER * least:
+                break
+            least = missed
         raise said
 
     def _costs(self, sizes: FloatArray) -> sp.csc_matrix:
@@ -296,23 +297,18 @@ class _Mesh:
             try:
                 step, promised = self._step(z, sizes, trust, M)
             except SolverError:
-                trust /= 4
-                if trust < SMALLEST:
-                    break
-                continue
+                step, promised = np.zeros_like(z), -np.inf
             after, _ = merit(z + step)
             gained, expected = now - after, now - promised
-            if expected <= STALLED * max(now, 1e-9) and trust < TRUST:
-                break
-            if np.isfinite(after) and gained > 0.1 * expected:
+            stalled = expected <= STALLED * max(now, 1e-9)
+            taken = bool(np.isfinite(after) and gained > 0.1 * expected)
+            if taken and not (stalled and trust < TRUST):
                 z, now = z + step, after
                 trust = min(2 * trust, 8.0) if gained > 0.5 * expected else trust
-                if expected <= STALLED * max(now, 1e-9):
-                    break
-            else:
+            if not taken:
                 trust /= 4
-                if trust < SMALLEST:
-                    break
+            if trust < SMALLEST or (stalled and (taken or trust < TRUST)):
+                break
         return z
 
     def _step(
@@ -348,7 +344,7 @@ class _Mesh:
 
     def settled(self, z: FloatArray) -> FloatArray:
         """The nearest z that obeys the collocation, by least-norm Newton steps; else Infeasible."""
-        sizes, n = self.sizes(z), self.n
+        sizes, n, begun = self.sizes(z), self.n, self.defects(z)
         free = self.free(z)
         scale = np.tile(1 / sizes[:n], len(z) - 1)
         for _ in range(NEWTON_STEPS):
@@ -368,10 +364,11 @@ class _Mesh:
             moved[free.ravel()] = step
             z = z - moved.reshape(z.shape) * sizes
         if not worst <= 100 * SETTLED:
-            k, i = divmod(int(np.abs(d).argmax()), n)
+            k, i = divmod(int(np.abs(begun / self.way).argmax()), n)
             raise Infeasible(
-                f"no motion was found: dx{i}/dt does not fit by {worst:.3g} of its size near "
-                f"{self.t[k]:.4g} s. Give more seconds, wider limits, or plan it in parts"
+                f"no motion to that end in {self.t[-1]:g} s was found: on the nearest one x{i} "
+                f"changes by {begun[k, i]:.3g} more than its dynamics say, near {self.t[k]:.4g} s. "
+                "Give another end, more or fewer seconds, wider limits, or plan it in parts"
             )
         u, (low, high) = z[:, n:], self.box.T
         reach = (high - low) * (1 / KEPT - 1) / 2
