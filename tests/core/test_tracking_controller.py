@@ -165,7 +165,7 @@ def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_sta
             r"derivative\(0.2 s\) makes",
         ),
         (["/a:data|to(deg)"], "makes other numbers"),
-        (["/a:data|delay(0.1 s)"], "makes other numbers"),
+        (["/a:data|lag(0.1 s)"], "makes other numbers"),
         (["/a:data|linear(0.1 s)"], "makes other numbers"),
     ],
 )

@@ -335,7 +335,7 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
     assert lines[1:3] == [
         "left out, not read: 1 bag",
         "  cut: is damaged or not a bag: it is no MCAP, SQLite or ROS 1 file: "
-        "it starts with 6e 6f 20 62 61 67",
+        "it starts with 6e 6f 20 62 61 67. `nlsid bag import` makes a bag of a table",
     ]
 
 

@@ -141,7 +141,8 @@ class Oracle:
             for j in seen
             for gain in numbers(self.policy["K"][j])
         )
-        return Fraction(hold * fastest + shaken)
+        total: Fraction = hold * fastest + shaken
+        return total
 
     def ranges(self, k: int) -> list[list[Fraction]]:
         """Lows and highs of what the input is off by, if anything, and of w."""
@@ -294,8 +295,8 @@ class Oracle:
             mu += Fraction(2) ** shift * (start + (end - start) * sigma) * power(row, e)
         pushed = self.pushed(k, t0, Pe, u, w)
         margin = Fraction(self.proof["margin"])
-        lost = growth + margin * h * rho + held + pushed
-        return Fraction(rho1 - rho0 - lost + mu * (rho - W))
+        total: Fraction = rho1 - rho0 - growth - margin * h * rho + mu * (rho - W) - held - pushed
+        return total
 
     def pushed(
         self, k: int, t0: Fraction, Pe: list[Fraction], u: list[Fraction], w: list[Fraction]
