@@ -52,7 +52,7 @@ def say_identified(console: Console, result: Identified) -> None:
         say(console, line)
     say_written(console, result.files)
     if not report_available():
-        console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+        say(console, f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
 
 
 def worth(result: Identified) -> str:
