@@ -27,6 +27,8 @@ th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
 ul { padding-left: 1.2rem }
 tbody tr { border-bottom: 1px solid #ddd } pre { font-size: .8rem; overflow-x: auto }
+@media screen and (max-width: 40rem) { body { font-size: 14px } pre { font-size: 7.5px }
+  table { display: block; overflow-x: auto } th, td { padding: .25rem .4rem } }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
 """
