@@ -186,8 +186,9 @@ def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
     [
         (pendulum, [0, 0], [3, 0], "more seconds"),
         (lambda x, u: [x[1], -(u[0] ** 2) * x[1]], [0, 1], [1, 1.2], r"x1 changes by 0\.2 more"),
+        (lambda x, u: [x[1], u[0] ** 2 * x[1]], [0, 1], [1, 0.8], r"x1 changes by 0\.2 less"),
     ],
-    ids=["too weak", "only brakes"],
+    ids=["too weak", "only brakes", "only pushes"],
 )
 def test_what_is_no_motion_is_not_returned(
     rate: Any, start: list[float], end: list[float], why: str

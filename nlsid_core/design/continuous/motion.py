@@ -207,8 +207,12 @@ class _Mesh:
         return np.append(spread, self.much)
 
     def defects(self, z: FloatArray) -> FloatArray:
-        """(K-1, n) x₁ - x₀ - h/6 (f₀ + 4 f_middle + f₁), the middle on the cubic."""
-        return self._defects(z)[0]
+        """(K-1, n) x₁ - x₀ - h/6 (f₀ + 4 f_middle + f₁), the middle on the cubic.
+
+        They may be infinite or NaN on a path where the dynamics are.
+        """
+        with np.errstate(all="ignore"):
+            return self._defects(z)[0]
 
     def _defects(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         n, h = self.n, np.diff(self.t)[:, None]
@@ -248,8 +252,7 @@ class _Mesh:
         """A motion by convex programs and Newton's steps from a guess; Infeasible if none."""
         z = z.copy()
         z[:, self.n :] = np.clip(z[:, self.n :], *self.box.T)
-        with np.errstate(all="ignore"):
-            gaps = self.defects(z)
+        gaps = self.defects(z)
         if not np.isfinite(gaps).all():
             k, i = np.argwhere(~np.isfinite(gaps))[0].tolist()
             raise Infeasible(
@@ -288,8 +291,7 @@ class _Mesh:
         def merit(z: FloatArray) -> tuple[float, float]:
             v = ((z - origin) / sizes).ravel()
             cost = v @ M @ v
-            with np.errstate(all="ignore"):
-                missed = np.abs(self.defects(z) / states).sum()
+            missed = np.abs(self.defects(z) / states).sum()
             return float(cost + PRICE * missed), float(cost)
 
         now, _ = merit(z)
@@ -348,8 +350,7 @@ class _Mesh:
         free = self.free(z)
         scale = np.tile(1 / sizes[:n], len(z) - 1)
         for _ in range(NEWTON_STEPS):
-            with np.errstate(all="ignore"):
-                d = self.defects(z).ravel() * scale
+            d = self.defects(z).ravel() * scale
             worst = float(np.abs(d).max(initial=0.0))
             if worst <= SETTLED or not worst < LOST:
                 break
@@ -365,9 +366,10 @@ class _Mesh:
             z = z - moved.reshape(z.shape) * sizes
         if not worst <= 100 * SETTLED:
             k, i = divmod(int(np.abs(begun / self.way).argmax()), n)
+            off = f"{abs(begun[k, i]):.3g} {'more' if begun[k, i] > 0.0 else 'less'}"
             raise Infeasible(
                 f"no motion to that end in {self.t[-1]:g} s was found: on the nearest one x{i} "
-                f"changes by {begun[k, i]:.3g} more than its dynamics say, near {self.t[k]:.4g} s. "
+                f"changes by {off} than its dynamics say, near {self.t[k]:.4g} s. "
                 "Give another end, more or fewer seconds, wider limits, or plan it in parts"
             )
         u, (low, high) = z[:, n:], self.box.T
