@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from rich.console import Console
 
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, DocumentError
 from nlsid_core.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -43,10 +43,18 @@ class Clock(StrEnum):
     LOG = "log"
 
 
+def _folder(path: Path) -> Path:
+    """Refuse a file in the place of a folder."""
+    if path.is_file():
+        raise DocumentError(f"{path} is a file: give the design's folder, {path.parent}")
+    return path
+
+
 DesignArgument = Annotated[
     Path,
     typer.Argument(
         metavar="DIR",
+        callback=_folder,
         help="The design's folder: robot.yaml, model.json, funnel.json, their proofs.",
     ),
 ]

@@ -31,6 +31,7 @@ from nlsid_core.errors import (
 )
 from nlsid_core.models import DifferenceEquation
 from tests.tracked import assumption, designed, tracked
+from tests.verbs import nlsid
 
 PROFILE = ((0.0, 0.0), (7.0, 0.5))
 
@@ -146,6 +147,9 @@ def test_a_proof_of_something_else_is_no_design(
     files.write_document(tmp_path / PROOF, fit.proof.document(fit.model, MODEL))
     with pytest.raises(CertificateMismatch, match="is not about it: give the design's folder"):
         load(tmp_path)
+    assert "is a file: give the design" in nlsid(
+        "monitor", tmp_path / FUNNEL, tmp_path, status=None
+    )
 
 
 def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesign) -> None:
