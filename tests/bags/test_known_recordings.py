@@ -525,8 +525,9 @@ def test_definitions_and_padding_of_ros_1_are_read_as_they_come(
     tmp_path: Path, kind: str, text: str, data: bytes, field: str
 ) -> None:
     bag = ros1_bag(tmp_path / "a.bag", [(0, data)] * 3, kind=kind, text=text)
-    signal = f"speed:{field}"
-    assert read_signals(bag, [signal])[signal].values.tolist() == [0.5] * 3
+    (read,) = read_signals(bag, [f"speed:{field}"]).values()
+    stamps = [2 * 10**9 + 3 if kind == "p/Stamped" else START_NS + k * STEP_NS for k in range(3)]
+    assert (read.values.tolist(), read.stamp_ns.tolist()) == ([0.5] * 3, stamps)
     package, _, name = kind.partition("/")
     channel = ("/x", f"{package}/{name}", "ros1msg", text, "ros1")
     mcap = mcap_bag(tmp_path / "a.mcap", [channel], [(0, 5, data)])

@@ -14,6 +14,7 @@ from nlsid_core.design import compose_funnels, design_funnel
 from nlsid_core.errors import CertificateMismatch, DataError, Infeasible
 from tests.core.kernel import refusals
 from tests.decided import decided
+from tests.funnel_files import forged_by
 from tests.marks import slow_among
 from tests.verbs import nlsid
 
@@ -183,10 +184,8 @@ def rebound(files: Files, folder: Path) -> Path:
 def test_a_forged_composition_is_refused_for_what_it_is(
     files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
 ) -> None:
-    forged = json.loads(json.dumps(files))
-    forge(forged)
     with refusals.refused(reason):
-        decided(rebound(forged, tmp_path))
+        decided(rebound(forged_by(forge, files), tmp_path))
 
 
 def test_binding_the_files_again_as_they_are_changes_nothing(files: Files, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from nlsid_core.errors import CertificateMismatch
 from nlsid_core.proofs import check
 from tests.core.kernel import refusals
 from tests.decided import decided
-from tests.funnel_files import Files, write
+from tests.funnel_files import Files, forged_by, write
 from tests.marks import slow_among
 
 
@@ -155,10 +155,8 @@ LONG = {
 def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
     files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
 ) -> None:
-    forged = json.loads(json.dumps(files))
-    forge(forged)
     with refusals.refused(reason):
-        decided(write(forged, tmp_path, rebind=True))
+        decided(write(forged_by(forge, files), tmp_path, rebind=True))
 
 
 @pytest.mark.parametrize(
@@ -168,10 +166,8 @@ def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
 def test_a_forged_file_is_refused_by_its_digest(
     files: Files, tmp_path: Path, forge: Callable[[Files], None]
 ) -> None:
-    forged = json.loads(json.dumps(files))
-    forge(forged)
     with pytest.raises(CertificateMismatch, match="is not the"):
-        decided(write(forged, tmp_path, rebind=False))
+        decided(write(forged_by(forge, files), tmp_path, rebind=False))
 
 
 def test_writing_the_files_again_as_they_are_changes_nothing(files: Files, tmp_path: Path) -> None:

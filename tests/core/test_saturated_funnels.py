@@ -1,6 +1,5 @@
 """Funnels of policies whose inputs saturate: proved mode by mode, simulated, and forged."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.core.kernel import refusals
 from tests.decided import decided
-from tests.funnel_files import Files, saved, write
+from tests.funnel_files import Files, forged_by, saved, write
 from tests.verbs import nlsid
 
 LIMIT = 9.0
@@ -213,10 +212,8 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
 def test_a_forged_saturated_funnel_is_refused(
     files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
 ) -> None:
-    forged = json.loads(json.dumps(files))
-    forge(forged)
     with refusals.refused(reason):
-        decided(write(forged, tmp_path, rebind=True))
+        decided(write(forged_by(forge, files), tmp_path, rebind=True))
 
 
 def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> None:

@@ -131,6 +131,18 @@ def test_two_monitors_say_the_same(robot: Robot) -> None:
         stop(second)
 
 
+def test_in_simulated_time_a_slow_simulation_is_not_a_silent_robot(robot: Robot) -> None:
+    simulated = {"use_sim_time": True, "stale_after": 0.1, "__node": "simulated_monitor"}
+    with process(MONITOR, **simulated) as monitor:
+        robot.ready(monitors=2)
+        robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
+        robot.hears(" yet", "simulated_monitor")
+        robot.drive(GOOD, slower=8.0, clock=True)  # 0.2 s of wall time between samples
+        robot.hears("inside", "simulated_monitor")
+        assert not robot.has_said("no speed for", "simulated_monitor")
+        stop(monitor)
+
+
 def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
     robot: Robot,
 ) -> None:

@@ -369,3 +369,22 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
         (answer,) = ask(Name(), bags, Workers(), manifest)
     assert isinstance(answer, Answer)
     assert (answer.content, answer.requests, answer.kept) == (b"a.mcap a", 0, False)
+
+
+@pytest.mark.slow
+def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: Path) -> None:
+    """Busy for ever, vanished after it was listed, busy for a while: each once."""
+    pytest.importorskip("obstore")
+    for k in range(4):
+        drive(tmp_path / "web" / f"drive_{k}.mcap", seed=k, samples=120)
+
+    def fault(path: str, number: int) -> int | None:
+        return {"/drive_1.mcap": 503, "/drive_2.mcap": 404}.get(path, 503 if number <= 2 else None)
+
+    with web_server(tmp_path / "web", fault) as url:
+        named = named_bags([Path(f"{url}/drive_{k}.mcap") for k in range(4)], patience=2.0)
+        found = identified(named, load_config(config), tmp_path / "out")
+    assert found.left_out.keys() == {"drive_1", "drive_2"}
+    assert "2 s were lost with failing requests" in found.left_out["drive_1"]
+    assert found.left_out["drive_2"] == "it is not there any more"
+    assert {*found.trials.train.names, *found.trials.test.names} == {"drive_0", "drive_3"}

@@ -3,8 +3,7 @@
 from itertools import product
 from typing import Any
 
-from nlsid_core import proofs
-from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind
+from tests.funnel_files import Files, stated
 
 HOLD, LIMITS = 1.0, (-1.0, 1.0)
 TIMES = [0.0, 1.0, 1.25, 2.25]
@@ -82,19 +81,7 @@ def claim(low: float) -> Files:
         "rates": [[1.0]] * 3,
         "rate_pieces": rates,
     }
-    about = {
-        role: {"file": f"{role}.json", "digest": ""}
-        for role in ("vector_field", "policy", "funnel")
-    }
-    stated = {"kind": "continuous_funnel", "about": about, "hold": HOLD}
-    files = {
-        FIELD: field,
-        POLICY: policy,
-        FUNNEL: funnel,
-        PROOF: proofs.proof_document(stated, proof),
-    }
-    bind(files)
-    return files
+    return stated(field, policy, funnel, proof, hold=HOLD)
 
 
 def integrator(rate: float) -> Files:
@@ -169,16 +156,4 @@ def integrator(rate: float) -> Files:
         "rates": [[rate]],
         "rate_pieces": rates,
     }
-    about = {
-        role: {"file": f"{role}.json", "digest": ""}
-        for role in ("vector_field", "policy", "funnel")
-    }
-    stated = {"kind": "continuous_funnel", "about": about, "hold": 0.25}
-    files = {
-        FIELD: field,
-        POLICY: policy,
-        FUNNEL: funnel,
-        PROOF: proofs.proof_document(stated, proof),
-    }
-    bind(files)
-    return files
+    return stated(field, policy, funnel, proof, hold=0.25)

@@ -28,7 +28,18 @@ from nlsid_core.kernel.exact import inverse_forms
 from nlsid_core.kernel.polynomials import Polynomial, Ring
 from tests.core.kernel import refusals
 from tests.core.kernel.oracle_continuous import Oracle
-from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, copy_of, saved, write
+from tests.funnel_files import (
+    FIELD,
+    FUNNEL,
+    POLICY,
+    PROOF,
+    Files,
+    bind,
+    copy_of,
+    saved,
+    stated,
+    write,
+)
 from tests.marks import slow_among
 
 NUMBERS: list[Callable[[np.random.Generator], float]] = [
@@ -155,19 +166,7 @@ def random_claim(rng: np.random.Generator) -> Files:
                 if not mode:
                     del piece["mode"]
                 proof["rate_pieces"].append(piece)
-    about = {
-        role: {"file": f"{role}.json", "digest": ""}
-        for role in ("vector_field", "policy", "funnel")
-    }
-    claim = {"kind": "continuous_funnel", "about": about, **claimed}
-    files = {
-        FIELD: field,
-        POLICY: policy,
-        FUNNEL: funnel,
-        PROOF: proofs.proof_document(claim, proof),
-    }
-    bind(files)
-    return files
+    return stated(field, policy, funnel, proof, **claimed)
 
 
 def random_hold(rng: np.random.Generator, *, files: tuple[Any, Any], proof: Any) -> Any:
