@@ -222,8 +222,7 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
         elif len(columns) and not columns.stamp_ns.any():
             yield Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0")
         elif len(columns):
-            back = int((np.diff(columns.stamp_ns) < 0).sum())
-            if back:
+            if back := int((np.diff(columns.stamp_ns) < 0).sum()):
                 yield Finding(Level.BAD, "clock", f"{topic}: stamps that go back: {back}")
             relation = clock_relation(columns.stamp_ns, columns.log_ns)
             offsets[topic] = relation.offset
@@ -239,20 +238,17 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
 
 
 def _regularity(samples: Samples) -> Iterator[Finding]:
-    steps = np.diff(samples.stamp_ns) / 1e9
-    name = samples.path
+    every = np.diff(samples.stamp_ns) / 1e9
+    name, steps = samples.path, every[every > 0]
     if not len(steps):
-        yield Finding(Level.BAD, "regularity", f"{name} has one sample")
+        yield Finding(Level.BAD, "regularity", f"{name} has one stamp")
         return
-    if repeated := int((steps == 0).sum()):
+    if repeated := len(every) - len(steps):
         yield Finding(
             Level.LOOK,
             "regularity",
             f"{name}: {repeated} of {len(samples)} stamps repeat the one before",
         )
-    steps = steps[steps > 0]
-    if not len(steps):
-        return
     period = float(np.median(steps))
     gaps = steps > GAP * period
     if gaps.any():

@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -114,6 +114,18 @@ def _assigned(text: str) -> tuple[SignalPath, str]:
     return path, column.strip()
 
 
+def _every_column(titles: Iterable[str], time: str | None) -> list[tuple[SignalPath, str]]:
+    """All but the times, each as the number of a topic called as the column is."""
+    named: dict[str, str] = {}
+    for title in titles:
+        name = re.sub(r"\W+", "_", title, flags=re.ASCII).strip("_")
+        named[title] = name if name[:1].isalpha() else f"column_{name}"
+    named.pop(_unit_of(time or "")[0], None)
+    if len(set(named.values())) < len(named):
+        raise BagError(f"two of {listed(named)} make one topic: name them, -s /NAME:data=COLUMN")
+    return [(SignalPath.parse(f"/{name}:data"), title) for title, name in named.items()]
+
+
 def import_table(
     file: Path | str,
     out: Path | str,
@@ -130,7 +142,7 @@ def import_table(
     Args:
         file: the table.
         out: the bag.
-        assignments: `signal=column` each.
+        assignments: `signal=column` each; none: every column but the times is a topic's number.
         types: topic -> message type, a standard one; a number where only `topic:data` is assigned.
         rows: when the rows were recorded; without a period or a column, by the one named as time.
         custom: key-value pairs of the bag's own.
@@ -150,16 +162,13 @@ def import_table(
             f"(--time); there are: {listed(tables)}"
         )
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
-    for text in assignments:
-        path, column = _assigned(text)
+    assigned = list(map(_assigned, assignments)) or _every_column(tables, rows.time)
+    for path, column in assigned:
         topics.setdefault(path.topic, {})[path] = _column(tables, column)
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     if not topics:
-        raise BagError(
-            "say which column is which signal, e.g. -s /speed:data=COLUMN; there are: "
-            f"{listed(tables)}"
-        )
+        raise BagError(f"{file} has no column of numbers but '{rows.time}'")
     times, unit = _times(tables, rows)
     stamps = _stamps(times, round(rows.start * 1e9))
     streams = []
