@@ -9,7 +9,8 @@ over outputs, at safety factor 1: `fading` is the tube of the fast observer (whe
 commands, its mean), `headline` the last of those for ever. `response` is the simulation's largest
 error, of each output for itself; at one scale it promises what a tube does, of any output's alarm.
 Times are of the processor, a sample's update that of the quickest trial. `unjudged` are sabotaged
-trials of which a part was unknown and nothing else was said. Published are figures of a trial of the method, each scaled by itself.
+trials of which a part was unknown and nothing else was said. Published are figures of a trial of
+the method, each scaled by itself.
 """
 
 import os
