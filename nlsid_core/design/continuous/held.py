@@ -42,15 +42,14 @@ class Hold:
     """period: how old the applied input is at most, s. error: (n,) bounds of measurement errors.
 
     longest: the period is where a search for the longest one starts. What a search finds on its
-    way: free, (K,) ρ without the hold, of which nothing may be proved; needed, 1/s, the margin with
-    which that was proved; rates, (K-1, m) what |dũ/dt| stays below in every funnel looked for.
+    way: free, (K,) ρ without the hold, of which nothing may be proved; rates, (K-1, m) what |dũ/dt|
+    stays below in every funnel looked for.
     """
 
     period: float
     error: FloatArray
     longest: bool = False
     free: FloatArray = field(default_factory=lambda: np.zeros(0))
-    needed: float = 0.0
     rates: FloatArray | None = None
 
     @classmethod
