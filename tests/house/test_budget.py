@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_100,
-    ("bags",): 11_923,
+    ("bags",): 11_915,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_339,
+    ("tests",): 22_340,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
