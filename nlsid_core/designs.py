@@ -9,15 +9,10 @@ from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, DocumentError
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.funnels import ContinuousFunnel, SampledFunnel, TubeFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import Signal, StableModel
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.models import Signal, StableModel, StateModel
+from nlsid_core.policies import ContinuousPolicy, SampledPolicy, TubePolicy
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held

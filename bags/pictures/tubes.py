@@ -14,8 +14,7 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
-from nlsid_core.models import Signal
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models import Signal, StateModel
 
 TUBE = "#dbe8f4"
 TIMES = 200  # at which a continuous tube is drawn

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.designs import AnyDesign
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels import ContinuousFunnel, SampledFunnel
 from nlsid_core.running.reading import Reading
 
 

@@ -15,8 +15,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.models.signal import signals_of
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models import StateModel, signals_of
 from nlsid_core.polynomial.values import monomial_values
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds

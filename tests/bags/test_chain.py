@@ -23,9 +23,8 @@ from bags.designs.provenance import of_proof
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth
 from bags.signals.signal import SignalPath
-from nlsid import Grid, Status, read_bags
+from nlsid import Grid, Status, f1tenth, read_bags
 from nlsid_core import files
 from nlsid_core.errors import DataError
 from nlsid_core.progress import silent
