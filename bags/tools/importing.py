@@ -96,8 +96,10 @@ def _number(text: str) -> float | None:
 
 def _column(tables: Mapping[str, FloatArray], title: str) -> FloatArray:
     if title not in tables:
-        near = did_you_mean(title, tables)
-        raise DataError(f"no column of numbers '{title}'; there are: {listed(tables)}{near}")
+        raise DataError(
+            f"no column of numbers '{title}'; there are: {listed(tables)}"
+            f"{did_you_mean(title, tables)}"
+        )
     return tables[title]
 
 
@@ -116,11 +118,9 @@ def _assigned(text: str) -> tuple[SignalPath, str]:
 
 def _every_column(titles: Iterable[str], time: str | None) -> list[tuple[SignalPath, str]]:
     """All but the times, each as the number of a topic called as the column is."""
-    named: dict[str, str] = {}
-    for title in titles:
-        name = re.sub(r"\W+", "_", title, flags=re.ASCII).strip("_")
-        named[title] = name if name[:1].isalpha() else f"column_{name}"
-    named.pop(_unit_of(time or "")[0], None)
+    times = _unit_of(time or "")[0]
+    words = {title: re.findall("[A-Za-z0-9]+", title) for title in titles if title != times}
+    named = {title: re.sub("^(?![A-Za-z])", "column_", "_".join(words[title])) for title in words}
     if len(set(named.values())) < len(named):
         raise BagError(f"two of {listed(named)} make one topic: name them, -s /NAME:data=COLUMN")
     return [(SignalPath.parse(f"/{name}:data"), title) for title, name in named.items()]

@@ -647,20 +647,24 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_every_column_is_a_topic_where_none_is_named(tmp_path: Path) -> None:
-    table = tmp_path / "log.csv"
-    table.write_text("t,voltage [V],yaw rate,2nd=b\n0,1,0.1,7\n0.02,2,0.3,8\n")
-    run("import", table, "--out", tmp_path / "bag")
-    names = ["/voltage_V:data", "/yaw_rate:data", "/column_2nd_b:data"]
-    read = read_signals(tmp_path / "bag", names)
-    assert [read[name].values.tolist() for name in names] == [[1.0, 2.0], [0.1, 0.3], [7.0, 8.0]]
+    (tmp_path / "log.csv").write_text("t,voltage [V],yaw rate,2nd=b\n0,1,0.1,7\n0.02,2,0.3,8\n")
+    run("import", tmp_path / "log.csv", "--out", tmp_path / "bag")
+    read = read_signals(
+        tmp_path / "bag", ["/voltage_V:data", "/yaw_rate:data", "/column_2nd_b:data"]
+    )
+    assert [signal.values.tolist() for signal in read.values()] == [[1, 2], [0.1, 0.3], [7, 8]]
 
 
 def import_speed(tmp_path: Path, text: str, rows: Rows) -> str:
     """A bag `bag` of a table's column `speed`; how its times were understood."""
     (tmp_path / "log.csv").write_text(text)
-    types = {ODOM: ODOM_TYPE}
-    out = tmp_path / "bag"
-    return import_table(tmp_path / "log.csv", out, [f"{SPEED}=speed"], types=types, rows=rows).times
+    return import_table(
+        tmp_path / "log.csv",
+        tmp_path / "bag",
+        [f"{SPEED}=speed"],
+        types={ODOM: ODOM_TYPE},
+        rows=rows,
+    ).times
 
 
 @pytest.mark.parametrize(
@@ -742,10 +746,14 @@ def test_an_import_that_does_not_fit_is_refused_and_writes_nothing(
     tmp_path: Path, assignment: str, message: str
 ) -> None:
     (tmp_path / "log.csv").write_text("a,b,b?\n0,0,0\n1,1,1\n")
-    file, given = tmp_path / "log.csv", [assignment] * bool(assignment)
-    types, rows = {"/arm": JOINT_TYPE}, Rows(period=1.0)
     with pytest.raises(DataError, match=message):
-        import_table(file, tmp_path / "x", given, types=types, rows=rows)
+        import_table(
+            tmp_path / "log.csv",
+            tmp_path / "x",
+            [assignment] * bool(assignment),
+            types={"/arm": JOINT_TYPE},
+            rows=Rows(period=1.0),
+        )
     assert os.listdir(tmp_path) == ["log.csv"]  # noqa: PTH208
 
 
