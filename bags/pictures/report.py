@@ -40,7 +40,7 @@ def report_available() -> bool:
 
 
 def drawable(replays: Sequence[Replay]) -> bool:
-    """Whether replayed bags can be drawn in their tubes: those of one output, if any was judged."""
+    """Whether replayed bags can be drawn: they have one output, and one was judged."""
     judged = any(entry.judged for entry in replays)
     return report_available() and judged and all(entry.half_width for entry in replays)
 
@@ -58,7 +58,7 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
 
 
 def write_catching(folder: Path, catching: Catching) -> list[Path]:
-    """The picture of what a funnel catches, and its section in the report; the files written.
+    """Write the picture of the faults that a funnel catches, and its section; return the files.
 
     Nothing without the extra `report`; no section where there is no report.
     """

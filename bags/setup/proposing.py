@@ -454,7 +454,7 @@ def _say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> Non
 
 
 def take_next(proposal: Proposal, refusal: object) -> str:
-    """Take the next best of what was tried, as the best was refused; which, empty if none is."""
+    """Take the next best attempt, as the best was refused; its name, or empty if none is left."""
     choice = proposal.choice
     if choice is None or len(choice.ranked) < 2:
         return ""

@@ -250,7 +250,7 @@ class Choice:
 
     @property
     def promise(self) -> Promise:
-        """The errors on each fold of what the other folds choose.
+        """The errors on each fold of the model that the other folds choose.
 
         The interval is that of as much new data as a fold: the mean of n squared errors and that of
         n/3 new ones differ by a standard deviation of 2 σ/√n, half of it in the root.
