@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_100,
     ("bags",): 11_923,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_339,
+    ("tests",): 22_338,
     ("benchmarks", "examples"): 3_798,
 }
 ARGUMENTS, FIELDS = 6, 8
