@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bags.designs.documents import load
     from bags.monitoring.replay import replay
     from bags.pictures.notebook import plot, to_control
-    from bags.samples import f1tenth
+    from bags.samples.folders import f1tenth
     from bags.signals.grid import read_dataset as read_bags
     from bags.signals.sampling import Grid
     from bags.tools.tables import frame
@@ -109,7 +109,7 @@ _MOTIONS: Final = ("integrate_nominal", "plan_motion")
 _HOMES: Final = {
     "bags.pictures.notebook": ("plot", "to_control"),
     "bags.monitoring.replay": ("replay",),
-    "bags.samples": ("f1tenth",),
+    "bags.samples.folders": ("f1tenth",),
     "bags.signals.grid": ("read_bags",),
     "bags.signals.sampling": ("Grid",),
     "bags.tools.tables": ("frame",),

@@ -2,65 +2,44 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.funnels import AnyFunnel, ContinuousFunnel, SampledFunnel, TubeFunnel
 from nlsid_core.models import (
     BlockCascade,
     CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
+    StableModel,
     StateAffineModel,
     StateModel,
 )
-from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.policies import AnyPolicy, ContinuousPolicy, SampledPolicy, TubePolicy
 
-Noun: TypeAlias = (
-    ContinuousFunnel
-    | SampledFunnel
-    | TubeFunnel
-    | ContinuousPolicy
-    | SampledPolicy
-    | TubePolicy
-    | VectorField
-    | BlockCascade
-    | CellNetwork
-    | DifferenceEquation
-    | ImplicitModel
-    | MonotoneEquation
-    | StateAffineModel
-    | StateModel
-)
+Noun: TypeAlias = AnyFunnel | AnyPolicy | VectorField | StableModel | StateModel
 
 # By format, and by kind where the format has kinds.
-READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType(
-    {
-        ("nlsid/funnel", "continuous"): ContinuousFunnel.from_document,
-        ("nlsid/policy", "continuous"): ContinuousPolicy.from_document,
-        ("nlsid/vector_field", None): VectorField.from_document,
-        ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
-        ("nlsid/funnel", "tube"): TubeFunnel.from_document,
-        ("nlsid/policy", "tube"): TubePolicy.from_document,
-        ("nlsid/policy", "sampled"): SampledPolicy.from_document,
-        ("nlsid/model", "block_cascade"): BlockCascade.from_document,
-        ("nlsid/model", "cell_network"): CellNetwork.from_document,
-        ("nlsid/model", "difference_equation"): DifferenceEquation.from_document,
-        ("nlsid/model", "implicit"): ImplicitModel.from_document,
-        ("nlsid/model", "monotone_equation"): MonotoneEquation.from_document,
-        ("nlsid/model", "state_affine"): StateAffineModel.from_document,
-        ("nlsid/model", "state_map"): StateModel.from_document,
-    }
-)
+READERS: Final[Mapping[tuple[str, str | None], Callable[..., Noun]]] = {
+    ("nlsid/funnel", "continuous"): ContinuousFunnel.from_document,
+    ("nlsid/policy", "continuous"): ContinuousPolicy.from_document,
+    ("nlsid/vector_field", None): VectorField.from_document,
+    ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
+    ("nlsid/funnel", "tube"): TubeFunnel.from_document,
+    ("nlsid/policy", "tube"): TubePolicy.from_document,
+    ("nlsid/policy", "sampled"): SampledPolicy.from_document,
+    ("nlsid/model", "block_cascade"): BlockCascade.from_document,
+    ("nlsid/model", "cell_network"): CellNetwork.from_document,
+    ("nlsid/model", "difference_equation"): DifferenceEquation.from_document,
+    ("nlsid/model", "implicit"): ImplicitModel.from_document,
+    ("nlsid/model", "monotone_equation"): MonotoneEquation.from_document,
+    ("nlsid/model", "state_affine"): StateAffineModel.from_document,
+    ("nlsid/model", "state_map"): StateModel.from_document,
+}
 
 
 def load(path: Path | str) -> Noun:

@@ -10,7 +10,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 
 POINTS: Final = 80  # of a line
-LEAST: Final = 10  # characters of a column
+LEAST, MOST = 10, 35  # characters of a column, and lines of a table that are printed
 BLUE, GREY = "#1f6fb4", "#9aa0a6"
 
 
@@ -32,10 +32,12 @@ class Table:
         first = max(map(len, self.rows), default=0)
         widths = [max(len(column), LEAST) for column in self.columns]
         texts = {name: [f"{x:.4g}" for x in numbers] for name, numbers in self.rows.items()}
-        return "\n".join(
+        lines = [
             "  ".join([f"{name:{first}s}", *map(str.rjust, cells, widths)])
             for name, cells in ({"": self.columns} | texts).items()
-        )
+        ]
+        more = f"\n... {len(lines) - MOST} more in .rows" * (len(lines) > MOST)
+        return "\n".join(lines[:MOST]) + more
 
 
 def card(text: str, *lines: str) -> str:

@@ -15,8 +15,7 @@ from typer.main import get_command
 
 from bags.chain.shipped import config_file
 from bags.designs.documents import FUNNEL, MODEL, MODEL_PROOF
-from bags.samples import f1tenth
-from nlsid import Dataset, Fit, OutputTube, Polynomial, Trajectory, identify
+from nlsid import Dataset, Fit, OutputTube, Polynomial, Trajectory, f1tenth, identify
 from nlsid_core import files
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.models import DifferenceEquation

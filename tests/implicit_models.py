@@ -4,8 +4,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.models import ImplicitModel
-from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models import ImplicitModel, Polynomials
 
 
 def quintic() -> ImplicitModel:

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from nlsid import Degrees, Trajectory
+from nlsid import Polynomial as Equation
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moments import Offsets
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.polynomial import Polynomial, constant

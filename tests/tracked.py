@@ -12,8 +12,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.funnels.sampled import DisturbanceAssumption
-from nlsid_core.models import Signal
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models import Signal, StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.running.observer import StateObserver
 

@@ -28,8 +28,7 @@ from nlsid_core.design import OutputTube, OutputTubeDesign, design
 from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
-from nlsid_core.models import StableModel
-from nlsid_core.models.signal import Signal, signals_of
+from nlsid_core.models import Signal, StableModel, signals_of
 from nlsid_core.progress import Progress, part, silent
 
 USES: Final = ("test", "calibration")  # that the split names bags for

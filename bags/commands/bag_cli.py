@@ -274,7 +274,8 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat.",
+            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat. "
+            "Default: a topic of every column.",
         ),
     ] = None,
     types: Annotated[

@@ -19,16 +19,11 @@ from nlsid_core.designs import AnyDesign, Design, Wiring
 from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.funnels import ContinuousFunnel, SampledFunnel, TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.checking import read_regular
-from nlsid_core.models import StableModel
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.models import StableModel, StateModel
+from nlsid_core.policies import ContinuousPolicy, SampledPolicy, TubePolicy
 from nlsid_core.running.stage import Stage
 
 FORMAT: Final = "nlsid/bundle"

@@ -15,8 +15,7 @@ from typing import Any
 from bags.designs import documents
 from nlsid_core import files
 from nlsid_core.errors import DataError
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels import ContinuousFunnel, SampledFunnel
 from nlsid_core.kernel import Verdict, text
 from nlsid_core.models.signal import Signal
 

@@ -415,7 +415,7 @@ def replay_messages(
     clock: takes note of the stamps.
     """
     bag = place(bag)
-    planned = centre is Centre.PROFILE or design.has_plan
+    planned = centre is Centre.PROFILE or not isinstance(design.funnel, TubeFunnel)
     announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)
     stamped = [

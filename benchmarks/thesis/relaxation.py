@@ -10,9 +10,8 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.design import ContinuousTracking
-from nlsid_core.design.continuous.expanded_sweep import swept
+from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.setting import prepare
-from nlsid_core.design.continuous.sweep import Wanted
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.progress import Progress, silent
@@ -44,9 +43,9 @@ def sample_funnel(
         raise DataError(f"{samples} samples an interval: its two ends are the least")
     setting = prepare(problem)
     policy = setting.policy
-    wanted = Wanted(setting.margin(setting.rho_final), setting.rho_final)
     shares = np.linspace(0, 1, samples).tolist()
-    rho = swept(replace(setting, expansion=None), wanted, progress, shares=shares).rho
+    bare = replace(setting, expansion=None)
+    rho = swept(bare, wanted_of(setting), progress, shares=shares).rho
     digest = files.digest(policy.document())
     funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
     return Sampled(funnel, (funnel.volume_integral(),))

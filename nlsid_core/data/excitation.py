@@ -31,8 +31,7 @@ def chirp(samples: int, period: float, *, lowest: float, highest: float) -> Floa
     """A sine whose frequency rises exponentially from lowest to highest Hz."""
     _harmonics(samples, period, lowest, highest)
     t = np.arange(samples) * period
-    duration = samples * period
-    growth = math.log(highest / lowest) / duration
+    growth = math.log(highest / lowest) / (samples * period)
     phase = 2.0 * np.pi * lowest * np.expm1(growth * t) / growth if growth else lowest * t
     return np.asarray(np.sin(phase))
 

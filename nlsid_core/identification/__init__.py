@@ -24,12 +24,12 @@ from nlsid_core.identification.prediction import Model, simulate_trial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.proofs.stable_sets import ImplicitProof, prove_implicit
 from nlsid_core.identification.repeats import compare_repeats
+from nlsid_core.identification.uncertainty import standard_errors
 from nlsid_core.identification.validation import (
     Residual,
     Validation,
     compare,
     simulation_percent,
-    standard_errors,
     validate,
 )
 

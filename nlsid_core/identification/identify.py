@@ -46,8 +46,7 @@ def identify(
     for asked in (chosen, *(comparators or ())):
         if getattr(asked, "name", None) not in [one.name for one in known]:
             raise DataError(_unknown(asked, known))
-    datasets = {"train": train, "test": test}
-    scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
+    scored = {"train": train} | ({} if test is None else {"test": test})
     for dataset in scored.values():  # a dataset has the same signals and period throughout
         Dataset((train.trajectories[0], dataset.trajectories[0]))
     if max_rate is not None and not 0.0 < max_rate < 1.0:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
@@ -15,6 +14,7 @@ from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
+    Polynomials,
     StableModel,
     StateAffineModel,
 )
@@ -119,15 +119,31 @@ def _explicit(
     model: DifferenceEquation | StateAffineModel, trial: Trajectory
 ) -> tuple[FloatArray, FloatArray]:
     """y(t) = gains(t) [y(t-1); …; y(t-n)] + forcing(t) in the outputs' units, t = n …."""
-    n, N = len(model), len(trial)
-    if isinstance(model, DifferenceEquation):
-        gains = np.broadcast_to(model.a, (N - n, 1, n))
-        forcing = np.asarray(lfilter(model.b, [1.0], trial.u[:, 0])[n:, None] + model.c)
-        return gains, forcing
-    gains, forcing = model.explicit(model.windows(trial.u))
-    scale, offset = model.y_scale, model.y_offset
+    form = as_state_affine(model) if isinstance(model, DifferenceEquation) else model
+    gains, forcing = form.explicit(form.windows(trial.u))
+    scale, offset, n = form.y_scale, form.y_offset, len(form)
     gains = gains * scale[:, None] / np.tile(scale, n)
     return gains, forcing * scale + offset - gains @ np.tile(offset, n)
+
+
+def as_state_affine(model: DifferenceEquation) -> StateAffineModel:
+    """The same equation, 0 = y(t) - Σ a_k y(t-k) - Σ b_j u(t-j) - c."""
+    n, constant = len(model), np.zeros((1, len(model) + 1), dtype=np.int64)
+    largest = np.finfo(np.float64).max
+    right = -np.append(model.b, model.c)[:, None]
+    return StateAffineModel(
+        G=tuple(Polynomials(constant, np.full((1, 1, 1), g)) for g in (1.0, *-model.a)),
+        p=Polynomials(np.eye(n + 2, n + 1, dtype=np.int64), right),
+        window=tuple((0, delay) for delay in range(n + 1)),
+        y_offset=np.zeros(1),
+        y_scale=np.ones(1),
+        u_offset=np.zeros(1),
+        u_scale=np.ones(1),
+        u_range=np.array([[-largest, largest]]),
+        y=(model.y,),
+        u=(model.u,),
+        period=model.period,
+    )
 
 
 def _monotone_step(

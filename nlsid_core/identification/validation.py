@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate, lfilter
+from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
 from nlsid_core.arrays import FloatArray
@@ -23,9 +23,8 @@ from nlsid_core.identification.prediction import (
     learns,
     one_step_residual,
     simulate_started,
-    simulate_trial,
 )
-from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.models import StateAffineModel
 from nlsid_core.shown import Table
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
@@ -51,8 +50,11 @@ class Residual:
     independent: bool
 
     def __str__(self) -> str:
-        left = "dynamics are left, or noise that is coloured or of both kinds"
-        white = "white" if self.white else f"NOT white (99 %): {left}"
+        white = (
+            "white"
+            if self.white
+            else "NOT white (99 %): dynamics are left, or noise that is coloured or of both kinds"
+        )
         if self.independent:
             return f"{white}, independent of the input"
         return f"{white}, NOT independent of the input (99 %): it explains more than the model uses"
@@ -128,16 +130,14 @@ def validate(model: Model, dataset: Dataset, *, transient: int = 0) -> Validatio
     """
     first = max(history(model), transient)
     shortest = min(dataset, key=len)
-    room = len(shortest) - first - 1
-    lags = min(LAGS, room // 2)
+    lags = min(LAGS, (len(shortest) - first - 1) // 2)
     if lags < 1:
         raise DataError(
             f"{shortest.name}: {len(shortest)} samples; correlations need more than {first + 2}"
         )
     inputs = [trial.u[first:] for trial in dataset]
     simulated = _simulated(model, dataset, first)
-    late = first - history(model)
-    one_step = [one_step_residual(model, trial)[late:] for trial in dataset]
+    one_step = [one_step_residual(model, trial)[first - history(model) :] for trial in dataset]
     with np.errstate(over="ignore", invalid="ignore"):
         left = [measured - outputs for measured, outputs in simulated]
         pairs = zip(dataset, one_step, strict=True)
@@ -287,36 +287,3 @@ def compare(data: Dataset, models: Mapping[str, Model]) -> Table:
     }
     rows = {name: (100.0 - error, error) for name, error in errors.items()}
     return Table(("fit [%]", "simulation error [%]"), rows)
-
-
-def standard_errors(model: DifferenceEquation, data: Dataset) -> Table:
-    """Give the coefficients with their standard errors, by the trials that they were fitted to.
-
-    They are right where the simulation's errors are white; `validate` says whether they are.
-    J = ∂ŷ/∂(a, b, c) is the row of the equation through the filter 1/(1 - Σ a_k z⁻ᵏ), and the
-    covariance σ² (J'J)⁻¹. Source: Ljung, System Identification, Section 9.3, of an output error.
-
-    Returns:
-        A row for each of a1 ... an, b0 ... bn and c: value, standard error. [name] is the latter.
-
-    Raises:
-        DataError: for another class of models, and where the data do not determine all of them.
-    """
-    if not isinstance(model, DifferenceEquation):
-        raise DataError("standard errors are those of a linear model of one output and one input")
-    n = len(model)
-    parts = []
-    for trial in data:
-        simulated, u = simulate_trial(model, trial)[:, 0], trial.u[:, 0]
-        past = [simulated[n - k : len(u) - k] for k in range(1, n + 1)]
-        driven = [u[n - j : len(u) - j] for j in range(n + 1)]
-        rows = np.column_stack([*past, *driven, np.ones(len(u) - n)])
-        moved = lfilter([1.0], np.append(1.0, -model.a), rows, axis=0)
-        parts.append(np.column_stack([moved, (trial.y[:, 0] - simulated)[n:]]))
-    J, e = np.split(np.concatenate(parts), [-1], axis=1)
-    if np.linalg.matrix_rank(J) < J.shape[1]:
-        raise DataError("the inputs of these trials do not determine all numbers of the model")
-    covariance = np.linalg.inv(J.T @ J) * np.sum(e**2) / (len(e) - J.shape[1])
-    names = [*(f"a{k}" for k in range(1, n + 1)), *(f"b{j}" for j in range(n + 1)), "c"]
-    numbers = zip([*model.a, *model.b, model.c], np.sqrt(np.diag(covariance)), strict=True)
-    return Table(("value", "standard error"), dict(zip(names, numbers, strict=True)))

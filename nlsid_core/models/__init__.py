@@ -7,7 +7,8 @@ from nlsid_core.models.cell_network import CellNetwork, PiecewiseLinear
 from nlsid_core.models.difference_equation import DifferenceEquation
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.monotone_equation import MonotoneEquation
-from nlsid_core.models.signal import Signal
+from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.signal import Signal, signals_of
 from nlsid_core.models.spline import Spline
 from nlsid_core.models.state_affine import StateAffineModel
 from nlsid_core.models.state_map import StateModel
@@ -29,9 +30,11 @@ __all__ = [
     "ImplicitModel",
     "MonotoneEquation",
     "PiecewiseLinear",
+    "Polynomials",
     "Signal",
     "Spline",
     "StableModel",
     "StateAffineModel",
     "StateModel",
+    "signals_of",
 ]

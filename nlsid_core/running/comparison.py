@@ -18,14 +18,10 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import CertificateMismatch, ShapeError, apart
-from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels import ContinuousFunnel, SampledFunnel, TubeFunnel
 from nlsid_core.funnels.factor import UNIT, refuse_coarse, refuse_unmonitorable
-from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.models import DifferenceEquation, StateModel
+from nlsid_core.policies import SampledPolicy, TubePolicy
 from nlsid_core.running.assumption import DisturbanceMeter
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Level, unsaid

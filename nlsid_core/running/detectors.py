@@ -7,7 +7,7 @@ times the safety factor. So each has the same bound on false alarms, 1/(m + 1) f
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -57,13 +57,11 @@ def largest(z: FloatArray) -> FloatArray:
 
 
 # Each: the part of the residuals, and the statistic of it in standard deviations.
-DETECTORS: Mapping[str, tuple[str, Callable[[FloatArray], FloatArray]]] = MappingProxyType(
-    {
-        "CUSUM": ("innovation", cusum),
-        "3σ": ("innovation", largest),
-        "box": ("error", largest),
-    }
-)
+DETECTORS: Final[Mapping[str, tuple[str, Callable[[FloatArray], FloatArray]]]] = {
+    "CUSUM": ("innovation", cusum),
+    "3σ": ("innovation", largest),
+    "box": ("error", largest),
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from typing import Any
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.funnels import ContinuousFunnel, TubeFunnel
 from nlsid_core.running.comparison import (
     Centre,
     Compared,

@@ -8,8 +8,7 @@ next one, 0 if it is that of the sample itself.
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models import DifferenceEquation, StateModel
 
 
 class PredictingObserver:

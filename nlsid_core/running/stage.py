@@ -5,10 +5,9 @@ from typing import NamedTuple, TypeAlias
 from nlsid_core import files
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError
-from nlsid_core.funnels.protocol import AnyFunnel
-from nlsid_core.models import StableModel
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.policies.protocol import AnyPolicy
+from nlsid_core.funnels import AnyFunnel
+from nlsid_core.models import StableModel, StateModel
+from nlsid_core.policies import AnyPolicy
 from nlsid_core.running.held import Held
 
 Dynamics: TypeAlias = StableModel | StateModel | VectorField

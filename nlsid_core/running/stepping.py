@@ -21,12 +21,12 @@ from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
+    Signal,
     StableModel,
     StateAffineModel,
 )
 from nlsid_core.models.implicit_step import SingleStep
 from nlsid_core.models.monotone_equation import solve_increasing
-from nlsid_core.models.signal import Signal
 from nlsid_core.models.starts import nearest_start
 from nlsid_core.polynomial.products import Products
 

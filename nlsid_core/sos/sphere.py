@@ -24,8 +24,7 @@ from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray, keep
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
-from nlsid_core.polynomial import monomials
-from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.polynomial import monomial_values, monomials
 
 CANDIDATES = 1.5  # random points per equality, of which pivoting keeps the best conditioned ones
 ONE = 0.25  # of the weights, of the monomial 1

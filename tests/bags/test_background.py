@@ -13,9 +13,8 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import split
 from bags.designs.documents import MODEL, MODEL_PROOF
 from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth
 from bags.signals.recording import Arrival, Recent
-from nlsid import check
+from nlsid import check, f1tenth
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command, speed_bag
 from tests.conftest import synthetic_dataset

@@ -23,8 +23,7 @@ from nlsid import (
 )
 from nlsid_core import files
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import simulation_percent, validate
-from nlsid_core.identification.prediction import simulate_trial
+from nlsid_core.identification import simulate_trial, simulation_percent, validate
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from tests import repeated
 from tests.conftest import synthetic_dataset

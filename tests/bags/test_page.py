@@ -20,9 +20,8 @@ from bags.commands.page import folder_page
 from bags.designs import documents
 from bags.monitoring.replay import Replay
 from bags.pictures import tables
-from bags.samples import f1tenth
 from bags.tools.fitness import LEAST_OVERLAP
-from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Status, Trajectory, identify
+from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Status, Trajectory, f1tenth, identify
 from nlsid_core import designs, kernel
 from nlsid_core.errors import DocumentError
 from nlsid_core.running.reading import Reading

@@ -15,7 +15,6 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.show import UNJUDGED_SAID
 from bags.designs import documents
 from bags.designs.bundle import Bundle
-from bags.designs.documents import load
 from bags.designs.wiring import wiring_of
 from bags.monitoring.replay import replay_bag, replay_messages
 from bags.monitoring.watch import Watch
@@ -23,7 +22,7 @@ from bags.signals.sampling import LOST
 from bags.viewing.drawn import HalfWidths
 from bags.viewing.replay import Recording
 from bags.viewing.scene import Scene
-from nlsid import Status, Trajectory, check
+from nlsid import Status, Trajectory, check, load
 from nlsid_core import designs
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateMismatch, CertificateRejected

@@ -18,13 +18,12 @@ from bags.chain.shipped import config_file
 from bags.designs import documents
 from bags.designs.wiring import read_at
 from bags.monitoring.replay import replay_messages
-from bags.samples import f1tenth
 from bags.viewing import scene
 from bags.viewing.drawn import HalfWidths
 from bags.viewing.page import MOST_READERS, PAGE, serve_page
 from bags.viewing.replay import Recording
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
-from nlsid import Status
+from nlsid import Status, f1tenth
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from tests.browser import CHROMIUM, MISSING, Page, browser

@@ -18,8 +18,7 @@ from bags.chain.tracking_config import load_tracking_config
 from bags.chain.tracking_steps import what_breaks, widest_start
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.monitoring.catching import OF_STATES, breaking
-from bags.samples import f1tenth
-from nlsid import Dataset, Goal, Trajectory, VectorField, check, plan_motion
+from nlsid import Dataset, Goal, Trajectory, VectorField, check, f1tenth, plan_motion
 from nlsid_core import files
 from nlsid_core.dynamics import MeasuredPush, measured_push
 from nlsid_core.errors import DocumentError

@@ -12,8 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.samples import f1tenth
-from nlsid import Dataset, Grid, OutputTube, Polynomial, Status, identify, read_bags, replay
+from nlsid import (
+    Dataset,
+    Grid,
+    OutputTube,
+    Polynomial,
+    Status,
+    f1tenth,
+    identify,
+    read_bags,
+    replay,
+)
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.c_table import c_table, write_table

@@ -11,14 +11,16 @@ from nlsid_core.design import OutputTubeDesign
 from nlsid_core.documents import load
 from nlsid_core.dynamics import VectorField, constant_on, cubic_through, linear_through
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
-from nlsid_core.funnels.protocol import Funnel
-from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
-from nlsid_core.funnels.tube import Measured, Tube, TubeFunnel
-from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.protocol import AnyPolicy, Policy
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.funnels import (
+    ContinuousFunnel,
+    DisturbanceAssumption,
+    Measured,
+    SampledFunnel,
+    Tube,
+    TubeFunnel,
+    ellipsoid_inside,
+)
+from nlsid_core.policies import ContinuousPolicy, SampledPolicy, TubePolicy
 from tests.continuous_stage import stage
 from tests.tracked import designed
 
@@ -51,14 +53,20 @@ def random_policy(gain: str, n: int = 3, m: int = 2, knots: int = 6) -> Continuo
 
 def discrete_documents() -> dict[str, Any]:
     """The other kinds of funnels and policies."""
-    assumption = DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),))
     two = np.array([np.eye(2)] * 3)
     ones, trial = np.ones(1), (("trial", "sha256:1"),)
     scaled = Measured(1.0, 2.0, (), trial)
     tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, scaled)
     return {
         "discrete": SampledFunnel(
-            two, two[:2], np.ones(3), np.ones(3), np.ones((3, 2)), assumption, "m", "p"
+            two,
+            two[:2],
+            np.ones(3),
+            np.ones(3),
+            np.ones((3, 2)),
+            DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),)),
+            "m",
+            "p",
         ),
         "tube": TubeFunnel((tube,), 2, "m", policy="p"),
         "tracking": SampledPolicy(
@@ -121,8 +129,7 @@ def test_an_ellipsoid_is_inside_exactly_up_to_the_boundary() -> None:
     t = funnel.t0 + 0.5
     shape, centre = funnel.shape(t), funnel.nominal(t)
     for scale, inside in ((1.001, True), (0.999, False)):
-        inner, outer = ((centre, scale * shape), (centre, shape))
-        assert (ellipsoid_inside(*inner, *outer) is not None) is inside
+        assert inside is (ellipsoid_inside(centre, scale * shape, centre, shape) is not None)
 
 
 @pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])
@@ -136,8 +143,7 @@ def test_a_policy_of_every_kind_of_gain_reads_back_and_takes_many_states(
     t, X = 0.4 * policy.t[0] + 0.6 * policy.t[1], np.random.default_rng(1).normal(size=(7, 3))
     u = again(float(t), X)
     assert u.shape == (7, 2)
-    one = policy.u(t) - policy.K(t) @ (X[3] - policy.x(t))
-    assert u[3] == pytest.approx(one)
+    assert u[3] == pytest.approx(policy.u(t) - policy.K(t) @ (X[3] - policy.x(t)))
     middle = policy.K(t)
     ends = policy.K.control[0, 0], policy.K.control[0, -1]
     if gain == "constant":
@@ -149,11 +155,10 @@ def test_a_policy_of_every_kind_of_gain_reads_back_and_takes_many_states(
 
 
 def test_load_reads_whatever_the_file_declares(tmp_path: Path) -> None:
-    field = VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0)
     nouns: dict[str, Any] = {
         "funnel": random_funnel(),
         "policy": random_policy("linear"),
-        "field": field,
+        "field": VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0),
     }
     for name, noun in (nouns | discrete_documents()).items():
         files.write_document(tmp_path / name, noun.document())
@@ -183,16 +188,14 @@ def test_outside_its_times_a_funnel_says_so() -> None:
 # -- What funnels and policies of every kind have in common: sizes, widths, one `load` each
 
 
-def pairs() -> list[tuple[AnyPolicy, SampledFunnel | ContinuousFunnel]]:
+def pairs() -> list[tuple[Any, Any]]:
     """One of each kind that holds a state."""
     sampled, (_, policy, funnel) = designed(), stage()
     return [(sampled.policy, sampled.funnel), (policy, funnel)]
 
 
 def test_every_kind_answers_the_same_questions(design: OutputTubeDesign) -> None:
-    for policy, funnel in pairs():
-        common: Funnel = funnel
-        plan: Any = policy
+    for plan, common in pairs():
         for when in (0, common.last):
             widths = common.widths(when)
             assert common.size(when, np.zeros(len(widths))) <= 1e-12
@@ -213,6 +216,6 @@ def test_every_kind_answers_the_same_questions(design: OutputTubeDesign) -> None
     assert not tube.start_size(np.full(len(design.model), np.nan)) <= 1.0
 
 
-def _covers(plan: Policy, n: int) -> None:
+def _covers(plan: Any, n: int) -> None:
     low, high = plan.covers(0, np.zeros(n))
     assert np.all(low <= high)

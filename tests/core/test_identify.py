@@ -14,7 +14,6 @@ from scipy.signal import lfilter
 from bags.chain.shipped import config_file
 from bags.designs import documents
 from bags.pictures.report import page
-from bags.samples import f1tenth
 from nlsid import (
     CellRow,
     Dataset,
@@ -30,6 +29,7 @@ from nlsid import (
     Sem,
     Trajectory,
     check,
+    f1tenth,
     identify,
 )
 from nlsid_core.arrays import FloatArray

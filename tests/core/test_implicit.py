@@ -10,9 +10,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
 from nlsid_core.identification.polynomial.rollout import Rollout, simulate_together
-from nlsid_core.models import ImplicitModel, Signal, monotone
+from nlsid_core.models import ImplicitModel, Polynomials, Signal, monotone
 from nlsid_core.models.implicit_step import SingleStep
-from nlsid_core.models.polynomials import Polynomials
 from tests import implicit_models
 from tests.implicit_models import coupled, cubic_spring, lagged, quintic
 from tests.marks import slow_among

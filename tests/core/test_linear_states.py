@@ -10,8 +10,7 @@ from nlsid import Dataset, Fit, Polynomial, Trajectory, check, identify
 from nlsid_core import files
 from nlsid_core.errors import CertificateRejected, DataError, DocumentError
 from nlsid_core.identification.states import identify_states
-from nlsid_core.models import ImplicitModel
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models import ImplicitModel, StateModel
 from tests.tracked import PERIOD, pendulum
 
 A = np.array([[0.9, 0.2], [-0.2, 0.7]])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nlsid import Dataset, Degrees
+from nlsid import Polynomial as Equation
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
-from nlsid_core.identification import Polynomial as Equation
 from nlsid_core.identification.polynomial.moment_rie import (
     Layout,
     MomentFit,

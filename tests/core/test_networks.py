@@ -27,7 +27,7 @@ from nlsid import (
 from nlsid_core import documents, proofs
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import CertificateRejected, DataError, DocumentError, ShapeError
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import prove_stability, simulate_trial
 from nlsid_core.identification.network.cells import Row
 from nlsid_core.identification.network.feedback import Layout
 from nlsid_core.identification.network.filters import Cascade
@@ -37,7 +37,6 @@ from nlsid_core.identification.network.lowering import network_of
 from nlsid_core.identification.network.maps import Smooth
 from nlsid_core.identification.network.options import Limit
 from nlsid_core.identification.network.signals import Signals, Trial
-from nlsid_core.identification.prediction import simulate_trial
 from nlsid_core.models import BlockCascade, CellNetwork, PiecewiseLinear, Spline
 from tests import duffing
 from tests.cascades import in_motion, recording, truth, two_phases, wiener

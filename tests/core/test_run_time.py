@@ -18,14 +18,17 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
-from nlsid_core.funnels import factor
+from nlsid_core.funnels import (
+    DisturbanceAssumption,
+    Measured,
+    SampledFunnel,
+    Tube,
+    TubeFunnel,
+    factor,
+)
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
-from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
-from nlsid_core.funnels.tube import Measured, Tube, TubeFunnel
-from nlsid_core.models import DifferenceEquation, Signal
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.models import DifferenceEquation, Signal, StateModel
+from nlsid_core.policies import SampledPolicy, TubePolicy
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.grid import Grid

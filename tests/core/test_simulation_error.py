@@ -11,7 +11,7 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Trajectory, identify
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification import prove_stability, trail
+from nlsid_core.identification import prove_stability, simulation_percent, trail, validate
 from nlsid_core.identification.methods import newton, rse
 from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
@@ -23,7 +23,6 @@ from nlsid_core.identification.polynomial.explicit import equation_error, minimi
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.starts import companion, reduced, reflected
 from nlsid_core.identification.trail import tried
-from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import DifferenceEquation
 from tests.conftest import synthetic_dataset
 from tests.decided import checked

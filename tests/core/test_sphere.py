@@ -9,8 +9,7 @@ from nlsid_core.errors import (
     ShapeError,
     SolverError,
 )
-from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
-from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.polynomial import Gram, Polynomial, constant, monomial_values, monomials, variables
 from nlsid_core.sos import (
     Program,
     SphereProgram,

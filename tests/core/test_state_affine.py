@@ -20,8 +20,7 @@ from nlsid_core.identification.polynomial.certified import (
 )
 from nlsid_core.identification.polynomial.matrix_set import MatrixSet, slowest_rate
 from nlsid_core.identification.polynomial.rows import StateAffineRows, build_state_affine_rows
-from nlsid_core.models import Signal, StateAffineModel
-from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models import Polynomials, Signal, StateAffineModel
 from tests.decided import checked
 from tests.state_affine_rows import problem
 

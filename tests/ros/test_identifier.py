@@ -13,8 +13,7 @@ from std_msgs.msg import String
 
 from bags.chain.shipped import config_file
 from bags.designs import documents
-from bags.samples import f1tenth
-from nlsid import check
+from nlsid import check, f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_ros import qos

@@ -11,10 +11,9 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 import rclpy
 
 from bags.chain.shipped import config_file
-from bags.samples import f1tenth
 from docs.site import nodes as page
 from docs.site.nodes import NODES, node_class
-from nlsid import NlsidError
+from nlsid import NlsidError, f1tenth
 from tests.ros.processes import Bench, refusal, ros_test
 
 pytestmark = ros_test

@@ -26,8 +26,7 @@ from bags.designs import documents
 from bags.designs.bundle import Bundle
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
-from bags.samples import f1tenth
-from nlsid import OutputTube, Status, design
+from nlsid import OutputTube, Status, design, f1tenth
 from nlsid_core.arrays import FloatArray
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import Signal

@@ -27,11 +27,10 @@ from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth
 from bags.setup.candidates import look
 from bags.setup.proposing import Chosen, propose
 from bags.setup.written import yaml_text
-from nlsid import Status
+from nlsid import Status, f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.progress import silent

@@ -131,7 +131,7 @@ def widened(problem: ContinuousTracking, found: Found, progress: Progress) -> Fo
     again = replace(problem, nominal=motion_of(setting), R=setting.weights[1])
     try:
         free = expected(prepare(replace(again, limits=None)), progress)
-        if funnel.rho[0] >= NARROW**2 * free[0]:
+        if funnel.rho[0] >= NARROW**2 * free.rho[0]:
             return found
         wider = search(prepare(again, saturated=True), progress)
     except Infeasible:

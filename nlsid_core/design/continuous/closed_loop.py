@@ -37,7 +37,8 @@ class Pieces:
     2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
     kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
     mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
-    y = (1, z) the multiplier of what holds in that mode. push: (B, m) that the input is off.
+    y = (1, z) the multiplier of what holds in that mode. off: (B, m + n_w) δ, that the input is
+    off, and w.
     stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
     """
 
@@ -51,7 +52,7 @@ class Pieces:
     gram: FloatArray
     mode: IntArray
     tau: FloatArray
-    push: FloatArray
+    off: FloatArray
     stated: NDArray[np.object_]
     kappa: FloatArray | None = None
 
@@ -76,7 +77,7 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class InputRates:
-    """How fast the policy changes input entry (B,), with a sign (B,), on pieces, at w (B, n_w).
+    """How fast the policy changes input entry (B,), with a sign (B,), on pieces.
 
     Pieces that differ in entry and sign only follow each other, in the same frame T.
 
@@ -85,7 +86,6 @@ class InputRates:
     """
 
     pieces: Pieces
-    w: FloatArray
     entry: IntArray
     sign: IntArray
     taken: FloatArray
@@ -121,7 +121,7 @@ def closed_loop_polynomial(
     limited, f is that of the piece's mode, and what holds in the mode is taken off.
     """
     n, k = field.n, pieces.interval
-    loop = _Loop(field, policy, funnel, pieces, end=end)
+    loop = _Loop(field, policy, funnel, pieces, end)
     P = linear(funnel.P)[k]
     rho = linear(funnel.rho)[k]
     x_bar: list[Graded] = [{1: pieces.T[:, i][:, None]} for i in range(n)]
@@ -156,13 +156,13 @@ def rate_polynomial(
 
     room: (B,) in input units per s. τ: the first of the piece's. end: only its value at 0 or at 1.
     """
-    pieces, w, entry = of.pieces, of.w, of.entry
+    pieces, entry = of.pieces, of.entry
     n, k = field.n, pieces.interval
-    loop = _Loop(field, policy, funnel, pieces, w, end)
+    loop = _Loop(field, policy, funnel, pieces, end)
     case = np.column_stack([k, pieces.level, pieces.index, pieces.vertex, pieces.mode])
     new = np.r_[True, (case[1:] != case[:-1]).any(axis=1)]
     first = np.flatnonzero(new)
-    rates = _Loop(field, policy, funnel, pieces.select(first), w[first], end).field_times_h()
+    rates = _Loop(field, policy, funnel, pieces.select(first), end).field_times_h()
     shared = np.cumsum(new) - 1
     every = np.arange(len(k))
     gains = policy.K.control[k][every, :, entry]
@@ -191,14 +191,9 @@ class _Loop:
         policy: ContinuousPolicy,
         funnel: ContinuousFunnel,
         pieces: Pieces,
-        w: FloatArray | None = None,
         end: int | None = None,
     ) -> None:
         self.field, self.pieces, self.end = field, pieces, end
-        vertices = field.vertices()
-        if w is None and pieces.kappa is None:
-            w = vertices[pieces.vertex % len(vertices)]
-        self.w = np.tile(field.uncertain.mean(axis=1), (len(pieces), 1)) if w is None else w
         self.policy, self.funnel = policy, funnel
         spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")
         self.span = spans[pieces.interval]
@@ -311,8 +306,8 @@ class _Loop:
             {0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)
         ]
         for i, applied in enumerate(self._clipped()):
-            forms.append(add(applied, {0: self.pieces.push[:, i][:, None, None]}))
-        forms += [{0: part[:, None, None]} for part in self.w.T]
+            forms.append(add(applied, {0: self.pieces.off[:, i][:, None, None]}))
+        forms += [{0: part[:, None, None]} for part in self.pieces.off[:, self.field.m :].T]
         return forms
 
     def _clipped(self) -> list[Graded]:

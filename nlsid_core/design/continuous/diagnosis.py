@@ -145,7 +145,6 @@ def _terms(
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """-Ẇ/ρ of the linear closed loop at the program's points, and of each term beside it."""
     x_bar = np.sqrt(rho) * steps.program.points @ section.shape.base.T
-    vertex, *_ = steps.split(case)
     centre = steps.field.uncertain.mean(axis=1)
 
     def falls(rates: FloatArray) -> FloatArray:
@@ -176,7 +175,8 @@ def _terms(
         pushed = -steps.from_pushes(section, x_bar) / rho
     else:
         pushed = np.zeros((len(x_bar), len(centre)))
-        for j, value in enumerate(steps.vertices[vertex].tolist()):
+        corner = steps.off(section.interval)[case % len(steps.corners), steps.field.m :]
+        for j, value in enumerate(corner.tolist()):
             w = centre.copy()
             w[j] = value
             U = section.u - x_bar @ section.K.T
@@ -184,8 +184,8 @@ def _terms(
     parts["disturbance"] = pushed[:, :own].sum(axis=1)
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning
-    # The same vertex and corner where no input is at a limit: modes come in that order.
-    free = case % (len(steps.vertices) * len(steps.corners))
+    # The same corner where no input is at a limit: modes come in that order.
+    free = case % len(steps.corners)
     here, unlimited = steps.values(section, rho, [case, free])
     parts["saturation"] = here - unlimited
     cause = "motion" if steps.widths is None else "hold"

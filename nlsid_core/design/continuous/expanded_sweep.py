@@ -53,8 +53,8 @@ def wanted_of(
     """
     caps = validity_caps(setting.steps.field, setting.policy, setting.P, widths)
     caps = caps if below is None else np.minimum(caps, below)
-    final = min(setting.rho_final, float(caps[-1]))
-    return Wanted(setting.margin(final), final, caps)
+    caps[-1] = min(setting.rho_final, caps[-1])
+    return Wanted(np.full(len(caps) - 1, setting.margin(float(caps[-1]))), caps)
 
 
 def swept(
@@ -78,8 +78,8 @@ def swept(
     """
     steps, policy, P, expansion = setting.steps, setting.policy, setting.P, setting.expansion
     K = len(P)
-    rho, k, back = np.full(K, wanted.final), K - 2, 0
-    caps = np.array([wanted.cap(k) for k in range(K)])
+    caps, k, back = wanted.caps.copy(), K - 2, 0
+    rho = np.full(K, caps[-1])
     ends: dict[int, Ends] = {}
     if again is not None:
         rho, ends, k = again.rho.copy(), dict(enumerate(again.ends)), again.last
@@ -90,11 +90,11 @@ def swept(
         try:
             if expansion is None:
                 instants = [section_at(steps, P, k, s) for s in shares]
-                rho[k], ends[k] = largest_before(steps, instants, after, cap, wanted.on(k), duals)
+                rho[k], ends[k] = largest_before(steps, instants, after, cap, wanted, duals)
             else:
                 guess = after * rho[k + 1] / rho[k + 2] if k + 2 < K else after
                 levels = (min(guess, cap), after, cap)
-                rho[k], ends[k] = _expanded(setting, k, levels, wanted.on(k), duals)
+                rho[k], ends[k] = _expanded(setting, k, levels, wanted, duals)
             progress(f"rho at {policy.t[k]:.3g} s", 1 - k / (K - 1))
             k -= 1
             continue

@@ -6,9 +6,8 @@ searched for W; so R is bounded in a larger one first. Nothing here is trusted.
 Source: docs/theory-funnels.md, "The hold between samples".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.closed_loop import CELLS, InputRates, Pieces, rate_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
-from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.continuous.lstep import LSteps, at_corners, corners_of
 from nlsid_core.design.continuous.pieces import (
     MAX_LEVEL,
     Part,
@@ -43,15 +42,14 @@ class Hold:
     """period: how old the applied input is at most, s. error: (n,) bounds of measurement errors.
 
     longest: the period is where a search for the longest one starts. What a search finds on its
-    way: free, (K,) ρ without the hold, of which nothing may be proved; needed, 1/s, the margin with
-    which that was proved; rates, (K-1, m) what |dũ/dt| stays below in every funnel looked for.
+    way: free, (K,) ρ without the hold, of which nothing may be proved; rates, (K-1, m) what |dũ/dt|
+    stays below in every funnel looked for.
     """
 
     period: float
     error: FloatArray
     longest: bool = False
     free: FloatArray = field(default_factory=lambda: np.zeros(0))
-    needed: float = 0.0
     rates: FloatArray | None = None
 
     @classmethod
@@ -136,7 +134,7 @@ class Changes:
     def of(cls, steps: LSteps, funnel: ContinuousFunnel) -> "Changes":
         """Make the changes for this funnel; steps: with widths, of any size."""
         field, K = steps.field, len(funnel.t) - 1
-        corners = _corners(field)
+        corners = corners_of([not pushes for pushes in _pushing(field, 1 + field.n, field.m)])
         chosen, count = (corners > 0).astype(int), len(corners)
         signs = _signs(chosen)
         unit, curving = np.ones((K, field.m)), curving_states(field)
@@ -267,19 +265,15 @@ def _batches(
     signs: tuple[int, ...] = (-1, 1),
 ) -> Iterator[InputRates]:
     """Every rate on these parts of time, as many as fit at once."""
-    field, policy, n = steps.field, steps.policy, steps.program.n
+    field, policy, n = steps.field, steps.policy, steps.field.n
+    of_inputs = _pushing(field, 1 + n, field.m)
     own = _pushing(field, 1 + n + field.m, len(field.uncertain))
-    boxes = [
-        ((a + b) / 2,) if pushes else (a, b)
-        for pushes, (a, b) in zip(own, field.uncertain.tolist(), strict=True)
-    ]
-    values = _grid(boxes)
-    corners = _corners(field)
+    corners = corners_of([not pushes for pushes in (*of_inputs, *own)])
     limited = steps.limits[:, 0].astype(int).tolist()
     cases = [
         (v, entry, sign, mode)
         for mode in range(len(steps.modes))
-        for v in range(len(values) * len(corners))
+        for v in range(len(corners))
         for entry in range(field.m)
         for sign in signs
         if entry not in limited or not steps.modes[mode][limited.index(entry)]
@@ -305,28 +299,16 @@ def _batches(
             gram=np.zeros((count, 2, len(basis), len(basis))),
             mode=steps.modes[m],
             tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
-            push=corners[v // len(values)] * widths[place[:, 0]],
+            off=at_corners(field, corners, widths[place[:, 0]])[np.arange(count), v],
             stated=np.empty(count, dtype=object),
         )
         gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
         spans = np.searchsorted(field.breaks, policy.t[place[:, 0]], side="right")
         shoved, own_shoved = (
             np.abs(gains @ _pushes(field, first, found)[spans]).max(axis=1)
-            for first, found in ((1 + n, _pushing(field, 1 + n, field.m)), (1 + n + field.m, own))
+            for first, found in ((1 + n, of_inputs), (1 + n + field.m, own))
         )
-        yield InputRates(pieces, values[v % len(values)], i, side, own_shoved @ halves, shoved)
-
-
-def _grid(sides: Sequence[tuple[float, ...]]) -> FloatArray:
-    """(points, entries) all of a product, the last entry changing first."""
-    points = list(product(*sides))
-    return np.array(points).reshape(len(points), -1)
-
-
-def _corners(field: VectorField) -> FloatArray:
-    """(corners, m) of |δ_i| ≤ 1 that a rate is proved at: 0 for every δ_i that only pushes."""
-    pushing = _pushing(field, 1 + field.n, field.m)
-    return _grid([(0.0,) if pushes else (-1.0, 1.0) for pushes in pushing])
+        yield InputRates(pieces, i, side, own_shoved @ halves, shoved)
 
 
 def _pushing(field: VectorField, first: int, count: int) -> list[bool]:

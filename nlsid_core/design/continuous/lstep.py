@@ -91,12 +91,26 @@ def refuse_degree(field: VectorField) -> None:
         )
 
 
+def corners_of(boxed: Sequence[bool]) -> FloatArray:
+    """(corners, entries) of ±1 for the entries that have a box, else 0; the last changes first."""
+    corners = list(product(*((-1.0, 1.0) if one else (0.0,) for one in boxed)))
+    return np.array(corners).reshape(len(corners), -1)
+
+
+def at_corners(field: VectorField, corners: FloatArray, widths: FloatArray) -> FloatArray:
+    """(..., corners, m + n_w) (δ, w) with |δ| ≤ widths (..., m) at these corners."""
+    low, high = field.uncertain.T
+    half = np.broadcast_to((high - low) / 2, (*widths.shape[:-1], len(low)))
+    middle = np.concatenate([np.zeros(field.m), (low + high) / 2])
+    return np.asarray(middle + corners * np.concatenate([widths, half], axis=-1)[..., None, :])
+
+
 class LSteps:
     """L-steps of one vector field; holds the sphere program and counts what is solved.
 
-    A case is a vertex of w at a corner of δ in a mode of the policy: every vertex at the first
-    corner in the first mode comes first. limits and modes: of the policy, if its inputs are
-    clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
+    A case is a corner of the box of (δ, w) in a mode of the policy: every corner in the first mode
+    comes first. limits and modes: of the policy, if its inputs are clipped. widths: (intervals, m)
+    of what the applied input is off, δ; None if it is not. corners: see `corners_of`.
     nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
     field's `is_pushed`). kappa: (intervals, n_w), if it is bounded; tightness: the same over
@@ -124,15 +138,11 @@ class LSteps:
         self.modes: IntArray = policy.modes()
         self.widths = widths
         self.tightness: FloatArray | None = None
-        corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
-        self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
-        self.kappa: FloatArray | None = None
+        n_w = len(field.uncertain)
+        self.corners = corners_of(field.m * [widths is not None] + n_w * [not self.pushed])
+        bounds = np.ones((len(policy.t) - 1, n_w))
+        self.kappa: FloatArray | None = bounds if self.pushed else None
         self.solved = 0
-        if self.pushed:
-            self.kappa = np.ones((len(policy.t) - 1, len(field.uncertain)))
-            self.vertices = field.uncertain.mean(axis=1)[None]
-        else:
-            self.vertices = field.vertices()
 
     def like(
         self, field: VectorField, policy: ContinuousPolicy, widths: FloatArray | None = None
@@ -196,14 +206,13 @@ class LSteps:
 
     @property
     def cases(self) -> int:
-        """Vertices times corners times modes."""
-        return len(self.vertices) * len(self.corners) * len(self.modes)
+        """Corners times modes."""
+        return len(self.corners) * len(self.modes)
 
-    def split(self, case: int) -> tuple[int, int, IntArray]:
-        """The vertex, the corner and the mode of a case."""
-        rest, vertex = divmod(case, len(self.vertices))
-        mode, corner = divmod(rest, len(self.corners))
-        return vertex, corner, self.modes[mode]
+    def off(self, k: int) -> FloatArray:
+        """(corners, m + n_w) (δ, w) on interval k."""
+        widths = np.zeros(self.field.m) if self.widths is None else self.widths[k]
+        return at_corners(self.field, self.corners, widths)
 
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
         """(cases, N) -Ẇ/ρ at the program's points, in each mode, from the vector field."""
@@ -218,19 +227,15 @@ class LSteps:
     def moves(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
         """(cases, N, n) dx̄/dt at the program's points; w that is bounded is in its centre."""
         x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
+        modes, corners = np.divmod(cases, len(self.corners))
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
-        w = np.empty((*u.shape[:2], self.vertices.shape[1]))
-        for place, case in enumerate(cases):
-            vertex, corner, mode = self.split(case)
-            w[place] = self.vertices[vertex]
-            for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
-                if side:
-                    u[place, :, int(i)] = low if side < 0 else high
-            if self.widths is not None:
-                u[place] += self.corners[corner] * self.widths[section.interval]
+        for (i, low, high), sides in zip(self.limits.tolist(), self.modes[modes].T, strict=True):
+            u[sides < 0, :, int(i)], u[sides > 0, :, int(i)] = low, high
+        m, off = self.field.m, self.off(section.interval)[corners]
+        u += off[:, None, :m]
         X = np.tile(section.x + x_bar, (len(cases), 1))
-        W = w.reshape(len(X), w.shape[2])
-        rate = self.rate(section, X, u.reshape(len(X), u.shape[2]), W) - section.x_rate
+        W = np.repeat(off[:, m:], len(x_bar), axis=0)
+        rate = self.rate(section, X, u.reshape(len(X), m), W) - section.x_rate
         return rate.reshape(len(cases), *x_bar.shape)
 
     def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
@@ -262,7 +267,7 @@ class LSteps:
         """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.shape.base.T
         demand = section.u - x_bar @ section.K.T
-        *_, mode = self.split(case)
+        mode = self.modes[case // len(self.corners)]
         rows = []
         for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
             above, below = demand[:, int(i)] - low, high - demand[:, int(i)]

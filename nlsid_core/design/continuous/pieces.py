@@ -216,24 +216,20 @@ def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
     basis, count = proof_basis(steps.program), len(parts) * steps.cases
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
     repeated = np.repeat(whole, steps.cases, axis=0)
-    vertices, limited, n = len(steps.vertices), len(steps.limits), steps.program.n
-    corners = np.tile(np.repeat(steps.corners, vertices, axis=0), (len(steps.modes), 1))
-    push = np.zeros((count, steps.field.m))
-    if steps.widths is not None:
-        push = np.tile(corners, (len(parts), 1)) * steps.widths[repeated[:, 0]]
-    vertices *= len(steps.corners)
+    corners, limited, n = len(steps.corners), len(steps.limits), steps.program.n
+    off = [steps.off(part.interval) for part in parts for _ in steps.modes]
     return Pieces(
         basis,
         interval=repeated[:, 0],
-        vertex=np.tile(np.arange(steps.cases) % vertices, len(parts)),
+        vertex=np.tile(np.arange(steps.cases) % corners, len(parts)),
         level=repeated[:, 1],
         index=repeated[:, 2],
         T=T,
         mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
         gram=np.zeros((count, 2, len(basis), len(basis))),
-        mode=np.tile(np.repeat(steps.modes, vertices, axis=0), (len(parts), 1)),
+        mode=np.tile(np.repeat(steps.modes, corners, axis=0), (len(parts), 1)),
         tau=np.zeros((count, 2, limited, n + 1, n + 1)),
-        push=push,
+        off=np.array(off).reshape(count, steps.corners.shape[1]),
         stated=np.empty(count, dtype=object),
         kappa=steps.kappa,
     )

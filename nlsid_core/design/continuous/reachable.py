@@ -7,7 +7,7 @@ goal. Nothing here is trusted: the sweep decides how much of it the dynamics kee
 Source: Kurzhanski and Vályi, Ellipsoidal Calculus for Estimation and Control, 1997, Section 2.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,12 @@ from nlsid_core.design.continuous.setting import GOAL_ROOM, Setting
 
 PARTS = 4  # of an interval, for the integration
 SLACK = 0.24  # of log ρ over the motion: room for what is not linear
-START = 0.1  # of the end's size, that is due to where solutions start
+START = 0.1  # of the goal's size, that is due to where solutions start
 SHARPNESS = (
     4  # p of the norm tr(M^p)^(1/p) that is minimised in the place of the largest eigenvalue
 )
 SPREAD = 0.1  # of the mean: what every direction of the start counts at least
-ROUNDS, STEPS = 8, 6  # of what is lost between knots; of κ in each
+ROUNDS, STEPS = 8, 6  # of what is lost between knots; of the norm's slope in each
 FAR = 3.0  # times the goal: it does not come back from there
 LOST = 1e6  # times the goal: beyond, numbers overflow
 
@@ -48,11 +48,16 @@ def reached(setting: Setting) -> Reached | None:
         return None
     lost = np.zeros(len(loop.h))
     slack = SLACK / float(loop.h.sum())
-    state = _Choice(np.ones((len(loop.h), loop.G.shape[2])), START**2 * loop.goal_inverse)
-    least = np.inf
+    end, least = loop.goal, np.inf
+    share = START * len(end)
     for _ in range(ROUNDS):
-        state, X = loop.improved(state, slack + lost)
-        size = loop.size(X[-1])
+        for _ in range(STEPS):
+            X, kappa = loop.forward(end, share, slack + lost)
+            size = loop.size(X[-1])
+            if size < LOST:
+                end = (end + loop.weights(X[-1])) / 2
+                grown = np.exp(loop.h @ ((loop.r / kappa).sum(axis=1) + slack + lost))
+                share = START * np.trace(end @ X[-1]) / grown
         if not size < LOST:
             if least == np.inf:  # nothing is lost between knots yet: more of them are no help
                 return None
@@ -64,20 +69,12 @@ def reached(setting: Setting) -> Reached | None:
         P = (P + P.transpose(0, 2, 1)) / 2
         if not size < FAR:
             break
-        lost = np.maximum(lost + slack - loop.margins(P, scale, state.kappa), 0.0)
+        lost = np.maximum(lost + slack - loop.margins(P, scale, kappa), 0.0)
     along = np.einsum("kij,kil,klj->kj", loop.G, P[1:] / scale[1:, None, None], loop.G)
     tightness = np.ones((len(P) - 1, len(setting.steps.field.uncertain)))
-    tightness[:, : along.shape[1]] = state.kappa * np.sqrt(along)
+    tightness[:, : along.shape[1]] = kappa * np.sqrt(along)
     coarse = (lost > slack) | (not size < FAR)  # but if nothing was lost, more knots are no help
     return Reached(GOAL_ROOM * size**2 * P, size, tightness, coarse & (least < 1))
-
-
-@dataclass(frozen=True, eq=False)
-class _Choice:
-    """kappa: (K-1, n_w). start: (n, n) X(t₀)."""
-
-    kappa: FloatArray
-    start: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,52 +126,45 @@ class _Loop:
         L = np.linalg.cholesky(self.goal)
         return float(np.sqrt(np.linalg.eigvalsh(L.T @ X @ L)[-1]))
 
-    def forward(self, chosen: _Choice, slack: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """X (K, n, n) at the knots, and (K-1, PARTS, n, n) where each part begins."""
-        step = self.h / PARTS
-        growth = np.exp(step * ((self.r / chosen.kappa).sum(axis=1) + slack))
-        added = np.einsum("kij,kj,klj->kil", self.G, step[:, None] * self.r * chosen.kappa, self.G)
-        X, knots = chosen.start, [chosen.start]
-        begins = np.empty_like(self.across)
+    def weights(self, X: FloatArray) -> FloatArray:
+        """(n, n) the slope of tr(M^p)^(1/p), M the end X beside the goal, to a factor."""
+        L = np.linalg.cholesky(self.goal)
+        values, vectors = np.linalg.eigh(L.T @ X @ L)
+        turned = L @ vectors
+        return np.asarray((turned * (values / values[-1]) ** (SHARPNESS - 1)) @ turned.T)
+
+    def forward(
+        self, end: FloatArray, share: float, slack: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """X (K, n, n) at the knots, for which tr(end X) is least at the end, and κ (K-1, n_w).
+
+        With the adjoint Λ of `end`, r(κ g'Λg + tr(ΛX)/κ) is least at κ² = tr(ΛX)/g'Λg; and of all
+        starts with the same tr(ΛX) that with X ∝ Λ⁻¹ is the largest.
+        """
+        adjoint = [end]
+        for parts in self.across[::-1]:
+            for F in parts[::-1]:
+                end = F.T @ end @ F
+            adjoint.append(end)
+        n, step = len(self.goal), self.h / PARTS
+        least = SPREAD / n * np.trace(end @ self.goal_inverse)
+        X = share / n * np.linalg.inv(end + least * self.goal)
+        knots, kappas = [X], []
         with np.errstate(over="ignore", invalid="ignore"):  # what explodes is not finite
             for k, parts in enumerate(self.across):
-                for i, F in enumerate(parts):
-                    begins[k, i] = X
-                    X = growth[k] * F @ X @ F.T + added[k]
-                knots.append(X)
-        return np.array(knots), begins
-
-    def improved(self, chosen: _Choice, slack: FloatArray) -> tuple[_Choice, FloatArray]:
-        """κ and a start with which the end is smaller, and X there.
-
-        By the adjoint Λ of the end's norm: r(κ g'Λg + tr(ΛX)/κ) is least at κ² = tr(ΛX)/g'Λg, and
-        of all starts with the same tr(ΛX) that with X ∝ Λ⁻¹ is the largest.
-        """
-        L = np.linalg.cholesky(self.goal)
-        step = self.h / PARTS
-        for _ in range(STEPS):
-            X, begins = self.forward(chosen, slack)
-            if not self.size(X[-1]) < LOST:
-                return chosen, X
-            growth = np.exp(step * ((self.r / chosen.kappa).sum(axis=1) + slack))
-            values, vectors = np.linalg.eigh(L.T @ X[-1] @ L)
-            turned = L @ vectors
-            end = (turned * (values / values[-1]) ** (SHARPNESS - 1)) @ turned.T
-            adjoint, after = end, np.empty_like(self.across)
-            for k in range(len(self.h) - 1, -1, -1):
-                for i in range(PARTS - 1, -1, -1):
-                    after[k, i] = adjoint
-                    F = self.across[k, i]
-                    adjoint = growth[k] * F.T @ adjoint @ F
-            kept = np.einsum("kpij,kpij->k", after, begins)
-            pushed = np.einsum("kij,kpil,klj->kj", self.G, after, self.G)
-            kappa = np.sqrt(chosen.kappa * np.sqrt(kept[:, None] / pushed))
-            n = len(self.goal)
-            least = SPREAD / n * np.trace(adjoint @ self.goal_inverse)
-            start = START / n * np.trace(end @ X[-1]) * np.linalg.inv(adjoint + least * self.goal)
-            start = (chosen.start + (start + start.T) / 2) / 2
-            chosen = replace(chosen, kappa=kappa, start=start)
-        return chosen, self.forward(chosen, slack)[0]
+                G, kept, pushed = self.G[k], 0.0, 0.0
+                for of_end in adjoint[-1 - k], adjoint[-2 - k]:  # with κ of the start, then of both
+                    kept = kept + np.trace(of_end @ X)
+                    pushed = pushed + np.einsum("ij,il,lj->j", G, of_end, G)
+                    kappa = np.sqrt(kept / pushed)
+                    growth = np.exp(step[k] * ((self.r / kappa).sum() + slack[k]))
+                    added = G * (step[k] * self.r * kappa) @ G.T
+                    X = knots[k]
+                    for F in parts:
+                        X = growth * F @ X @ F.T + added
+                kappas.append(kappa)
+                knots.append((X + X.T) / 2)
+        return np.array(knots), np.array(kappas)
 
     def margins(self, P: FloatArray, scale: FloatArray, kappa: FloatArray) -> FloatArray:
         """(K-1,) what V falls by at least on its boundary, in 1/s, with P and ρ = scale linear."""

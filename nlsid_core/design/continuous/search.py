@@ -13,7 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
+from nlsid_core.design.continuous.expanded_sweep import Swept, swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
@@ -38,7 +38,7 @@ STEPS = (0, 2, 3, 4, 6, 10, 16)  # of the factor √2 below the longest hold, in
 
 
 class Found(NamedTuple):
-    """A funnel that is proved for every t, what it was found for, and the margin in 1/s."""
+    """A funnel that is proved for every t, what it was found for, and the first margin in 1/s."""
 
     setting: Setting
     funnel: ContinuousFunnel
@@ -52,15 +52,11 @@ def search(setting: Setting, progress: Progress) -> Found:
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
     """
     expansion, hold = setting.expansion, setting.hold
-    if hold is None or expansion is not None:
-        first = _proved(setting, wanted_of(setting), progress)
-        if hold is None:
-            return first
-        hold = replace(hold, free=first.funnel.rho, needed=first.margin)
-        setting = replace(first.setting, expansion=None, hold=hold)
-    else:
-        hold = replace(hold, free=expected(setting, progress))
-        setting = replace(setting, hold=hold)
+    if hold is None:
+        return _proved(setting, wanted_of(setting), progress)
+    free = expected(setting, progress)
+    hold = replace(hold, free=free.rho)
+    setting = replace(free.setting, expansion=None, hold=hold)
     span = float(setting.policy.t[-1] - setting.policy.t[0])
     if hold.shortest > span:
         raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
@@ -148,9 +144,9 @@ def _held(
     ) from refusal
 
 
-def expected(setting: Setting, progress: Progress) -> FloatArray:
+def expected(setting: Setting, progress: Progress) -> Swept:
     """ρ (K,) as the sweep finds it if nothing is held; nothing is proved."""
-    return swept(setting, wanted_of(setting), progress).rho
+    return swept(setting, wanted_of(setting), progress)
 
 
 def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
@@ -158,11 +154,11 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
 
     What is proved stays as long as its interval does.
     """
-    intervals = range(len(setting.P) - 1)
-    times, again, kept, refusal = np.ones(len(intervals)), None, None, Infeasible("")
+    intervals, margin = range(len(setting.P) - 1), float(wanted.margins[0])
+    again, kept, refusal = None, None, Infeasible("")
     for _ in range(SWEEPS):
         try:
-            made = swept(setting, replace(wanted, times=times), progress, again=again)
+            made = swept(setting, wanted, progress, again=again)
         except NoFunnel as found:
             refusal = found if kept is None else refusal
             break
@@ -174,7 +170,7 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
         refuse_unmonitorable(funnel)
         shown = prove_pieces(steps, funnel, made.ends, kept=kept)
         if not shown.unproved:
-            return Found(made.setting, funnel, shown, wanted.margin)
+            return Found(made.setting, funnel, shown, margin)
         left = np.isin(intervals, [part.interval for part in shown.unproved])
         refusal = Unproved(
             f"no proof from {unsolved(policy, shown.unproved)} although the L-steps at its "
@@ -182,6 +178,7 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
             float(policy.t[int(np.flatnonzero(left)[-1])]),
             left,
         )
-        kept, times = shown, np.where(left, LARGER * times, times)
+        kept, margins = shown, np.where(left, LARGER, 1.0) * wanted.margins
+        wanted = replace(wanted, margins=margins)
         again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
     raise refusal

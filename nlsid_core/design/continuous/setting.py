@@ -4,13 +4,12 @@ Everything that can be wrong with what a user gives is found here, before anythi
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.expansion import Expansion, NoExpansion
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     LSteps,
@@ -79,14 +78,10 @@ class Setting:
         last = len(self.policy.t) - 2
         end = section_at(self.steps, self.P, last, 1.0)
         if self.expansion is not None:
-            around = partial(self.expansion.around, self.policy, self.P, last)
-            try:
-                self.steps.local[last] = around((rho, rho))
-            except NoExpansion:  # the end alone has one, or there would be no such ρ
-                self.steps.local[last] = around((LOWEST * rho, rho))
+            levels = LOWEST * rho, rho  # the end alone has cubics, or there would be no such ρ
+            self.steps.local[last] = self.expansion.around(self.policy, self.P, last, levels)
         self.steps.bound_pushes(end, rho)
-        own = MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
-        return own if self.hold is None else max(own, self.hold.needed)
+        return MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
 
 
 def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:

@@ -5,7 +5,7 @@ follows from ρ_{k+1}: no alternation, no objective.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -28,26 +28,14 @@ LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the nam
 class Wanted:
     """What ρ(t) keeps to.
 
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. final: ρ(t_f). caps: (K,) that ρ keeps below
-    (None: nothing). expected: whether ρ is likely to be at its caps, and tried there first. times:
-    (K-1,) what the margin is multiplied by on each interval (None: 1).
+    margins: (K-1,) what (ρ̇ - Ẇ)/ρ keeps above zero on each interval, in 1/s. caps: (K,) that ρ
+    keeps below, and what it is at the end. expected: whether ρ is likely to be at its caps, and
+    tried there first.
     """
 
-    margin: float
-    final: float
-    caps: FloatArray | None = None
+    margins: FloatArray
+    caps: FloatArray
     expected: bool = False
-    times: FloatArray | None = None
-
-    def on(self, k: int) -> "Wanted":
-        """With the margin of interval k."""
-        if self.times is None:
-            return self
-        return replace(self, margin=self.margin * float(self.times[k]), times=None)
-
-    def cap(self, k: int) -> float:
-        """The cap at knot k."""
-        return np.inf if self.caps is None else float(self.caps[k])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +76,12 @@ def largest_before(
     if duals is not None and not wanted.expected and not len(steps.limits):
         near = duals
         cap = estimated_before(steps, instants, after, cap, wanted, duals)
-    at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + wanted.margin)
+    at_end = steps.solve(end, after, duals, enough=(cap / after - 1) / h + first.margin)
     phi = min(s.m for s in at_end)
     cap = min(cap, first.allowed(phi))
     if cap <= LOWEST * after:  # ρ̇ cannot be large enough for this end
         why = partial(diagnosed, steps.as_it_is(), [end], [after], after / h)
-        raise NoFunnel(end.t, why, phi - wanted.margin)
+        raise NoFunnel(end.t, why, phi - first.margin)
 
     for section in between:
         inner = _Instant(steps, section, (section.t - start.t) / h, after, h, wanted)
@@ -129,6 +117,11 @@ class _Instant:
     h: float
     wanted: Wanted
 
+    @property
+    def margin(self) -> float:
+        """What the interval asks for, in 1/s."""
+        return float(self.wanted.margins[self.section.interval])
+
     def here(self, rho: float) -> float:
         """ρ at the instant, for ρ_k = rho."""
         return (1 - self.share) * rho + self.share * self.after
@@ -136,11 +129,11 @@ class _Instant:
     def slack(self, rho: float, phi: float) -> float:
         """What is left of the margin, in 1/s, for ρ_k = rho and φ at the instant."""
         growth = (self.after - rho) / self.here(rho) / self.h
-        return phi + growth - self.wanted.margin
+        return phi + growth - self.margin
 
     def allowed(self, phi: float) -> float:
         """The largest ρ_k that φ at the interval's end leaves the margin for."""
-        return self.after * (1 + self.h * (phi - self.wanted.margin))
+        return self.after * (1 + self.h * (phi - self.margin))
 
     def bound(self, duals: list[SphereSolution], cap: float) -> float:
         """The largest ρ_k ≤ cap, nearly, at which the bound by dual solutions leaves the margin."""
@@ -164,10 +157,10 @@ class _Instant:
             if best is not None and rho <= feasible:
                 break
             needed = -self.slack(rho, 0.0)
-            least = needed - ACCEPT * self.wanted.margin
+            least = needed - ACCEPT * self.margin
             found = steps.solve(self.section, self.here(rho), duals, least=least, enough=needed)
             left = self.slack(rho, min(s.m for s in found))
-            if left >= -ACCEPT * self.wanted.margin:
+            if left >= -ACCEPT * self.margin:
                 if not len(steps.limits) or rho >= cap:  # else `predicted` may be too low
                     return rho, found
                 done = rho <= NEAR * feasible

@@ -29,8 +29,7 @@ from nlsid_core.identification.network.options import FilterMapFilter, Network
 from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Taps, Trial
 from nlsid_core.identification.regressors import signal_scale
 from nlsid_core.identification.trail import Task
-from nlsid_core.models import BlockCascade, Spline
-from nlsid_core.models.signal import signals_of
+from nlsid_core.models import BlockCascade, Spline, signals_of
 
 STEPS, TOLERANCE = 40, 1e-3  # with fewer knots
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5

@@ -13,9 +13,8 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.identification.network.fit import Minimum, Scaled
 from nlsid_core.identification.network.maps import as_piecewise_linear
 from nlsid_core.identification.network.signals import Mapped, Signal, Signals, Trial, passed
-from nlsid_core.models import CellNetwork
+from nlsid_core.models import CellNetwork, signals_of
 from nlsid_core.models.cell_network import PRIOR
-from nlsid_core.models.signal import signals_of
 
 SMALLEST = 1e-3  # rms error in spreads of y, below which a start is not trusted
 

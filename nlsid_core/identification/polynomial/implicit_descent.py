@@ -24,9 +24,8 @@ from nlsid_core.identification.polynomial.implicit_rie import (
 )
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, delayed_states
 from nlsid_core.identification.polynomial.rollout import DIVERGED, Linearised, Rollout
-from nlsid_core.models import ImplicitModel, MonotoneEquation, Signal
+from nlsid_core.models import ImplicitModel, MonotoneEquation, Polynomials, Signal
 from nlsid_core.models.monotone_equation import is_increasing
-from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables
 from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import NormBound, Program, solve

@@ -22,11 +22,8 @@ from nlsid_core.identification.polynomial.moments import Offsets
 from nlsid_core.identification.polynomial.options import Polynomial as Options
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
-from nlsid_core.models import ImplicitModel, MonotoneEquation
-from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import signals_of
-from nlsid_core.polynomial import Polynomial, monomials, variables
-from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.models import ImplicitModel, MonotoneEquation, Polynomials, signals_of
+from nlsid_core.polynomial import Polynomial, monomial_values, monomials, variables
 
 MOST_TERMS = 1000  # of e and f: with 10 000 samples a step takes 2.5 s and 0.8 GB, of one core
 MOST_MONOMIALS = 1000  # of a square in an inequality of the set, before it is built

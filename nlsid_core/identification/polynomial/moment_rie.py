@@ -35,8 +35,7 @@ from nlsid_core.identification.polynomial.moments import (
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.proofs.stability import StabilityProof, prove_stability
 from nlsid_core.identification.repeats import refuse_false_repeats
-from nlsid_core.models import MonotoneEquation
-from nlsid_core.models.signal import signals_of
+from nlsid_core.models import MonotoneEquation, signals_of
 
 DELTA = 1e-3  # δ of (3.8), V ≥ δ|Δ|² more than needed: what leaves the exact proof room
 SPLITS = 6  # τ: of y d, y²d, y³d, d², y² d², y²d²

@@ -15,11 +15,8 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
-from nlsid_core.models import DifferenceEquation, StateAffineModel
-from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import signals_of
-from nlsid_core.polynomial import monomials
-from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.models import DifferenceEquation, Polynomials, StateAffineModel, signals_of
+from nlsid_core.polynomial import monomial_values, monomials
 
 MIN_ROWS_PER_PARAMETER = 5  # of a linear model; fewer and the fit is an interpolation
 RANK_TOLERANCE = 1e-13  # relative singular value of unit columns at which a basis repeats itself

@@ -16,10 +16,10 @@ from nlsid_core.models import (
     DifferenceEquation,
     MonotoneEquation,
     PiecewiseLinear,
+    Polynomials,
     Signal,
     StateAffineModel,
 )
-from nlsid_core.models.polynomials import Polynomials
 from tests.cascades import two_phases
 
 Y, U = Signal("speed", "m/s", "/speed:data"), Signal("command", "V", "/command:data")

@@ -19,9 +19,8 @@ from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
-from bags.samples import f1tenth
 from benchmarks.verified import generator, mutated
-from nlsid import design
+from nlsid import design, f1tenth
 from nlsid_core import files as saved
 from nlsid_core import kernel, proofs, second
 from nlsid_core.errors import CertificateRejected
