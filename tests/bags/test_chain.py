@@ -54,7 +54,7 @@ def trial(name: str) -> Path:
 
 
 def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Path) -> None:
-    """On the trials for which they were first measured, all but the test trials, from raw starts."""
+    """On the trials for which they were first measured, from raw starts."""
     split = config.split.model_copy(update={"calibration": ()})
     everything = config.model_copy(update={"split": split})
     result = identify_bags(f1tenth(), everything, tmp_path, progress=silent)
