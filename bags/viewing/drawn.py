@@ -1,4 +1,4 @@
-"""What of a design is drawn beside the signals: their names, and how wide the tube is."""
+"""The part of a design that is drawn: its signals' names, and how wide the tube is."""
 
 from typing import Any
 

@@ -258,7 +258,7 @@ class TubeFunnel:
         return max(tube.rounding for tube in self.tubes)
 
     def start_size(self, x_bar: FloatArray) -> float:
-        """How far out of what may start beside the plan x̄ (n,) is: 1 on its boundary."""
+        """How far out of the allowed starts x̄ (n,) is, beside the plan: 1 on their boundary."""
         return max(tube.start_size(x_bar) for tube in self.tubes)
 
     def document(self) -> Json:
