@@ -13,6 +13,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Model, Validation
 from nlsid_core.identification.prediction import history, learns, simulate_started
 from nlsid_core.identification.validation import unscored
+from nlsid_core.models import Signal
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
@@ -106,7 +107,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
 
 def axis_name(trial: Trajectory, output: int) -> str:
     """The output with its unit."""
-    return f"{trial.y_names[output]} [{trial.y_units[output]}]"
+    return Signal(trial.y_names[output], trial.y_units[output]).label
 
 
 def _correlations(
