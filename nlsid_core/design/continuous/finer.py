@@ -76,9 +76,7 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
 
 def refusal_time(refusal: Infeasible) -> float | None:
     """When in the motion something was refused; None if it says nothing about that."""
-    if isinstance(refusal, Unproved):
-        return refusal.t
-    return refusal.t if isinstance(refusal, NoFunnel) else None
+    return refusal.t if isinstance(refusal, NoFunnel | Unproved) else None
 
 
 def _first(chosen: BoolArray, order: FloatArray, count: int) -> BoolArray:

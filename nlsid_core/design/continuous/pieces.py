@@ -15,8 +15,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.design.continuous.closed_loop import SHARED, Pieces, batches, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
-from nlsid_core.design.continuous.lstep import LSteps, section_at
-from nlsid_core.design.continuous.sweep import Ends
+from nlsid_core.design.continuous.lstep import Ends, LSteps, section_at
 from nlsid_core.design.continuous.witnesses import (
     affine,
     documents,
