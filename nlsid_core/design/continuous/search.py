@@ -24,7 +24,7 @@ from nlsid_core.design.continuous.held_sweep import (
 )
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import Again, Swept, Wanted, swept, wanted_of
+from nlsid_core.design.continuous.sweep import Swept, Wanted, swept, wanted_of
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -179,5 +179,5 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
         )
         kept, margins = shown, np.where(left, LARGER, 1.0) * wanted.margins
         wanted = replace(wanted, margins=margins)
-        again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
+        again = made._replace(last=int(np.flatnonzero(left)[-1]))
     raise refusal

@@ -225,7 +225,8 @@ def refuse_saturated(nominal: Nominal, limits: FloatArray) -> None:
         if not (low < least and most < high):
             raise DataError(
                 f"the nominal's input {int(i)} needs [{least:.6g}, {most:.6g}], its limits are "
-                f"[{low:g}, {high:g}]: no room is left to correct anything"
+                f"[{low:g}, {high:g}]: no room is left to correct anything. Plan it within the "
+                "limits (`limits` of plan_motion), or in more seconds"
             )
 
 

@@ -51,20 +51,16 @@ class Wanted:
     expected: bool = False
 
 
-class Again(NamedTuple):
-    """ρ (K,) and L-steps of a sweep that is made again from interval `last` backward."""
-
-    rho: FloatArray
-    ends: list[Ends]
-    last: int
-
-
 class Swept(NamedTuple):
-    """ρ (K,), the L-steps at the ends of intervals, and the setting of their field."""
+    """ρ (K,), the L-steps at the ends of intervals, and the setting of their field.
+
+    last: the interval from which backward the sweep is to be made again, if it is.
+    """
 
     setting: Setting
     rho: FloatArray
     ends: list[Ends]
+    last: int = -1
 
 
 def wanted_of(
@@ -87,7 +83,7 @@ def swept(
     *,
     shares: Sequence[float] = (0.0, 1.0),
     most_back: int = MAX_BACK,
-    again: Again | None = None,
+    again: Swept | None = None,
 ) -> Swept:
     """The largest ρ(t) backward from the end, and what it was found with.
 
