@@ -123,7 +123,7 @@ def _problem(details: ErrorDetails, kind: type[Section]) -> str:
         if section is not None and (unit := _unit(section, key)):
             message = f"{message}, in {unit}"
     said = f"{'.'.join(where)}: {message}"
-    is_of_key = details["type"] in ("missing", "extra_forbidden")
+    is_of_key = message == "Field required" or details["type"] == "extra_forbidden"
     return said if is_of_key else f"{said} (found {found!r:.60})"
 
 

@@ -72,8 +72,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     for i in range(n_y):
         over_time, auto, *crossed = panels[i]
         for trial, y in zip(test, simulated, strict=True):
-            left = trial.y[start:, i] - y[start:, i]
-            t, e = thinned(trial.t[start:] - trial.t[0], left, DRAWN)
+            t, e = thinned(trial.t[start:] - trial.t[0], trial.y[start:, i] - y[start:, i], DRAWN)
             over_time.plot(t, e, lw=0.8)
         over_time.set_title(f"residual of {axis_name(first, i)}", fontsize=8, loc="left")
         over_time.set_xlabel("time [s]", fontsize=8)

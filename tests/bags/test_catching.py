@@ -397,8 +397,7 @@ def arm(tmp_path: Path) -> Path:
 
 def test_path_and_goal_of_a_joint_are_the_proved_half_widths_rounded_up(arm: Path) -> None:
     widths = designed().funnel.half_widths
-    found = tolerances(arm)
-    found.write(arm)
+    tolerances(arm).write(arm)
     content = yaml.safe_load((arm / CONTROLLER).read_text())
     constraints = content["joint_trajectory_controller"]["ros__parameters"]["constraints"]
     assert constraints == {
