@@ -126,9 +126,8 @@ def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: Fit
     read = read_signals(bag, [*u_names, *y_names], sort=True)
     commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
     found = look.findings
-    for name, samples in read.items():
-        if doubt := samples.doubt(responds=name in y_names):
-            found.append(Finding(Level.BAD, "publishers", doubt))
+    doubts = [samples.doubt(responds=name in y_names) for name, samples in read.items()]
+    found += [Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt]
     for samples in measured:
         found.extend(_regularity(samples))
         found.extend(_range(samples))
