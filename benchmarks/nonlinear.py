@@ -201,7 +201,7 @@ def measure(case: PublicSet, folder: Path) -> dict[str, Any]:
     model = fitted_to_all(choice)
     seconds, promise = time.process_time() - started, choice.promise
     start = choice.held_out.start
-    outputs = [simulate_started(model, trial, start) for trial in test]
+    outputs = simulate_started(model, list(test), start)
     squares = [choice.held_out.error(model, [trial]) for trial in test]
     weights = [len(trial) - start for trial in test]
     reached = 100.0 * float(np.sqrt(np.average(squares, weights=weights)))

@@ -6,9 +6,11 @@ DIR holds f1tenth, exchanger, wh2009, schunk_arm, emps and kuka_kr300; without i
 F1TENTH recordings are measured. Some trials identify a model and design its tube, others scale it,
 others yet are judged, untouched and sabotaged. Widths are per amplitude (half the range), the mean
 over outputs, at safety factor 1: `fading` is the tube of the fast observer (where it follows the
-commands, its mean), `headline` the last of those for ever. Times are of the processor, a sample's
-update that of the quickest trial. `unjudged` are sabotaged trials of which a part was unknown and
-nothing else was said. Published are figures of a trial of the method, each scaled by itself.
+commands, its mean), `headline` the last of those for ever. `response` is the simulation's largest
+error, of each output for itself; at one scale it promises what a tube does, of any output's alarm.
+Times are of the processor, a sample's update that of the quickest trial. `unjudged` are sabotaged
+trials of which a part was unknown and nothing else was said. Published are figures of a trial of
+the method, each scaled by itself.
 """
 
 import os
@@ -191,7 +193,12 @@ def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[st
     settling: int = made.funnel.settling
     u = [trial.u for trial in case.calibration]
     still = np.zeros((1, *made.funnel.tubes[0].L.shape))
-    errors = [innovations(model, still, t, settling)[:, 0] for t in case.calibration]
+    largest, designed = (
+        np.max(
+            [np.abs(innovations(model, still, t, settling)[:, 0]).max(axis=0) for t in trials], 0
+        )
+        for trials in (case.calibration, case.train)
+    )
 
     def mean(tube: Tube) -> FloatArray:
         if tube.follows is None:
@@ -201,12 +208,13 @@ def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[st
 
     tubes = made.funnel.tubes
     found = {
-        "response": np.max([np.abs(o).max(axis=0) for o in errors], axis=0),
+        "response": largest,
+        "response_at_one_scale": designed * np.max(largest / designed),
         "headline": mean(tubes[-1]) / FACTOR,
         "fading": mean(tubes[0]) / FACTOR,
     }
     inferred = 1.0 - tubes[-1].peak.direct * tubes[-1].peak.at_most / tubes[-1].half_widths
-    keys = {form: float(np.mean(found[form] / amplitudes)) for form in FORMS}
+    keys = {form: float(np.mean(width / amplitudes)) for form, width in found.items()}
     return keys | {"share_inferred": float(np.mean(inferred))}
 
 

@@ -123,7 +123,7 @@ class Deciding:
         return found
 
     def close(self) -> None:
-        """Call it off, or let go of what is left of it."""
+        """Stop it if it runs, and release its process and files."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -191,7 +191,7 @@ def _is_ours(status: os.stat_result, mode: int) -> bool:
 
 
 def _cache() -> Path | None:
-    """The folder of what was decided; None where there is none that is the user's own."""
+    """The folder that keeps earlier decisions; None where the user has none of their own."""
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(base) / "nlsid" / "decided"

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
+import numpy as np
+
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.dynamics import VectorField
@@ -18,7 +20,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.stage import Stage
-from nlsid_core.shown import card
+from nlsid_core.shown import BLUE, POINTS, card, line
 
 # The files in a design's folder; a claim calls each by its name without the ending.
 MODEL = "model.json"
@@ -86,7 +88,16 @@ class Design(Generic[D, P, F, S]):
         return f"<Design of {self.name}: {getattr(self.decision, 'statement', 'not decided')}>"
 
     def _repr_html_(self) -> str:
-        return card(repr(self)) if self.decision is None else self.decision._repr_html_()
+        """What is proved, and how wide the first signal's tube is over time."""
+        funnel = self.funnel
+        if funnel is None or self.decision is None:
+            return card(repr(self))
+        when = np.linspace(getattr(funnel, "t0", 0.0), min(funnel.last, 2.0 * POINTS), POINTS)
+        width = np.array([funnel.widths(each)[0] for each in when.tolist()])
+        span = np.append(width, -width)
+        return card(
+            str(self.decision), line(when, width, BLUE, span), line(when, -width, BLUE, span)
+        )
 
     @property
     def verdict(self) -> Verdict:
@@ -183,11 +194,6 @@ class Design(Generic[D, P, F, S]):
         return Held.of_claim(self.claim, self.period)
 
     @property
-    def has_plan(self) -> bool:
-        """Whether the funnel is always around the policy's plan; a tube may follow commands."""
-        return not isinstance(self.funnel, TubeFunnel)
-
-    @property
     def digest(self) -> str:
         """The digest of the funnel, or of a composition's proof, as an announcement names it.
 
@@ -238,8 +244,10 @@ class Design(Generic[D, P, F, S]):
 
     @property
     def _held_stages(self) -> list[Stage]:
-        stages = [replace(stage, wiring=self.wiring) for stage in self.stages]
-        return [Stage(s.model, s.policy, s.funnel, s.held) for s in stages]
+        return [
+            Stage(s.model, s.policy, s.funnel, replace(s, wiring=self.wiring).held)
+            for s in self.stages
+        ]
 
 
 AnyDesign: TypeAlias = Design[Any, Any, Any, Any]

@@ -72,7 +72,7 @@ def percent(error: float) -> str:
 
 
 def counted(count: int, what: str) -> str:
-    """How many there are of what, as text: 1 trial, 3 trials."""
+    """A count with its noun, as text: 1 trial, 3 trials."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 

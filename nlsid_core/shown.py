@@ -36,8 +36,8 @@ class Table:
             "  ".join([f"{name:{first}s}", *map(str.rjust, cells, widths)])
             for name, cells in ({"": self.columns} | texts).items()
         ]
-        more = [f"... {len(lines) - MOST} more in .rows"] if len(lines) > MOST else []
-        return "\n".join(lines[:MOST] + more)
+        more = f"\n... {len(lines) - MOST} more in .rows" * (len(lines) > MOST)
+        return "\n".join(lines[:MOST]) + more
 
 
 def card(text: str, *lines: str) -> str:

@@ -27,7 +27,7 @@ def message_class(msgtype: str) -> Any:
 
 @cache
 def installed_types(msgtype: str) -> Any:
-    """The type store of `msgtype` and of what it is made of, as they are installed.
+    """The type store of `msgtype` and of the types in it, as they are installed.
 
     The standard definitions are not asked: to read them all takes longer than to describe one.
     Raises BagError if the type is not installed.

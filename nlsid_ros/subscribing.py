@@ -97,7 +97,7 @@ class Silence:
 
 
 class Topic:
-    """A topic's subscription, as its publishers offer it, and what is known of what comes.
+    """A topic's subscription, as its publishers offer it, and what its messages show.
 
     `callback` gets serialised messages: what a node needs of them is read where it is.
 

@@ -166,7 +166,7 @@ class TrackingController(ManagedNode):
         expected_of(values)
 
     def tune(self, values: SimpleNamespace) -> None:
-        """Take limits and patience between runs; DataError in the middle of one."""
+        """Take limits and patience between runs; DataError while a run lasts."""
         if self._is_on:
             raise DataError("a run is on; stop it first")
         limits = Limits(

@@ -1,4 +1,4 @@
-"""Node `viewer`: serves a page of what the monitor says to any browser.
+"""Node `viewer`: serves the monitor's verdicts as a page to any browser.
 
 Hears ~/margin and ~/forecast of `monitor` and /diagnostics, and publishes nothing. It listens to
 the margins as best effort, so that a slow viewer never holds up the monitor; what it shows is the

@@ -32,7 +32,7 @@ def thread(folder: Path) -> tuple[str, int]:
 
 
 def threads(pid: int) -> Threads:
-    """Return state and switches of each thread of a process; none of one that is gone."""
+    """Return state and switches of each thread of a process; nothing if the process is gone."""
     found = {}
     for folder in Path(f"/proc/{pid}/task").glob("*"):
         with suppress(OSError, KeyError, ValueError):  # it ended meanwhile

@@ -21,5 +21,4 @@ def _values(case: Any) -> tuple[Any, ...]:
 
 
 def _name(case: Any) -> Any:
-    first = _values(case)[0]
-    return getattr(first, "__name__", first)
+    return getattr(_values(case)[0], "__name__", _values(case)[0])

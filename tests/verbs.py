@@ -7,8 +7,7 @@ from bags.commands.cli import app
 
 def nlsid(*arguments: object, status: int | tuple[int, ...] | None = 0, columns: int = 200) -> str:
     """What a verb prints if it ends with (one of) this status; None: what it raises, in words."""
-    given = list(map(str, arguments))
-    done = CliRunner().invoke(app, given, env={"COLUMNS": str(columns)})
+    done = CliRunner().invoke(app, list(map(str, arguments)), env={"COLUMNS": str(columns)})
     if status is None:
         assert done.exception is not None, done.output
         return str(done.exception)

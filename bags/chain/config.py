@@ -26,7 +26,7 @@ from nlsid_core.running.comparison import Centre
 
 
 def _listed(value: object) -> object:
-    """One signal is a list of one."""
+    """A single signal stands for a list with that signal."""
     return [value] if isinstance(value, dict) else value
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
+from typing import Final
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns, is_stamped
@@ -24,12 +24,11 @@ def held_at_zero(t: float, value: float) -> float:
     return 0.0 if t >= 1.0 else value
 
 
-FAULTS: Mapping[str, Fault] = MappingProxyType(
-    {"scaled by 0.6": scaled, "zero after 1 s": held_at_zero}
-)
-ONSETS: Mapping[str, float] = MappingProxyType(
-    {"scaled by 0.6": 0.0, "zero after 1 s": 1.0}
-)  # s from the signal's first message
+FAULTS: Final[Mapping[str, Fault]] = {"scaled by 0.6": scaled, "zero after 1 s": held_at_zero}
+ONSETS: Final[Mapping[str, float]] = {
+    "scaled by 0.6": 0.0,
+    "zero after 1 s": 1.0,
+}  # s from the signal's first message
 
 
 def write_faulty_copy(bag: Path | str, out: Path | str, signal: str, fault: Fault) -> None:

@@ -4,10 +4,9 @@ A pendulum with viscous damping and dry friction, and a two-link arm hanging in 
 driven by joint torques held for one sample. Encoders add white noise to angles and rates.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -76,7 +75,7 @@ ARM = Robot(
     (Link(2.0, 0.25, 0.5, 1.0, 0.02), Link(1.0, 0.25, 0.5, 0.5, 0.01)),
     (20.0, 10.0),
 )
-ROBOTS = MappingProxyType({robot.name: robot for robot in (PENDULUM, ARM)})
+ROBOTS: Final[Mapping[str, Robot]] = {robot.name: robot for robot in (PENDULUM, ARM)}
 
 
 class Plant:

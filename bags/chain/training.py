@@ -53,7 +53,7 @@ def load_held_back(path: Path | str, *, model: str) -> dict[str, Dataset]:
 
 
 def encoded(parts: Mapping[str, Dataset], *, model: str = "", compressed: bool = True) -> bytes:
-    """The .npz content of trials by what they are for, of the model with this digest if of one.
+    """The .npz content of trials by their use; model: the digest of the model that they made.
 
     Compressing some kilobytes takes three times as long as all the rest.
     """

@@ -274,7 +274,8 @@ def import_command(
         typer.Option(
             "--signal",
             "-s",
-            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat.",
+            help=r"signal=column: /joints:position\[name=elbow]=angle; repeat. "
+            "Default: a topic of every column.",
         ),
     ] = None,
     types: Annotated[
@@ -329,7 +330,7 @@ def _likeliest(
 
 
 def _opened(bag: Path, definitions: list[Path] | None) -> "Bag":
-    """The recording; of one that was not closed what there is."""
+    """The recording; if it was not closed, the messages that are whole."""
     from bags.recordings.bag import Bag
 
     return Bag(bag, unfinished=True, definitions=_definitions(definitions))

@@ -20,7 +20,7 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
 from bags.setup.candidates import Found, choose, look
 from bags.setup.proposal import Proposal
-from bags.setup.proposing import Chosen, propose
+from bags.setup.proposing import Chosen, beside, propose
 from bags.setup.written import yaml_text
 from bags.signals.reader import expanded
 from nlsid_core.errors import BagError, DataError, counted, percent
@@ -64,8 +64,8 @@ def run_init(
         named=(*responses, *excitations),
     )
     with progress_bar("trying models") as progress:
-        widen, alone = not excitations, not responses
-        proposal = propose(folders, found, chosen, widen=widen, alone=alone, progress=progress)
+        proposal = propose(folders, found, chosen, widen=not excitations, progress=progress)
+    proposal.walls += beside(proposal, found) if not responses else []
     if asked:
         drives, answers = (_paths(proposal, role) for role in ROLES)
         _show_others(console, found, {*drives, *answers})

@@ -192,7 +192,7 @@ class Check:
         return 0.0 if self._deciding is None else self._deciding.seconds
 
     def close(self) -> None:
-        """Call it off, or let go of what is left of it."""
+        """Stop the check if it runs, and release its process and files."""
         if self._deciding is not None:
             self._deciding.close()
 

@@ -1,4 +1,4 @@
-"""What an assumption was measured on: printed beside a verdict, and no part of what is proved.
+"""The trials that an assumption was measured on: printed beside a verdict, and not proved.
 
 The numbers are the file's word. What is looked at here is whether they agree with each other: a
 level is not below what was measured, and no sample both chose a tube and scaled it. Of m + 1

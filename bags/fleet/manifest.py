@@ -81,7 +81,7 @@ class Manifest:
 
 
 def key_of(bag: Path, name: str, asked: str) -> str:
-    """The key of what is asked of a bag: it changes when its files do. OSError if it is gone."""
+    """The key of a question about a bag: it changes when its files do. OSError if it is gone."""
     files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
     states: list[Any] = [(file.name, *_state(file)) for file in files]
     return hashlib.sha256(json.dumps([asked, name, str(bag), states]).encode()).hexdigest()

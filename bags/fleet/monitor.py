@@ -90,7 +90,7 @@ def _unjudged(replay: Replay) -> str:
 
 
 def most_spent(readings: Sequence[Reading]) -> Reading | None:
-    """The reading that uses the most of what is assumed; None if none measures it."""
+    """The reading that uses most of the assumption; None if none measures it."""
     measured = [reading for reading in readings if math.isfinite(reading.assumption)]
     return max(measured, key=lambda reading: reading.assumption, default=None)
 
@@ -143,7 +143,7 @@ class FleetVerdict:
 
 
 def in_percent(part: float) -> str:
-    """A part of what is assumed, three digits, rounded up."""
+    """The used part of an assumption in %, three digits, rounded up."""
     return f"{_above(100.0 * part)} %"
 
 

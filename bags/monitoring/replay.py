@@ -212,7 +212,7 @@ class Replay:
 
     @property
     def unjudged(self) -> tuple[Stretch, ...]:
-        """Every stretch that was not judged, starts left out that are no part of one.
+        """Every stretch that was not judged, without the starts of runs outside such stretches.
 
         Filled samples are one stretch where they are more than MOST_FILLED of all.
         """
@@ -285,7 +285,7 @@ class Replay:
 
     @property
     def assumption(self) -> float:
-        """The most of what is assumed that a judged sample used; 1 is all of it, NaN unmeasured."""
+        """The largest used part of the assumption; 1 is all of it, NaN where none was measured."""
         used = [r.assumption for r in self.judged if not math.isnan(r.assumption)]
         return max(used, default=math.nan)
 
@@ -415,7 +415,7 @@ def replay_messages(
     clock: takes note of the stamps.
     """
     bag = place(bag)
-    planned = centre is Centre.PROFILE or design.has_plan
+    planned = centre is Centre.PROFILE or not isinstance(design.funnel, TubeFunnel)
     announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)
     stamped = [

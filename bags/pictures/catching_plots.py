@@ -1,4 +1,4 @@
-"""The picture of what a funnel catches (extra `report`: matplotlib)."""
+"""The picture of the faults that a funnel catches (extra `report`: matplotlib)."""
 
 from textwrap import fill
 from typing import Any

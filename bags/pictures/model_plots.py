@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, grid, legend, thinned, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import Candidate, Model, Validation, simulate_trial
-from nlsid_core.identification.prediction import history, learns
+from nlsid_core.identification import Candidate, Model, Validation
+from nlsid_core.identification.prediction import history, learns, simulate_started
+from nlsid_core.identification.validation import unscored
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
@@ -31,7 +32,9 @@ def simulations(test: Dataset, models: Mapping[str, Model], output: int = 0) -> 
         The figure, with an input of the same unit.
     """
     *others, (title, chosen) = models.items()
-    simulated = {trial.name: simulate_trial(chosen, trial)[:, output] for trial in test}
+    n = unscored(test)
+    outputs = simulate_started(chosen, test.trajectories, n)
+    simulated = {t.name: y[:, output] for t, y in zip(test, outputs, strict=True)}
     trials = sorted(test, key=lambda t: -_size(t.y[:, output] - simulated[t.name]))[:MOST_TRIALS]
     trials.sort(key=lambda t: test.names.index(t.name))
     width = 3.1 if len(trials) > 1 else 9.1
@@ -45,7 +48,7 @@ def simulations(test: Dataset, models: Mapping[str, Model], output: int = 0) -> 
                 axes.step(t, u[rows_drawn], where="post", color=GREY, lw=LINE, label=name)
         axes.plot(t, y[rows_drawn], color=INK, lw=LINE, label="measured")
         for (name, model), color in zip(others, cycle((ORANGE, RED))):
-            other = _bounded(simulate_trial(model, trial)[rows_drawn, output], y)
+            other = _bounded(simulate_started(model, [trial], n)[0][rows_drawn, output], y)
             axes.plot(t, other, color=color, lw=LINE, ls="--", label=name)
         axes.plot(t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=title)
         drawn = "" if len(t) == len(trial) else f", {len(t)} of {len(trial)} samples"
@@ -62,12 +65,13 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     n_y, n_u = first.y.shape[1], first.u.shape[1]
     figure = Figure(figsize=(3.3 * (2 + n_u), 2.7 * n_y + 0.4), layout="constrained")
     panels = figure.subplots(n_y, 2 + n_u, squeeze=False)
-    start = max(history(chosen.model), chosen.transient)
+    start = max(history(chosen.model), unscored(test, chosen.transient))
+    simulated = simulate_started(chosen.model, test.trajectories, start)
     predicts = learns(chosen.model)
     for i in range(n_y):
         over_time, auto, *crossed = panels[i]
-        for trial in test:
-            left = trial.y[start:, i] - simulate_trial(chosen.model, trial)[start:, i]
+        for trial, y in zip(test, simulated, strict=True):
+            left = trial.y[start:, i] - y[start:, i]
             t, e = thinned(trial.t[start:] - trial.t[0], left, DRAWN)
             over_time.plot(t, e, lw=0.8)
         over_time.set_title(f"residual of {axis_name(first, i)}", fontsize=8, loc="left")

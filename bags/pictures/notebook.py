@@ -6,24 +6,29 @@ from typing import Any
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset
+from nlsid_core.designs import AnyDesign
 from nlsid_core.identification import Model
 from nlsid_core.models import DifferenceEquation
 
 
-def plot(data: Dataset, models: Mapping[str, Model], output: int = 0) -> Any:
-    """Draw what was measured on trials and what models simulate of them, as a matplotlib Figure.
+def plot(
+    shown: Dataset | AnyDesign, models: Mapping[str, Model] | None = None, output: int = 0
+) -> Any:
+    """Draw what was measured on trials and what models simulate of them, or a design's tube.
 
     Args:
-        data: the trials; of many, those that the last model simulates worst.
-        models: by the names that the legend shows, such as `fit.model`.
-        output: the number of the response.
+        shown: a design, or trials: of many, those that the last model simulates worst.
+        models: for trials, by the names that the legend shows, such as `fit.model`.
+        output: for trials, the number of the response.
 
     Returns:
-        The Figure; `savefig` writes it.
+        A matplotlib Figure; `savefig` writes it.
     """
-    from bags.pictures.model_plots import simulations
+    from bags.pictures import model_plots, tubes
 
-    return simulations(data, models, output)
+    if isinstance(shown, Dataset):
+        return model_plots.simulations(shown, models or {}, output)
+    return tubes.draw_tube(shown)
 
 
 def to_control(model: DifferenceEquation) -> Any:

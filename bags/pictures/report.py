@@ -40,7 +40,7 @@ def report_available() -> bool:
 
 
 def drawable(replays: Sequence[Replay]) -> bool:
-    """Whether replayed bags can be drawn in their tubes: those of one output, if any was judged."""
+    """Whether replayed bags can be drawn: they have one output, and one was judged."""
     judged = any(entry.judged for entry in replays)
     return report_available() and judged and all(entry.half_width for entry in replays)
 
@@ -58,7 +58,7 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
 
 
 def write_catching(folder: Path, catching: Catching) -> list[Path]:
-    """The picture of what a funnel catches, and its section in the report; the files written.
+    """Write the picture of the faults that a funnel catches, and its section; return the files.
 
     Nothing without the extra `report`; no section where there is no report.
     """
@@ -109,7 +109,6 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
         ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
         for part in (model.y, model.u)
     )
-    left_out = f" and the first {chosen.transient}" if chosen.transient else ""
     calibrated = ", calibration trials for neither: they scale the tube"
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
@@ -120,8 +119,8 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
 <p class="{"not" if chosen.proof is None else "proved"}">{escape(proved)}</p>
 <h2>How well it simulates</h2>
 {tables.html(lambda console: console.print(methods))}
-<p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
-simulation starts from{left_out}, ŷ simulated with the recorded input.
+<p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial but the first
+ones, which show where it starts, ŷ simulated with the recorded input.
 Trials: {counts}; test trials were only used
 for this table and the pictures below{calibrated if "calibration" in parts else ""}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}

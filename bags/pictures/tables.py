@@ -74,9 +74,9 @@ def stability_sentence(chosen: Candidate[Model]) -> str:
 def catching_table(catching: Catching) -> Table:
     """What the funnel and other detectors catch of every sabotage, and how soon."""
     detectors = list(catching.rows[0].others)
-    plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trial{plural}, and after how many s (median)",
+        title=f"caught of {counted(catching.trials, 'held-back trial')}, and after how many s "
+        "(median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
@@ -127,8 +127,11 @@ def warn(console: Console, line: str) -> None:
 def say_catching(console: Console, catching: Catching) -> None:
     """The widths, the table, and what is to be known of a tube that is too wide."""
     for width in catching.widths:
-        said = f"half-width of {width.name}: {width.said}, {width.part}"
-        console.print(said, soft_wrap=True, highlight=False)
+        console.print(
+            f"half-width of {width.name}: {width.said}, {width.part}",
+            soft_wrap=True,
+            highlight=False,
+        )
     console.print(catching_table(catching))
     for row in catching.rows:
         if row.refused:
@@ -143,9 +146,7 @@ def say_catching(console: Console, catching: Catching) -> None:
             f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
         )
-    for line in (*catching.beyond, *catching.still, *catching.restarts):
-        warn(console, line)
-    for line in catching.warnings():
+    for line in (*catching.beyond, *catching.still, *catching.restarts, *catching.warnings()):
         warn(console, line)
 
 

@@ -12,12 +12,12 @@ from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, grid, legend
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.designs import AnyDesign
-from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels import ContinuousFunnel, TubeFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
 from nlsid_core.models import Signal, StateModel
 
 TUBE = "#dbe8f4"
-TIMES = 200  # at which a continuous tube is drawn
+TIMES = 200  # at which a tube in continuous time, or without an end, is drawn
 OUTLINES = 80  # ellipses of a projected tube: their shadows join into one
 RINGS = 6  # of them drawn with a line
 PROJECTIONS = 3  # at most
@@ -31,9 +31,10 @@ def write_tube(path: Path, design: AnyDesign) -> None:
 
 
 def draw_tube(design: AnyDesign) -> Figure:
-    """Draw each state's tube around the motion over time; of a composition stage after stage.
+    """Draw each signal's tube around the motion over time; of a composition stage after stage.
 
-    Of a funnel in continuous time its projections onto pairs of states come first.
+    Of a funnel in continuous time its projections onto pairs of states come first. A tube without
+    a plan goes where its model's simulation goes, so it is drawn around 0.
     """
     signals = design.signals[0]
     is_continuous = isinstance(design.funnel, ContinuousFunnel)
@@ -112,6 +113,11 @@ def _band(design: AnyDesign) -> tuple[FloatArray, FloatArray, FloatArray]:
     if isinstance(funnel, ContinuousFunnel):
         t = np.linspace(funnel.t0, funnel.tf, TIMES)
         return t, funnel.x(t), np.array([funnel.widths(float(when)) for when in t])
+    if isinstance(funnel, TubeFunnel):
+        count = len(policy or range(int(min(funnel.last + 1, TIMES))))
+        widths = np.array(list(map(funnel.widths, range(count))))
+        x = 0.0 * widths if policy is None else policy.plan(design.model).y[:, None]
+        return np.arange(count) * design.period, x, widths
     return np.arange(len(policy) + 1) * policy.period, policy.x, funnel.half_widths
 
 

@@ -66,7 +66,7 @@ LATCHED: Final = Profile(depth=1, durability="transient_local")  # a latched top
 
 
 def offered(found: object) -> tuple[Profile, ...]:
-    """The profiles in a text of YAML or in what was read of one; none where they are malformed.
+    """The profiles in a text of YAML, or in its parsed content; none where they are malformed.
 
     A bag without a quality of service plays with the player's own; so does one whose is damaged.
     """

@@ -94,7 +94,7 @@ class RemotePath(PosixPath):
         return tuple(self.__dict__.get("_children", {}).values())
 
     def forget(self) -> None:
-        """Hold nothing any more, of it and of what is below."""
+        """Forget its entry, and those below it."""
         for key in ("_parts_held", "_order_held"):
             self.__dict__.pop(key, None)
         for child in self.known:
@@ -394,7 +394,7 @@ def _entry(described: Mapping[str, Any]) -> Entry:
 
 
 def _short(error: BaseException) -> str:
-    """The first line of what it says, without what a redirection or a server told of secrets."""
+    """The first line of an error, without secrets that a redirection or a server told."""
     line = str(error).partition("\n")[0][:200]
     for name, value in os.environ.items():
         if len(value) >= SHORTEST_SECRET and re.search("KEY|SECRET|TOKEN|PASSWORD", name):

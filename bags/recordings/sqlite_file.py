@@ -176,7 +176,7 @@ class SqliteFile:
         return min(ends, default=0), max(ends, default=-1)
 
     def _lose(self, what: str) -> None:
-        """Take note of what cannot be read; BagError unless it is to be salvaged."""
+        """Note a part that cannot be read; BagError unless the rest is to be salvaged."""
         if not self._salvage:
             raise BagError(what)
         self.contents.lost.append(what)

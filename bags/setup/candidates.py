@@ -152,12 +152,12 @@ class Found:
 
     @property
     def still(self) -> list[str]:
-        """Some of what measures and never varies."""
+        """Some signals that measure and never vary."""
         return [c.text for c in self.constant if c.command < 0.5][:SHOWN]
 
     @property
     def constant_commands(self) -> list[str]:
-        """Some of what surely commands and never varies, where nothing on its topic does."""
+        """Some signals that surely command and never vary, on topics where nothing varies."""
         moving = {c.topic for c in self.candidates}
         surely = [c for c in self.constant if c.command > COMMANDS_SURELY]
         return [c.text for c in surely if c.topic not in moving][:SHOWN]

@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.choosing import Attempt, Choice, HeldOut, Row
@@ -46,7 +48,8 @@ def choose(
 ) -> Choice:
     """Try what there is for such data: all on the first fold, the best of each stage on all.
 
-    known: what was tried before. A stage sees what its own attempts gave on the first fold.
+    Who falls back on the other folds takes nobody's place. known: what was tried before. A stage
+    sees what its own attempts gave on the first fold.
     """
     rows = list(known)
     for number, (stage, kept) in enumerate(stages):
@@ -56,17 +59,24 @@ def choose(
             if all(row.attempt != attempt for row in seen):
                 progress(str(attempt), number / len(stages))
                 seen.append(held_out.glance(attempt))
-        for place, row in enumerate(sorted(seen[begun:], key=lambda row: row.percent)):
+        left = kept
+        for row in sorted(seen[begun:], key=lambda row: row.percent):
             best = least(rows)
-            limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
                 rows.append(row)
-            elif kept == EVERY or (place < kept and row.percent <= limit):
+            elif best is None or kept == EVERY or (left and _keeps_up(row, best)):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
                 rows.append(held_out.judged(row))
+                left -= best is not None and _keeps_up(rows[-1], best)
             else:
                 rows.append(replace(row, refusal=f"{row.percent:.3g} % on one fold"))
     return Choice(held_out, tuple(rows))
+
+
+def _keeps_up(row: Row, best: Row) -> bool:
+    """Whether it is about as good, where both were judged."""
+    both = ~np.isnan(row.errors)
+    return bool(np.mean(row.judged[both]) <= DROPPED**2 * np.mean(best.judged[both]))
 
 
 def tried(train: Dataset, stages: "Stages", *, progress: Progress) -> Choice | None:
@@ -133,8 +143,8 @@ def networks(data: Dataset, rows: Sequence[Row]) -> Iterator[Attempt]:
         return
     certified = Sem(STEPS, certified=True)
     for structure in _structures(data, rows):
-        reached = min(row.percent for row in rows)
-        if reached < LEAP * before and not isinstance(structure, FilterMapFilter):
+        leapt = min(row.percent for row in rows) < LEAP * before
+        if leapt and not isinstance(structure, FilterMapFilter):
             return
         yield Attempt(Network(structure), certified)
     if min(row.percent for row in rows) > SWINGS:

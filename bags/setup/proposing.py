@@ -19,7 +19,7 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup import ladder
-from bags.setup.candidates import Found, Pair, Unfit, is_named, slope_window
+from bags.setup.candidates import Found, Pair, Unfit, is_named
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal
@@ -27,10 +27,11 @@ from bags.signals.columns import read_columns
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.signal import SignalPath
 from bags.signals.timing import RELATED
-from nlsid_core.data.repeats import same_excitation
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.repeats import by_excitation
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import Choice
+from nlsid_core.identification.choosing import STRETCHES
 from nlsid_core.progress import Progress, silent
 
 TEST_EVERY: Final = 5  # bags: every fifth only scores
@@ -63,13 +64,12 @@ def propose(
     chosen: Chosen,
     *,
     widen: bool = False,
-    alone: bool = False,
     progress: Progress = silent,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
 
     widen: where models of one excitation are poor, take those too that the response follows
-    besides, if that is better. alone: nobody chose the one response, and others like it are said.
+    besides, if that is better.
 
     Raises BagError and DataError if the bags cannot be read as any configuration says.
     """
@@ -120,14 +120,11 @@ def propose(
         moved = propose(bags, found, replace(chosen, responses=(washed,)), progress=progress)
         if moved.error <= proposal.error / 2.0:
             _say_washed_out(moved, proposal.error)
-            moved.walls += _beside(moved, found) if alone else []
             return moved
-    _say_funnel(proposal)
     others = [pair.command.text for pair in followed(proposal, found)]
     if widen and proposal.error > POOR and others:
         both = replace(chosen, excitations=(*excitations, *others))
         wider = propose(bags, found, both, progress=progress)
-        wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
             without = f"; without it models are off by {proposal.error:.3g} %"
             wider.why |= {text: wider.why[text] + without for text in others}
@@ -135,9 +132,9 @@ def propose(
     if choice is not None and not is_swapped:  # who swapped them has to say so first
         more = ladder.choose(choice.held_out, ladder.BEYOND, choice.rows, progress=progress)
         _say_model(proposal, more, trials.train)
+    _say_funnel(proposal, len(trials.train) if len(trials.train) > 1 else STRETCHES)
     if POOR < proposal.error < math.inf:
-        _say_poor(proposal, found)
-    proposal.walls += _beside(proposal, found) if alone else []
+        _say_poor(proposal)
     return proposal
 
 
@@ -188,7 +185,7 @@ def _say_washed_out(proposal: Proposal, error: float) -> None:
     )
 
 
-def _beside(proposal: Proposal, found: Found) -> list[str]:
+def beside(proposal: Proposal, found: Found) -> list[str]:
     """How the responses of the chosen one's kind are added, with what each of them follows."""
     signals = proposal.content["signals"]
     responses, excitations = (
@@ -232,18 +229,11 @@ def followed(proposal: Proposal, found: Found) -> list[Pair]:
     return follows[:OTHERS]
 
 
-def _say_poor(proposal: Proposal, found: Found) -> None:
-    signals = proposal.content["signals"]
-    wall = (
+def _say_poor(proposal: Proposal) -> None:
+    proposal.walls.append(
         f"nothing that was tried has less than {proposal.error:.3g} % error: the tube will be "
         "wide; another pair of signals, or more of them, may say more"
     )
-    if len(signals["response"]) == len(signals["excitation"]) == 1 and (
-        also := followed(proposal, found)
-    ):
-        said = ", ".join(f"{pair.command.text} ({pair.correlation:+.2f})" for pair in also)
-        wall += f": it follows {said} too (-u, once for each)"
-    proposal.walls.append(wall)
 
 
 def _unwrapped(text: str) -> bool:
@@ -252,8 +242,7 @@ def _unwrapped(text: str) -> bool:
 
 
 def _signal(found: Found, text: str, named: Sequence[str]) -> Signal:
-    known = next((c for c in found.candidates if c.text == text), None)
-    known = known or next((c for c in found.candidates if is_named(c.text, text)), None)
+    known = next((c for c in found.candidates if is_named(c.text, text)), None)
     if known is None:
         path = text.partition("|")[0]
         numbers = (
@@ -317,12 +306,6 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                 proposal.walls.append(
                     f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
                 )
-            washed = "|washout" in y.path
-            if best.response.is_position and not best.command.is_position and not washed:
-                proposal.walls.append(
-                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
-                    f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
-                )
 
 
 def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
@@ -369,8 +352,8 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
         proposal.content["split"] = {"share": SHARE}
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
         proposal.walls.append(
-            "one bag: a tube is designed on one trial and its level measured on another; record "
-            "more, or cut it: nlsid bag convert BAG --every 5"
+            "one bag: windows of it design the tube and set its level, so nothing is said of how "
+            "often a next recording raises an alarm; record more"
         )
 
 
@@ -379,13 +362,7 @@ def _say_motions(proposal: Proposal, trials: Dataset) -> bool:
 
     Bags by name often come motion after motion, or in turn: every fifth may be of one motion only.
     """
-    motions: list[list[Trajectory]] = []
-    for trial in trials:
-        known = next((m for m in motions if same_excitation(m[0].u[:, 0], trial.u[:, 0])), None)
-        if known is None:
-            motions.append([trial])
-        else:
-            known.append(trial)
+    motions = by_excitation(trials)
     repeats = min(map(len, motions))
     if proposal.content["split"].get("share") or repeats < TEST_EVERY:
         return False
@@ -420,16 +397,22 @@ def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]
             proposal.why[key] = f"without it: {error}"[:120].rpartition(" ")[0]
 
 
-def _say_funnel(proposal: Proposal) -> None:
-    """Where the level is set by trials that the model was fitted to, their errors are too small."""
-    times = 1.0
+def _say_funnel(proposal: Proposal, trials: int) -> None:
+    """Where half of so many trials set the level, and the model was fitted to them, it is too low.
+
+    The next trial exceeds the largest of m the oftener the fewer they are: factors of 1 + 1/m keep
+    that at about one in twenty where the sizes of errors differ by a third from trial to trial.
+    """
+    times, why = 1.0, "a wider tube raises fewer false alarms and catches less"
     if proposal.choice is not None and not proposal.content["split"].get("calibration"):
-        times = min(proposal.choice.optimism, MOST_OPTIMISM)
+        few = 1.0 + 1.0 / max(1, trials // 2)
+        times = few * min(proposal.choice.optimism, MOST_OPTIMISM)
+        why += (
+            f"; {SAFETY:g} times {times:.2g}: no trial is left for calibration, errors are larger "
+            "on what was held out than where models were fitted, and few trials set the level"
+        )
     proposal.content["funnel"] = {"safety_factor": float(f"{SAFETY * times:.2g}")}
-    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less" + (
-        f"; {SAFETY:g} times {times:.2g}, as no trial is left for calibration, and errors are so "
-        "many times larger on what was held out than where models were fitted"
-    ) * (times > 1.0)
+    proposal.why["safety_factor"] = why
 
 
 def _say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> None:
@@ -452,7 +435,7 @@ def _say_model(proposal: Proposal, choice: Choice | None, train: Dataset) -> Non
 
 
 def take_next(proposal: Proposal, refusal: object) -> str:
-    """Take the next best of what was tried, as the best was refused; which, empty if none is."""
+    """Take the next best attempt, as the best was refused; its name, or empty if none is left."""
     choice = proposal.choice
     if choice is None or len(choice.ranked) < 2:
         return ""

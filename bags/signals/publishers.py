@@ -22,6 +22,8 @@ UNEVEN: Final = 0.3  # of the median time between messages of all: it varies by 
 LEAST: Final = 6  # messages of each publisher in a window
 SMOOTH: Final = 10.0  # times less do squared second differences of the curves add up to; noise: 1
 TURNS: Final = (2, 3, 4)  # publishers that send in turn
+MOSTLY: Final = 0.5  # of the windows that move as much have two curves, where there are two
+LONGER: Final = 1.5  # times as long; where one publisher is gone, messages come more seldom
 DISTINCT: Final = 24  # values in a window; fewer are those of a coarse sensor, which flickers
 
 
@@ -45,13 +47,28 @@ def two_curves(stamp_ns: IntArray, values: FloatArray) -> str:
     order = np.argsort(stamp_ns, kind="stable")
     step = max(WINDOW // 2, (len(values) - WINDOW) // LOOKS)
     starts = range(0, len(values) - WINDOW + 1, step)
-    windows = (order[start : start + WINDOW] for start in starts)
-    found = [_has_two_curves(stamp_ns[rows], values[rows]) for rows in windows]
-    if not any(found):
+    windows = [order[start : start + WINDOW] for start in starts]
+    found = np.array([_has_two_curves(stamp_ns[rows], values[rows]) for rows in windows])
+    if not found.any() or np.mean(found[_alike(stamp_ns, values, windows, found)]) < MOSTLY:
         return ""
     return (
-        f"its values jump from one curve to another and back in {sum(found)} of {len(found)} "
+        f"its values jump from one curve to another and back in {found.sum()} of {len(found)} "
         f"stretches of {WINDOW} messages: several publishers send them"
+    )
+
+
+def _alike(
+    stamp_ns: IntArray, values: FloatArray, windows: list[IntArray], found: BoolArray
+) -> BoolArray:
+    """Windows that move as much as those with two curves, with messages about as often.
+
+    Two publishers make two curves in most of these. One whose counter flickers between two numbers,
+    or that rings at half its rate, does so now and then.
+    """
+    moved = np.array([np.ptp(values[rows]) for rows in windows])
+    lasts = np.array([np.ptp(stamp_ns[rows]) for rows in windows])
+    return np.asarray(
+        (moved >= np.median(moved[found])) & (lasts <= LONGER * np.median(lasts[found]))
     )
 
 

@@ -90,7 +90,7 @@ class Recent:
         definitions: Mapping[str, Definition] | None = None,
         offered: Mapping[str, tuple[Profile, ...]] | None = None,
     ) -> int:
-        """Write a bag of what is remembered; how many messages. Raises BagError if it exists.
+        """Write the remembered messages as a bag; return how many. BagError if it exists.
 
         definitions: of the topics' types by topic; those that are not in it have standard types.
         offered: the quality of service of each topic's publishers, where it is known.

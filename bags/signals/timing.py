@@ -33,7 +33,7 @@ def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
 
 @dataclass
 class Sequence:
-    """Messages missing from a publisher's own count of what it sent.
+    """Messages that a publisher counted and the bag lacks.
 
     A count that begins anew is a publisher that came back. One that goes back, or stays, again
     within SOON messages is that of several publishers, of which the middleware does not say who

@@ -6,7 +6,7 @@ from typing import Annotated
 
 @dataclass(frozen=True)
 class What:
-    """What of the old bags is copied. A moment is s after the first message, or a date in UTC."""
+    """The part of the old bags to copy. A moment is s after the first message, or a date in UTC."""
 
     topics: Annotated[list[str] | None, "Only these, by name or pattern: '/camera/*'."] = None
     start: Annotated[str, "From here on: s after the first message, or a date in UTC."] = ""

@@ -125,19 +125,18 @@ def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: Fit
     u_names, y_names = list(expanded(bag, u_texts)), list(expanded(bag, y_texts))
     read = read_signals(bag, [*u_names, *y_names], sort=True)
     commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
-    found = look.findings
     doubts = [samples.doubt(responds=name in y_names) for name, samples in read.items()]
-    found += [Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt]
+    look.findings += [Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt]
     for samples in measured:
-        found.extend(_regularity(samples))
-        found.extend(_range(samples))
+        look.findings.extend(_regularity(samples))
+        look.findings.extend(_range(samples))
     last_ns = max(int(samples.stamp_ns[-1]) for samples in measured)
     for samples in commanded:
-        found.extend(_commands(samples, last_ns))
-        found.extend(_excitation(samples))
+        look.findings.extend(_commands(samples, last_ns))
+        look.findings.extend(_excitation(samples))
         look.commands[samples.path] = samples.values
-    found.extend(_samples(measured, commanded, look.commands))
-    found.extend(_delays(commanded, measured))
+    look.findings.extend(_samples(measured, commanded, look.commands))
+    look.findings.extend(_delays(commanded, measured))
 
 
 def _samples(
@@ -202,10 +201,9 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
     if bag.ending is not None:
         yield Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}")
     found = expanded(bag, signals).values()
-    paths = [signal.path for signal in found]
     logged = {signal.path.topic for signal in found if signal.clock == "log"}
     offsets = {}
-    for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
+    for topic, columns in read_columns(bag, {str(s.path): s.path for s in found}).items():
         if topic in logged:
             yield Finding(
                 Level.GOOD,
@@ -221,8 +219,7 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
         elif len(columns) and not columns.stamp_ns.any():
             yield Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0")
         elif len(columns):
-            back = int((np.diff(columns.stamp_ns) < 0).sum())
-            if back:
+            if back := int((np.diff(columns.stamp_ns) < 0).sum()):
                 yield Finding(Level.BAD, "clock", f"{topic}: stamps that go back: {back}")
             relation = clock_relation(columns.stamp_ns, columns.log_ns)
             offsets[topic] = relation.offset
@@ -238,20 +235,17 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> Iterator[Finding]:
 
 
 def _regularity(samples: Samples) -> Iterator[Finding]:
-    steps = np.diff(samples.stamp_ns) / 1e9
-    name = samples.path
+    every = np.diff(samples.stamp_ns) / 1e9
+    name, steps = samples.path, every[every > 0]
     if not len(steps):
-        yield Finding(Level.BAD, "regularity", f"{name} has one sample")
+        yield Finding(Level.BAD, "regularity", f"{name} has one stamp")
         return
-    if repeated := int((steps == 0).sum()):
+    if repeated := len(every) - len(steps):
         yield Finding(
             Level.LOOK,
             "regularity",
             f"{name}: {repeated} of {len(samples)} stamps repeat the one before",
         )
-    steps = steps[steps > 0]
-    if not len(steps):
-        return
     period = float(np.median(steps))
     gaps = steps > GAP * period
     if gaps.any():

@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -96,8 +96,10 @@ def _number(text: str) -> float | None:
 
 def _column(tables: Mapping[str, FloatArray], title: str) -> FloatArray:
     if title not in tables:
-        near = did_you_mean(title, tables)
-        raise DataError(f"no column of numbers '{title}'; there are: {listed(tables)}{near}")
+        raise DataError(
+            f"no column of numbers '{title}'; there are: {listed(tables)}"
+            f"{did_you_mean(title, tables)}"
+        )
     return tables[title]
 
 
@@ -112,6 +114,16 @@ def _assigned(text: str) -> tuple[SignalPath, str]:
     if path.every:
         raise BagError(f"'{text}': name one element for one column")
     return path, column.strip()
+
+
+def _every_column(titles: Iterable[str], time: str | None) -> list[tuple[SignalPath, str]]:
+    """All but the times, each as the number of a topic called as the column is."""
+    times = _unit_of(time or "")[0]
+    words = {title: re.findall("[A-Za-z0-9]+", title) for title in titles if title != times}
+    named = {title: re.sub("^(?![A-Za-z])", "column_", "_".join(words[title])) for title in words}
+    if len(set(named.values())) < len(named):
+        raise BagError(f"two of {listed(named)} make one topic: name them, -s /NAME:data=COLUMN")
+    return [(SignalPath.parse(f"/{name}:data"), title) for title, name in named.items()]
 
 
 def import_table(
@@ -130,7 +142,7 @@ def import_table(
     Args:
         file: the table.
         out: the bag.
-        assignments: `signal=column` each.
+        assignments: `signal=column` each; none: every column but the times is a topic's number.
         types: topic -> message type, a standard one; a number where only `topic:data` is assigned.
         rows: when the rows were recorded; without a period or a column, by the one named as time.
         custom: key-value pairs of the bag's own.
@@ -150,16 +162,13 @@ def import_table(
             f"(--time); there are: {listed(tables)}"
         )
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
-    for text in assignments:
-        path, column = _assigned(text)
+    assigned = list(map(_assigned, assignments)) or _every_column(tables, rows.time)
+    for path, column in assigned:
         topics.setdefault(path.topic, {})[path] = _column(tables, column)
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     if not topics:
-        raise BagError(
-            "say which column is which signal, e.g. -s /speed:data=COLUMN; there are: "
-            f"{listed(tables)}"
-        )
+        raise BagError(f"{file} has no column of numbers but '{rows.time}'")
     times, unit = _times(tables, rows)
     stamps = _stamps(times, round(rows.start * 1e9))
     streams = []

@@ -1,11 +1,11 @@
-"""What of a design is drawn beside the signals: their names, and how wide the tube is."""
+"""The part of a design that is drawn: its signals' names, and how wide the tube is."""
 
 from typing import Any
 
 import numpy as np
 
 from nlsid_core.designs import AnyDesign
-from nlsid_core.funnels import ContinuousFunnel, SampledFunnel
+from nlsid_core.funnels import ContinuousFunnel
 from nlsid_core.running.reading import Reading
 
 
@@ -25,10 +25,8 @@ class HalfWidths:
             steps = np.arange(round((last - funnel.t0) / self._period) + 1) * self._period
             on = ((t, sum(t >= s.tf for s in stages[:-1])) for t in (funnel.t0 + steps).tolist())
             rows = [stages[i].widths(min(t, last)) for t, i in on]
-        elif isinstance(funnel, SampledFunnel):
-            rows = list(funnel.half_widths)
-        else:
-            rows = [funnel.half_widths]
+        else:  # of every sample, or of all
+            rows = list(np.atleast_2d(funnel.half_widths))
         self._rows = [tuple(map(float, row)) for row in rows]
 
     def of(self, reading: Reading) -> dict[str, float]:

@@ -40,7 +40,7 @@ class Sample(NamedTuple):
     numbers: Mapping[str, float]
 
     def signal(self, name: str, index: int) -> float:
-        """`nominal`, `measured`, `half_width`, `low` or `high` of one; NaN if it is not known."""
+        """`nominal`, `measured`, `half_width`, `low` or `high` of a signal; NaN if unknown."""
         found = self.numbers.get(f"{name}[{index}]", self.numbers.get(name) if index == 0 else None)
         return math.nan if found is None else found
 
@@ -59,7 +59,7 @@ class Said(NamedTuple):
 
 
 class Event(NamedTuple):
-    """A change of what a node says: stamp in ns, level, node and text."""
+    """A node's new message: stamp in ns, level, node and text."""
 
     stamp_ns: int
     level: int

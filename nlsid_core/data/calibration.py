@@ -7,10 +7,10 @@ same trials choose what s is. Source: V. Vovk, A. Gammerman, G. Shafer, Algorith
 Random World, Section 2.2.
 """
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from nlsid_core import files
 from nlsid_core.data.shared import shared_stretch
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
@@ -67,10 +67,10 @@ def calibration_trials(
             )
         return CalibrationTrials(Dataset(cut[::2]), Dataset(cut[1::2]), cut=True)
     scaling = set(recordings[1::2])
-    parts = [
-        [trial for trial in train if (recording(trial) in scaling) is of] for of in (False, True)
-    ]
-    design, scales = (Dataset(tuple(part)) for part in parts)
+    design, scales = (
+        Dataset(tuple(trial for trial in train if (recording(trial) in scaling) is scaled))
+        for scaled in (False, True)
+    )
     check_apart(design, scales)
     return CalibrationTrials(design, scales)
 
@@ -80,8 +80,7 @@ def check_apart(others: Iterable[Trajectory], calibration: Iterable[Trajectory])
 
     See `shared_stretch` for what that can see and what it cannot.
     """
-    found = shared_stretch(others, calibration)
-    if found is not None:
+    if found := shared_stretch(others, calibration):
         raise DataError(
             f"{found}. A calibration trial is a recording of its own; the largest of trials that "
             "designed the tube, or of one that is there twice, says nothing of the next one: "
@@ -97,11 +96,9 @@ def windows(trials: Iterable[Trajectory], samples: int) -> tuple[Trajectory, ...
     cut, before = [], 0
     for trial in trials:
         for first in range(0, len(trial) - samples + 1, samples):
-            part = slice(first, first + samples)
             where = f"[{before + first}:{before + first + samples}]"
-            cut.append(
-                replace(trial.rows(part, trial.name + where), digest=recording(trial) + where)
-            )
+            part = trial.rows(slice(first, first + samples), trial.name + where)
+            cut.append(replace(part, digest=recording(trial) + where))
         before += len(trial)
     return tuple(cut)
 
@@ -110,8 +107,7 @@ def recording(trial: Trajectory) -> str:
     """The digest of the recording that a trial came from; of its samples if it names none."""
     if trial.digest:
         return trial.digest
-    content = b"".join(values.tobytes() for values in (trial.t, trial.y, trial.u))
-    return f"sha256:{hashlib.sha256(content).hexdigest()}"
+    return files.digest(b"".join(values.tobytes() for values in (trial.t, trial.y, trial.u)))
 
 
 def _named(trials: Dataset) -> tuple[tuple[str, str], ...]:

@@ -136,7 +136,7 @@ def _balanced(
 
 
 def slowed(form: Form, found: Found, s: float) -> Found:
-    """A proof of the observer sL, of what an output has beside its own innovation (c = 1).
+    """A proof of the observer sL, for an output without its own innovation (c = 1).
 
     With ζ = s ζ̃ the inequalities of sL are those of L, in P/s² and diag(1/s, 1/s, 1) N/s; without
     e in them, N_j bounds output j by V at every vertex by 1/τ_j = H_j (ρP + sym(N_j E))⁻¹ H_j'.

@@ -253,7 +253,7 @@ class Cubic:
 
     @property
     def bounds(self) -> FloatArray:
-        """(n,) of what the cubics leave out; 0 for exact rates."""
+        """(n,) the most that the cubics leave out; 0 for exact rates."""
         return np.array(
             [self.rows[i].bound if i in self.rows else 0.0 for i in range(self.rates.n)]
         )

@@ -1,4 +1,4 @@
-"""`TaylorModel`: a cubic on a box and a bound of what it leaves out, carried through arithmetic.
+"""`TaylorModel`: a cubic on a box and a bound of its error, carried through arithmetic.
 
 For every d in [-1, 1]^k the value is within `error` of the cubic at d, rounding included.
 Source: Makino and Berz, "Taylor models and other validated functional inclusion methods", 2003.

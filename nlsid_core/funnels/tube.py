@@ -237,6 +237,11 @@ class TubeFunnel:
         """(p,): the least over the tubes, in the outputs' units."""
         return np.asarray(np.min([tube.half_widths for tube in self.tubes], axis=0))
 
+    def widths(self, k: float) -> FloatArray:
+        """(p,): the least over the tubes whose proof covers sample k."""
+        lasting = [tube.half_widths for tube in self.tubes if k < (tube.samples or math.inf)]
+        return np.asarray(np.min(lasting, axis=0))
+
     @property
     def made_for(self) -> tuple[str, str | None]:
         """The digests of the model, and of the policy if there is one."""
@@ -253,7 +258,7 @@ class TubeFunnel:
         return max(tube.rounding for tube in self.tubes)
 
     def start_size(self, x_bar: FloatArray) -> float:
-        """How far out of what may start beside the plan x̄ (n,) is: 1 on its boundary."""
+        """How far out of the allowed starts x̄ (n,) is, beside the plan: 1 on their boundary."""
         return max(tube.start_size(x_bar) for tube in self.tubes)
 
     def document(self) -> Json:

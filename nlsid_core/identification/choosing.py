@@ -146,9 +146,9 @@ class HeldOut:
         if len(groups) == 1:
             on = "stretches of the only excitation"
             folds = list(_folds(_stretches(data.trajectories, STRETCHES), 1))
-        else:  # dealt out by how much the inputs vary, so that no fold has all that vary most
-            on = "excitations"
-            groups = sorted(groups, key=lambda group: float(np.var(group[0].u, axis=0).sum()))
+        else:  # dealt out by how much the inputs vary, so that no fold has all that vary most, and
+            on = "excitations"  # the first fold, on which all are judged, has those most of all
+            groups = sorted(groups, key=lambda group: -float(np.var(group[0].u, axis=0).sum()))
             folds = list(_folds(groups, FOLDS if len(groups) < FEW else 1))
         spread = np.concatenate([trial.y for trial in data]).std(axis=0)
         shortest = min(len(t) for fold in folds for group in fold.judged for t in group)
@@ -163,12 +163,10 @@ class HeldOut:
 
     def error(self, model: Model, stretch: Sequence[Trajectory]) -> float:
         """The mean squared error of a simulation, in squared spreads; infinite if it diverges."""
-        squares = []
         with np.errstate(over="ignore", invalid="ignore"):
-            for trial in stretch:
-                missed = simulate_started(model, trial, self.start) - trial.y
-                squares.append((missed[self.start :] / self.spread) ** 2)
-            error = float(np.mean(np.concatenate(squares)))
+            outputs = zip(stretch, simulate_started(model, stretch, self.start), strict=True)
+            missed = np.concatenate([(y - trial.y)[self.start :] for trial, y in outputs])
+            error = float(np.mean((missed / self.spread) ** 2))
         return error if np.isfinite(error) else np.inf
 
     def apart(self, models: Sequence[Model]) -> float:
@@ -250,7 +248,7 @@ class Choice:
 
     @property
     def promise(self) -> Promise:
-        """The errors on each fold of what the other folds choose.
+        """The errors on each fold of the model that the other folds choose.
 
         The interval is that of as much new data as a fold: the mean of n squared errors and that of
         n/3 new ones differ by a standard deviation of 2 σ/√n, half of it in the root.
@@ -306,15 +304,15 @@ def _start(data: Dataset, shortest: int) -> int:
         model = fitted(shortened(data.trajectories), attempt, data).model
     except (DataError, SolverError):
         return rows[0]
+    parts = [
+        trial.rows(slice(first, first + min(shortest, SAMPLES // FOLDS)))
+        for trial in data.trajectories[:: -(-len(data.trajectories) // ENOUGH)]
+        for first in (int(place * len(trial)) for place in PLACES)
+    ]
     errors = []
     for samples in rows:
-        squares = []
-        for trial in data.trajectories[:: -(-len(data.trajectories) // ENOUGH)]:
-            for first in (int(place * len(trial)) for place in PLACES):
-                part = trial.rows(slice(first, first + min(shortest, SAMPLES // FOLDS)))
-                missed = simulate_started(model, part, samples) - part.y
-                squares.append(np.mean(missed[rows[-1] :] ** 2))
-        errors.append(float(np.mean(squares)))
+        outputs = zip(parts, simulate_started(model, parts, samples), strict=True)
+        errors.append(np.mean([np.mean((y - part.y)[rows[-1] :] ** 2) for part, y in outputs]))
     return next(n for n, e in zip(rows, errors, strict=True) if e <= START_CLOSE * min(errors))
 
 

@@ -13,7 +13,12 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
 from nlsid_core.identification.methods.options import Method
 from nlsid_core.identification.prediction import Model
-from nlsid_core.identification.validation import Validation, simulation_percent, validate
+from nlsid_core.identification.validation import (
+    Validation,
+    simulation_percent,
+    unscored,
+    validate,
+)
 from nlsid_core.models.difference_equation import DifferenceEquation
 from nlsid_core.shown import BLUE, card, line
 
@@ -67,7 +72,8 @@ class Candidate(Generic[M]):
 
     def error_percent(self, dataset: Dataset) -> float:
         """100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation over `dataset`."""
-        return simulation_percent(self.model, dataset, transient=self.transient)
+        n = unscored(dataset, self.transient)
+        return simulation_percent(self.model, dataset, transient=n)
 
     @property
     def unproved(self) -> str:
@@ -76,7 +82,7 @@ class Candidate(Generic[M]):
 
     def validate(self, dataset: Dataset) -> Validation:
         """Simulation and prediction errors and the tests of the residuals over `dataset`."""
-        return validate(self.model, dataset, transient=self.transient)
+        return validate(self.model, dataset, transient=unscored(dataset, self.transient))
 
 
 @dataclass(frozen=True)

@@ -60,21 +60,25 @@ def _simulated(model: Explicit, start: FloatArray, u: FloatArray) -> FloatArray:
     return model.simulate(inputs, start[:, 0])[:, None]
 
 
-def simulate_started(model: Model, trial: Trajectory, samples: int) -> FloatArray:
-    """`simulate_trial` from the start that is nearest to the first samples of the trial."""
+def simulate_started(model: Model, trials: Sequence[Trajectory], samples: int) -> list[FloatArray]:
+    """`simulate_trials` from the starts that are nearest to the first samples of the trials."""
     n = history(model)
     if isinstance(model, CellNetwork):
-        return model.simulate(trial.u, trial.y[: samples or n])
+        return [model.simulate(trial.u, trial.y[: samples or n]) for trial in trials]
     if samples <= n:
-        return simulate_trial(model, trial)
-    beginning = trial.rows(slice(samples))
+        return simulate_trials(model, trials)
 
-    def simulated(starts: FloatArray) -> FloatArray:
-        if isinstance(model, ImplicitModel):
-            return np.stack(simulate_together(model, [_from(s, beginning) for s in starts]))
-        return np.stack([_simulated(model, start, beginning.u) for start in starts])
+    def begun(trial: Trajectory) -> Trajectory:
+        beginning = trial.rows(slice(samples))
 
-    return simulate_trial(model, _from(nearest_start(simulated, beginning.y, n), trial))
+        def simulated(starts: FloatArray) -> FloatArray:
+            if isinstance(model, ImplicitModel):
+                return np.stack(simulate_together(model, [_from(s, beginning) for s in starts]))
+            return np.stack([_simulated(model, start, beginning.u) for start in starts])
+
+        return _from(nearest_start(simulated, beginning.y, n), trial)
+
+    return simulate_trials(model, [begun(trial) for trial in trials])
 
 
 def _from(start: FloatArray, trial: Trajectory) -> Trajectory:

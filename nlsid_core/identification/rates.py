@@ -18,5 +18,5 @@ def rate_of_memory(train: Dataset, trials: float = 1.0) -> float:
 
 
 def searched_rate(max_rate: float) -> float:
-    """The rate that a search keeps, so that the proof of what it finds is at most `max_rate`."""
+    """The rate that a search keeps, so that its model is proved at `max_rate` or faster."""
     return max(1.0 - ROOM * (1.0 - max_rate), 0.5 * max_rate)

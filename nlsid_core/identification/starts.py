@@ -192,7 +192,8 @@ def as_implicit(model: StateAffineModel, rows: ImplicitRows) -> tuple[FloatArray
     for row, target in zip(rows.left.tolist(), e, strict=True):
         if sum(row) == 1:
             target[row.index(1)] = 1.0
-    p = {key: -inverse @ value for key, value in _by_monomial(model).items()}
+    monomials = zip(map(tuple, model.p.exponents.tolist()), model.p.coefficients, strict=True)
+    p = {monomial: -inverse @ value for monomial, value in monomials}
     lagged = np.hstack([-inverse @ g.coefficients[0] for g in model.G[1:]])  # (n_v, states)
     for row, target in zip(rows.right.tolist(), f, strict=True):
         if sum(row) == 1 and any(row[:states]):
@@ -200,7 +201,3 @@ def as_implicit(model: StateAffineModel, rows: ImplicitRows) -> tuple[FloatArray
         elif not any(row[:states]) and tuple(row[states:]) in p:
             target[:] = p[tuple(row[states:])]
     return e, f
-
-
-def _by_monomial(model: StateAffineModel) -> dict[tuple[int, ...], FloatArray]:
-    return dict(zip(map(tuple, model.p.exponents.tolist()), model.p.coefficients, strict=True))

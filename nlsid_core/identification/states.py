@@ -129,7 +129,7 @@ def where_it_fails(model: StateModel, dataset: Dataset) -> str:
     points = np.concatenate([np.hstack([t.y[:-1], t.u[:-1]]) for t in dataset])
     missed = np.concatenate([t.y[1:] - model(t.y[:-1], t.u[:-1]) for t in dataset])
     size = np.sqrt(np.mean((missed / missed.std(axis=0)) ** 2, axis=1))
-    worst, words = 0.0, ""
+    found = [(0.0, "too little data to say where")]
     for j, signal in enumerate((*model.x, *model.u)):
         edges = np.linspace(points[:, j].min(), points[:, j].max(), SLICES + 1)
         for lo, hi in pairwise(edges.tolist()):
@@ -137,20 +137,18 @@ def where_it_fails(model: StateModel, dataset: Dataset) -> str:
             if inside.sum() < len(points) // (4 * SLICES):
                 continue
             ratio = float(size[inside].mean() / size.mean())
-            if ratio > worst:
-                worst = ratio
-                words = (
-                    f"one step ahead it is worst where {signal.name} is in [{lo:.3g}, {hi:.3g}] "
-                    f"{signal.unit}: {ratio:.1f} times the mean error (stick-slip, a limit or an "
-                    "unmeasured state there is no polynomial)"
-                )
-    return words or "too little data to say where"
+            words = (
+                f"one step ahead it is worst where {signal.name} is in [{lo:.3g}, {hi:.3g}] "
+                f"{signal.unit}: {ratio:.1f} times the mean error (stick-slip, a limit or an "
+                "unmeasured state there is no polynomial)"
+            )
+            found.append((ratio, words))
+    return max(found)[1]
 
 
 def monomials_of(degrees: Sequence[int]) -> IntArray:
     """All products with at most these powers, of total degree at most the largest."""
-    powers = product(*(range(d + 1) for d in degrees))
-    rows = [e for e in powers if sum(e) <= max(degrees)]
+    rows = [e for e in product(*(range(d + 1) for d in degrees)) if sum(e) <= max(degrees)]
     return np.array(rows, dtype=np.int64)
 
 
@@ -190,7 +188,6 @@ def _model(
         unit = (exponents == np.eye(exponents.shape[1], dtype=np.int64)[i]).all(axis=1)
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
-    noise = noise_between(groups)
     model = StateModel(
         exponents=exponents,
         coefficients=coefficients,
@@ -199,7 +196,7 @@ def _model(
         u=signals_of(first, "u"),
         x_range=ranges[:n],
         u_range=ranges[n:],
-        noise=noise,
+        noise=noise_between(groups),
         disturbance=np.zeros(n),
         bags=tuple((t.name, t.digest) for group in groups for t in group),
     )

@@ -22,7 +22,7 @@ from nlsid_core.identification.prediction import (
     history,
     learns,
     one_step_residual,
-    simulate_trials,
+    simulate_started,
 )
 from nlsid_core.models import StateAffineModel
 from nlsid_core.shown import Table
@@ -30,6 +30,7 @@ from nlsid_core.shown import Table
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
 LAGS = 20
+STARTED = 20  # samples, a fifth of a trial at most, that show where a simulation starts
 DIVERGED = 1e100  # a residual whose square no sum of squares should meet
 
 
@@ -161,6 +162,11 @@ def validate(model: Model, dataset: Dataset, *, transient: int = 0) -> Validatio
     )
 
 
+def unscored(dataset: Dataset, transient: int = 0) -> int:
+    """First samples of every trial that show where it starts and are not scored."""
+    return max(transient, min(STARTED, min(map(len, dataset)) // 5))
+
+
 def residual_tests(
     residuals: Sequence[FloatArray], inputs: Sequence[FloatArray], lags: int
 ) -> Residual:
@@ -198,7 +204,8 @@ def residual_tests(
 
 def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
-    of their spread; ŷ is simulated from the model's history, n is that or `transient` if longer.
+    of their spread; ŷ is simulated from the start nearest to these n: the model's history, or
+    `transient` if longer.
     """
     return _percent(_simulated(model, dataset, max(history(model), transient)))
 
@@ -206,8 +213,8 @@ def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) ->
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
-        outputs = simulate_trials(model, dataset.trajectories)
-        return [(t.y[first:], y[first:]) for t, y in zip(dataset, outputs, strict=True)]
+        outputs = simulate_started(model, dataset.trajectories, first)
+    return [(t.y[first:], y[first:]) for t, y in zip(dataset, outputs, strict=True)]
 
 
 def _rms(errors: list[FloatArray]) -> float:
@@ -271,8 +278,12 @@ def cross_correlation(
 def compare(data: Dataset, models: Mapping[str, Model]) -> Table:
     """Simulate models on the same trials; a row for each, [name] is its error.
 
-    The error is 100·‖y - ŷ‖/‖y - mean(y)‖ in %, the fit 100 % minus it.
+    The error is 100·‖y - ŷ‖/‖y - mean(y)‖ in %, the fit 100 % minus it. The first samples show
+    where a simulation starts and are not scored (`unscored`).
     """
-    errors = {name: simulation_percent(model, data) for name, model in models.items()}
+    errors = {
+        name: simulation_percent(model, data, transient=unscored(data))
+        for name, model in models.items()
+    }
     rows = {name: (100.0 - error, error) for name, error in errors.items()}
     return Table(("fit [%]", "simulation error [%]"), rows)

@@ -107,7 +107,7 @@ class Node:
         made_for: Mapping[str, str] = NOTHING,
         former: Sequence[str] = (),
     ) -> Members:
-        """The members of a document nlsid/`form`, of one of `kinds` if there are any.
+        """The members of a document nlsid/`form`, whose kind is among `kinds` if any are given.
 
         made_for: the digests, by role, that it has to name. former: kinds that are refused by name.
         """
@@ -218,7 +218,7 @@ class Node:
 
 
 def no_more(node: Node) -> None:
-    """A reader of what left: nothing makes it since version 0.3."""
+    """A reader that refuses a form which left with version 0.3."""
     raise Rejected(f"{node.where} is not decided since version 0.3", "left")
 
 
@@ -233,7 +233,7 @@ def each(reader: Reader, least: int, most: int = MAX_ENTRIES) -> Reader:
 
 
 def one_of(*texts: str, reason: str = "malformed", former: Sequence[str] = ()) -> Reader:
-    """A reader of one of these texts; former ones are refused by name."""
+    """A reader that takes one of these texts; former ones are refused by name."""
 
     def read(node: Node) -> str:
         if node.value in former:

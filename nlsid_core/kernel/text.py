@@ -21,7 +21,7 @@ SHORT = 6  # significant digits of a number that is not
 EXACT = Context(prec=60, Emax=MAX_EMAX, Emin=MIN_EMIN)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Verdict:
     """What is proved: it exists only for a claim that was decided.
 
@@ -45,11 +45,19 @@ class Verdict:
         return str(self.margin) if longest < LONGEST else below(self.margin)
 
     def _repr_html_(self) -> str:
-        return f'<div style="border-left: 5px solid #2e7d32"><pre>{escape(str(self))}</pre></div>'
+        """The same, with a tick."""
+        return (
+            '<div><svg viewBox="0 0 24 24" width="24" fill="none" stroke="#2e7d32">'
+            '<circle cx="12" cy="12" r="10"/><path d="M7 12.5l3.5 3.5L17 9"/></svg>'
+            f"<pre>{escape(str(self))}</pre></div>"
+        )
 
     def __str__(self) -> str:
-        lines = [f"PROVED {self.statement}, margin {below(self.margin)}"]
-        return "\n".join(lines + [f"  assuming {assumption}" for assumption in self.assumptions])
+        return "\n  assuming ".join(
+            [f"PROVED {self.statement}, margin {below(self.margin)}", *self.assumptions]
+        )
+
+    __repr__ = __str__
 
 
 def above(value: Fraction, digits: int = DIGITS) -> str:

@@ -1,4 +1,4 @@
-"""`Controller`: runs a policy on samples as they come; the live twin of what was proved.
+"""`Controller`: runs a policy on samples as they come, as the proof assumes.
 
 Of a tube input k+1 depends on the samples up to k only, so it is known a period before it
 acts. Of the other kinds input k answers sample k and has the period to get there.

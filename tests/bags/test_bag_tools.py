@@ -661,12 +661,25 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
     assert bag_origin(tmp_path / "bag")["custom"] == {"robot": "car"}
 
 
+def test_every_column_is_a_topic_where_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t,voltage [V],yaw rate,2nd=b\n0,1,0.1,7\n0.02,2,0.3,8\n")
+    run("import", tmp_path / "log.csv", "--out", tmp_path / "bag")
+    read = read_signals(
+        tmp_path / "bag", ["/voltage_V:data", "/yaw_rate:data", "/column_2nd_b:data"]
+    )
+    assert [signal.values.tolist() for signal in read.values()] == [[1, 2], [0.1, 0.3], [7, 8]]
+
+
 def import_speed(tmp_path: Path, text: str, rows: Rows) -> str:
     """A bag `bag` of a table's column `speed`; how its times were understood."""
     (tmp_path / "log.csv").write_text(text)
-    types = {ODOM: ODOM_TYPE}
-    out = tmp_path / "bag"
-    return import_table(tmp_path / "log.csv", out, [f"{SPEED}=speed"], types=types, rows=rows).times
+    return import_table(
+        tmp_path / "log.csv",
+        tmp_path / "bag",
+        [f"{SPEED}=speed"],
+        types={ODOM: ODOM_TYPE},
+        rows=rows,
+    ).times
 
 
 @pytest.mark.parametrize(
@@ -741,16 +754,21 @@ def test_a_table_is_read_or_what_is_wrong_is_said(
         ("/arm:posit[0]=a", "Field 'posit' does not exist"),
         ("/arm:position[0]", "is not signal=column"),
         ("/other:position[0]=a", "nothing is assigned to /arm"),
+        ("", "make one topic: name them"),
     ],
 )
 def test_an_import_that_does_not_fit_is_refused_and_writes_nothing(
     tmp_path: Path, assignment: str, message: str
 ) -> None:
-    (tmp_path / "log.csv").write_text("a,b\n0,0\n1,1\n")
-    types = {"/arm": JOINT_TYPE}
-    file = tmp_path / "log.csv"
+    (tmp_path / "log.csv").write_text("a,b,b?\n0,0,0\n1,1,1\n")
     with pytest.raises(DataError, match=message):
-        import_table(file, tmp_path / "x", [assignment], types=types, rows=Rows(period=1.0))
+        import_table(
+            tmp_path / "log.csv",
+            tmp_path / "x",
+            [assignment] * bool(assignment),
+            types={"/arm": JOINT_TYPE},
+            rows=Rows(period=1.0),
+        )
     assert os.listdir(tmp_path) == ["log.csv"]  # noqa: PTH208
 
 

@@ -305,7 +305,6 @@ def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> No
         "joint_states position joint_0 washed out",
     )
     assert f"{position} seems to add up its command, so |washout(2 s) of it is proposed" in said
-    assert "is in no model class" not in said
     assert "named by you" not in said, "nobody named what is proposed"
     assert re.search(r"expect an error in simulation of [0-9.]+ to [0-9.]+ % .*: good", said)
     assert "inside" in whole_way(bags, config, tmp_path / "out")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
-from bags.pictures.tubes import draw_free_run, draw_tube, state_pairs, write_tube
-from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.designs import AnyDesign, Design
+from bags.pictures.tubes import draw_free_run, state_pairs, write_tube
+from nlsid import Dataset, Design, Trajectory, plot
+from nlsid_core.designs import AnyDesign
 from nlsid_core.identification.states import free_run_error
 from tests.continuous_stage import stage
 from tests.tracked import PERIOD, designed, pendulum
@@ -18,14 +18,23 @@ from tests.tracked import PERIOD, designed, pendulum
 pytestmark = pytest.mark.pictures
 
 
-@pytest.mark.parametrize("make", [designed, lambda: Design(*stage())])
-def test_the_tube_is_drawn_as_wide_as_it_was_proved(make: Any, tmp_path: Path) -> None:
-    design: AnyDesign = make()
-    figure = draw_tube(design)
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda tube: tube,
+        lambda tube: replace(tube, policy=None),
+        lambda _: designed(),
+        lambda _: Design(*stage()),
+    ],
+    ids=["plan", "no plan", "sampled", "continuous"],
+)
+def test_the_tube_is_drawn_as_wide_as_it_was_proved(made: Any, tube: Any, tmp_path: Path) -> None:
+    design: AnyDesign = made(tube)
+    figure = plot(design)
     assert len(figure.axes) == len(design.signals[0])
     for i, axes in enumerate(figure.axes):
-        (tube,) = (c for c in axes.collections if isinstance(c, PolyCollection))
-        points = np.asarray(tube.get_paths()[0].vertices)
+        (drawn,) = (c for c in axes.collections if isinstance(c, PolyCollection))
+        points = np.asarray(drawn.get_paths()[0].vertices)
         first = points[points[:, 0] == points[:, 0].min(), 1]
         assert np.ptp(first) == pytest.approx(2.0 * design.funnel.widths(0)[i])
     write_tube(tmp_path / "tube.png", design)

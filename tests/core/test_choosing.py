@@ -20,6 +20,7 @@ from nlsid_core.identification import (
     Rse,
     Sem,
     identify,
+    simulation_percent,
 )
 from nlsid_core.identification.choosing import HeldOut, fitted, simplest
 from nlsid_core.identification.prediction import simulate_started, simulate_trial
@@ -96,8 +97,13 @@ def test_repeats_of_an_excitation_stay_together_and_others_make_the_promise() ->
 
 
 def test_no_fold_has_all_excitations_that_vary_most() -> None:
-    """Recordings that come in turn, such as a start from rest and two drives, would be one fold."""
+    """Recordings that come in turn, such as a start from rest and two drives, would be one fold.
+
+    All is judged on the first one, so its excitations are the largest.
+    """
     held_out = HeldOut.of(Dataset(tuple(trial(k, size=0.1 if k % 3 else 1.0) for k in range(9))))
+    largest = [float(np.var(fold.judged[0][0].u)) for fold in held_out.folds]
+    assert largest == sorted(largest, reverse=True)
     for fold in held_out.folds:
         names = [group[0].name.split("[")[0] for group in fold.judged]
         assert sum(name.endswith(" 1") for name in names) == 1
@@ -130,20 +136,22 @@ def test_a_simulation_starts_where_the_first_samples_are_nearest(
     model_class: Polynomial, method: Rse
 ) -> None:
     """The same state in scoring and in what runs; the noise of raw starts would be carried on."""
-    model = identify(
+    chosen = identify(
         Dataset(tuple(trial(k) for k in range(4))), model_class, method=method, comparators=()
-    ).model
-    raw, started = 0.0, 0.0
+    ).chosen
+    model, raw, started = chosen.model, 0.0, 0.0
     for first in range(100, 180, 8):
         part = trial(7).rows(slice(first, None))
         truth = clean(trial(7).u[:, 0])[first:, None]
-        found = simulate_started(model, part, 40)
+        [found] = simulate_started(model, [part], 40)
         stepper = Stepper(model)
         x = stepper.begin(part.y[:40], part.u[:40])
         np.testing.assert_allclose(stepper.advance(x[None], part.u[40])[0][0], found[40], atol=1e-9)
         raw += float(np.sum((simulate_trial(model, part) - truth)[40:90] ** 2))
         started += float(np.sum((found - truth)[40:90] ** 2))
     assert started < 0.8 * raw
+    short = Dataset(tuple(trial(7).rows(slice(n, n + 100)) for n in range(100, 180, 8)))
+    assert chosen.error_percent(short) < 0.97 * simulation_percent(model, short)
 
 
 def test_what_has_no_model_says_why_and_too_little_data_are_refused() -> None:

@@ -53,14 +53,20 @@ def random_policy(gain: str, n: int = 3, m: int = 2, knots: int = 6) -> Continuo
 
 def discrete_documents() -> dict[str, Any]:
     """The other kinds of funnels and policies."""
-    assumption = DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),))
     two = np.array([np.eye(2)] * 3)
     ones, trial = np.ones(1), (("trial", "sha256:1"),)
     scaled = Measured(1.0, 2.0, (), trial)
     tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, scaled)
     return {
         "discrete": SampledFunnel(
-            two, two[:2], np.ones(3), np.ones(3), np.ones((3, 2)), assumption, "m", "p"
+            two,
+            two[:2],
+            np.ones(3),
+            np.ones(3),
+            np.ones((3, 2)),
+            DisturbanceAssumption(0.2, 0.1, 2.0, (("run", "sha256:0"),)),
+            "m",
+            "p",
         ),
         "tube": TubeFunnel((tube,), 2, "m", policy="p"),
         "tracking": SampledPolicy(
@@ -123,8 +129,7 @@ def test_an_ellipsoid_is_inside_exactly_up_to_the_boundary() -> None:
     t = funnel.t0 + 0.5
     shape, centre = funnel.shape(t), funnel.nominal(t)
     for scale, inside in ((1.001, True), (0.999, False)):
-        inner, outer = ((centre, scale * shape), (centre, shape))
-        assert (ellipsoid_inside(*inner, *outer) is not None) is inside
+        assert inside is (ellipsoid_inside(centre, scale * shape, centre, shape) is not None)
 
 
 @pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])

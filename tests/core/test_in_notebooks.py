@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from nlsid import (
     Dataset,
     Degrees,
+    Design,
     Fit,
     Polynomial,
     compare,
@@ -26,22 +28,25 @@ from nlsid_core.identification.polynomial.explicit import (
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.prediction import as_state_affine
 from nlsid_core.models import DifferenceEquation, StateAffineModel
+from tests.continuous_stage import stage
 from tests.state_affine_rows import problem
+from tests.tracked import designed
 
 LONGEST = 2000  # characters of what a cell's last line prints
 NOISE, FITS = 0.03, 80  # standard deviation, and how many fits: their spread is known to 8 %
 STEP = 1e-6  # of a coefficient, for finite differences
 
 
-def test_what_a_cell_ends_with_is_short(
+def test_what_a_cell_ends_with_is_short_and_has_a_picture(
     train: Dataset, fit: Fit[DifferenceEquation], design: OutputTubeDesign
 ) -> None:
-    tables = compare(train, {"fitted": fit.model}), standard_errors(fit.model, train)
     trial, held = train.trajectories[0], replay(design, train.trajectories[0])
-    shown = (train, trial, fit, fit.model, design, design.verdict, held, *tables)
+    designs: list[Any] = [design, designed(), Design(*stage(), decision=design.decision)]
+    pictured: tuple[Any, ...] = (train, fit, held, *designs, *(each.verdict for each in designs))
+    shown = (*pictured, trial, fit.model, compare(train, {"fitted": fit.model}))
     assert not [each for each in shown if not 20 < len(repr(each)) <= LONGEST]
-    assert not [each for each in (train, fit, held) if "<svg" not in each._repr_html_()]
-    assert "PROVED tube" in design._repr_html_() == design.verdict._repr_html_()
+    assert not [each for each in pictured if "<svg" not in each._repr_html_()]
+    assert "PROVED tube" in design._repr_html_()
 
 
 def test_data_frames_are_trials(train: Dataset) -> None:
@@ -89,10 +94,9 @@ def test_python_control_steps_like_the_model(fit: Fit[DifferenceEquation]) -> No
     control = pytest.importorskip("control")
     model = replace(fit.model, c=0.0)
     assert to_control(model).output_labels == [model.y.name]
-    stepped = control.step_response(to_control(model), T=np.arange(50) * model.period)
-    inputs = np.concatenate([np.zeros(2), np.ones(50)])
-    simulated = model.simulate(inputs, np.zeros(2))[2:]
-    np.testing.assert_allclose(np.squeeze(stepped.outputs), simulated, atol=1e-9)
+    _, stepped = control.step_response(to_control(model), T=np.arange(50) * model.period)
+    simulated = model.simulate(np.append(np.zeros(2), np.ones(50)), np.zeros(2))[2:]
+    np.testing.assert_allclose(stepped, simulated, atol=1e-9)
 
 
 def changed(model: StateAffineModel, by: float) -> Iterator[StateAffineModel]:

@@ -9,11 +9,13 @@ from xml.etree import ElementTree
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, sources
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-NO_SUBJECT = re.compile(r"(Of|By) ")
+CLUMSY = re.compile(r"^(Of|By) |^What of\b|\bof what\b|\bof one[.,;:]")  # of a docstring's start
 WORDS, SENTENCES = 25, re.compile(r"[.!?:;·]\W|\n\n|\n- ")  # of a sentence, at most
-NO_PROSE = re.compile(
-    r"^(```.*?^```|---.*?^---|:::.*?$|\|.*?$|#.*?$)|`[^`]*`", re.DOTALL | re.MULTILINE
+BLOCKS = re.compile(
+    r"^(```.*?^```|---.*?^---|:::.*?$|\|.*?$|#.*?$|    .*?$)", re.DOTALL | re.MULTILINE
 )
+FORMULAS = re.compile(r"certificate|theory|measured")  # pages where symbols are no words
+SPOKEN, CODE = re.compile(r"[A-Za-z][A-Za-z'-]+"), re.compile(r"`[^`]*`")
 
 
 def public_definitions(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str, Definition]]:
@@ -45,22 +47,30 @@ def test_everything_public_has_a_docstring() -> None:
     assert not silent
 
 
-def test_no_docstring_begins_without_its_subject() -> None:
-    documented = (
-        (source.name, ast.get_docstring(node) or "")
+def test_docstrings_begin_with_a_subject_and_nouns() -> None:
+    begun = (
+        (source.name, (ast.get_docstring(node) or "").partition("\n\n")[0])
         for source in sources(*PACKAGES)
         for node in ast.walk(source.tree)
-        if isinstance(node, Definition)
+        if isinstance(node, Definition) and source.name != "nlsid_core.running.tubes"
     )
-    assert not [found for found in documented if NO_SUBJECT.match(found[1])]
+    assert not [found for found in begun if CLUMSY.search(found[1])]
 
 
-def test_sentences_of_what_is_read_first_are_short() -> None:
-    names = ("README", *(f"docs/{each}" for each in ("index", "install", "choosing", "tutorial-*")))
-    texts = (page.read_text() for name in names for page in ROOT.glob(f"{name}.md"))
-    sentences = [each for text in texts for each in SENTENCES.split(NO_PROSE.sub("X", text))]
-    assert len(sentences) > 200
-    assert not [each for each in sentences if len(each.split()) > WORDS]
+def test_sentences_of_pages_are_short() -> None:
+    """Of all but `verified.md`, which states theorems to those who read Coq."""
+    pages = {ROOT / "README.md", *ROOT.glob("docs/*.md")} - {ROOT / "docs" / "verified.md"}
+    sentences = [
+        (page.name, each)
+        for page in pages
+        for each in SENTENCES.split(CODE.sub("X", BLOCKS.sub("\n\n", page.read_text())))
+    ]
+    assert len(sentences) > 2000
+    assert not [
+        (name, each)
+        for name, each in sentences
+        if len(SPOKEN.findall(each) if FORMULAS.match(name) else each.split()) > WORDS
+    ]
 
 
 def test_every_public_signature_says_what_it_takes() -> None:
@@ -71,8 +81,11 @@ def test_every_public_signature_says_what_it_takes() -> None:
             if isinstance(node, ast.ClassDef):
                 continue
             given = node.args
-            arguments = [a for a in given.posonlyargs + given.args if a.arg not in ("self", "cls")]
-            arguments += [*given.kwonlyargs, *([given.vararg] if given.vararg else [])]
+            arguments = [
+                *(a for a in given.posonlyargs + given.args if a.arg not in ("self", "cls")),
+                *given.kwonlyargs,
+                *([given.vararg] if given.vararg else []),
+            ]
             anything = given.vararg and ast.unparse(given.vararg.annotation or ast.Name("Any"))
             if (
                 given.kwarg
@@ -107,7 +120,6 @@ def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
 
 def test_the_version_is_the_same_everywhere() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    package = ElementTree.parse(ROOT / "package.xml").getroot()
-    assert package.findtext("version") == version
+    assert ElementTree.parse(ROOT / "package.xml").getroot().findtext("version") == version
     headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert version in headings[:2], "the newest release, below Unreleased if there is one"

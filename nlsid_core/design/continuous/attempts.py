@@ -161,7 +161,7 @@ def _finer(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
 
 
 def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
-    """P(t) of what a pushed linear loop reaches, if w stopped the last; None if it misses the goal.
+    """P(t) of a pushed linear loop's reach, if w stopped the last; None if it misses the goal.
 
     Where P turns fast on some intervals, there are more knots.
     """

@@ -247,7 +247,7 @@ class LSteps:
 
     @property
     def radius(self) -> FloatArray:
-        """(n_w,) half of what each w may be."""
+        """(n_w,) half the range of each w."""
         return np.asarray(np.ptp(self.field.uncertain, axis=1) / 2)
 
     def _from_defect(self, section: Section, rho: float) -> FloatArray:

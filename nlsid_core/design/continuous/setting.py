@@ -158,7 +158,7 @@ def limits_of(limits: ArrayLike | None, m: int) -> FloatArray:
 
 
 def valid_rows(limits: FloatArray, n: int) -> FloatArray:
-    """Rows (input, low, high) as rows of what a field of n states says is valid."""
+    """Rows (input, low, high) as rows of `VectorField.valid` for n states."""
     return np.column_stack([n + limits[:, 0], limits[:, 1:]])
 
 

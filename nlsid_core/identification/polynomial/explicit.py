@@ -91,10 +91,10 @@ def minimise_simulation_error(
 
 def _is_stable(problem: StateAffineRows, theta: FloatArray) -> bool:
     """Every pole is within the radius, up to rounding."""
-    radius = min(problem.slowest, SLOWEST_POLE)
     if not theta[0]:
         return False
-    return bool((np.abs(poles_of(theta, len(problem.y_scale[0]))) <= radius + POLE_ROUNDING).all())
+    radius = min(problem.slowest, SLOWEST_POLE) + POLE_ROUNDING
+    return bool((np.abs(poles_of(theta, len(problem.y_scale[0]))) <= radius).all())
 
 
 def _minima(problem: StateAffineRows, starts: list[FloatArray], method: Sem) -> Model:
