@@ -126,7 +126,7 @@ def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: Fit
     read = read_signals(bag, [*u_names, *y_names], sort=True)
     commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
     doubts = [samples.doubt(responds=name in y_names) for name, samples in read.items()]
-    look.findings += [Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt]
+    look.findings.extend(Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt)
     for samples in measured:
         look.findings.extend(_regularity(samples))
         look.findings.extend(_range(samples))

@@ -382,7 +382,7 @@ class _Parquet:
         self._writer.write_table(pyarrow.table(dict(table), self._writer.schema))
 
     def _type(self, name: str, column: Numbers) -> Any:
-        """Of texts and arrays as stated, of numbers as they are after their operations."""
+        """Arrow's type of texts and arrays as stated, of numbers after their operations."""
         import pyarrow
 
         if column.dtype != object:
