@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 18_034,
     ("bags",): 11_915,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_337,
+    ("tests",): 22_335,
     ("benchmarks", "examples"): 3_796,
 }
 ARGUMENTS, FIELDS = 6, 8
