@@ -20,11 +20,11 @@ Place = Literal["outside upper left", "outside upper right", "outside lower left
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an <svg> element to put into a page."""
+    """The figure as an element to put into a page, in which a narrow window can scroll."""
     stream = io.StringIO()
     _laid_out(figure).savefig(stream, format="svg")
     text = stream.getvalue()
-    return text[text.index("<svg") :]
+    return f'<div class="picture">{text[text.index("<svg") :]}</div>'
 
 
 def png(figure: Figure) -> bytes:

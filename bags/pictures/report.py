@@ -26,9 +26,12 @@ th, td { white-space: nowrap } .left td { white-space: normal }
 th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
 ul { padding-left: 1.2rem }
-tbody tr { border-bottom: 1px solid #ddd } pre { font-size: .8rem; overflow-x: auto }
+tbody tr { border-bottom: 1px solid #ddd } td code { white-space: nowrap }
+pre { font-size: .8rem; overflow-x: auto } .picture { overflow-x: auto }
+@media screen and (min-width: 62rem) { pre { white-space: pre-wrap } }
 @media screen and (max-width: 40rem) { body { font-size: 14px } pre { font-size: 7.5px }
-  table { display: block; overflow-x: auto } th, td { padding: .25rem .4rem } }
+  table { display: block; overflow-x: auto } th, td { padding: .25rem .4rem }
+  .picture svg { max-width: none; width: 48rem } }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
 """

@@ -16,10 +16,9 @@ from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.graded import monomials_of, positions
-from nlsid_core.design.continuous.lstep import LSteps, Section, section_at
+from nlsid_core.design.continuous.lstep import Ends, LSteps, Section, section_at
 from nlsid_core.design.continuous.pieces import end_proof
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, solve_ends
-from nlsid_core.design.continuous.sweep import Ends
 from nlsid_core.errors import Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values

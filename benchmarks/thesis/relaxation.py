@@ -10,8 +10,8 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.design import ContinuousTracking
-from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.setting import prepare
+from nlsid_core.design.continuous.sweep import swept, wanted_of
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.progress import Progress, silent

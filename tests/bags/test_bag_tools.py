@@ -90,9 +90,15 @@ def test_verbs_are_few_and_an_option_means_the_same_in_all_of_them() -> None:
                 assert not parameter.required, f"{name} {parameter.name} has to be given"
                 for flag in parameter.opts:
                     said.setdefault(flag, set()).add(parameter.opts[0])
-                if parameter.opts[0] in ("--response", "--excitation", "--clock", "--json"):
+                if parameter.opts[0] in (
+                    "--response",
+                    "--excitation",
+                    "--clock",
+                    "--json",
+                    "--verbose",
+                ):
                     said.setdefault(f"help of {parameter.opts[0]}", set()).add(parameter.help)
-    assert {"-y", "-u", "--clock", "--json", "--out"} <= set(said)
+    assert {"-y", "-u", "--clock", "--json", "--out", "--verbose"} <= set(said)
     assert not {flag: names for flag, names in said.items() if len(names) > 1}
 
 

@@ -292,7 +292,7 @@ def test_a_browser_shows_a_recording_that_is_over_as_it_ended(page: Page, watche
         page.open(address)
         page.wait(lambda: page.text("#word").lower() == "recording over")
         assert page.text("#why").startswith("verdict: inside")
-        assert page.text("#n-age") == "the last"
+        assert (page.text("#n-age"), page.text("#n-margin")) == ("the last", "0.500")
         assert page.value("document.body.className") == ""
         page.value("document.querySelector('#play').click()")
         page.wait(lambda: page.text("#shown").endswith("before the newest"))

@@ -7,7 +7,6 @@ from traceback import extract_tb
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.dynamics import Nominal
 from nlsid_core.dynamics.taylor import Cubic, Rates, field_of
 from nlsid_core.dynamics.vector_field import VectorField
@@ -16,6 +15,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 
 ROOM = 1 + 1e-6  # of the box over the funnel: the checker decides in rationals
 LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
+LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
 BACK = 0.8  # of ρ, where a box is too wide, or the interval before cannot take it
 HALVINGS = 6  # of an interval on which the motion's own box is too wide: then it is not the box
 PACKAGE = Path(__file__).parents[2]  # lines of code outside are those of who wrote the equations

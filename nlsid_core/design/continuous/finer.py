@@ -34,15 +34,13 @@ def lost(setting: Setting) -> FloatArray:
     t, h = policy.t, np.diff(policy.t)
     found = np.zeros(len(h))
     for k in range(len(h)):
-        root = np.linalg.inv(np.linalg.cholesky((P[k] + P[k + 1]) / 2))
         for s in (0.0, 0.5, 1.0):
             when = float(t[k] + np.clip(s, ENDS, 1 - ENDS) * h[k])
             A, B = field.jacobians(when, policy.x(when), policy.u(when))
             here = (1 - s) * P[k] + s * P[k + 1]
             along = here @ (A - B @ policy.K(when))
             falls = -(h[k] * (along + along.T) + P[k + 1] - P[k])
-            if s != 0.5:
-                root = np.linalg.inv(np.linalg.cholesky(here))
+            root = np.linalg.inv(np.linalg.cholesky(here))
             found[k] = max(found[k], -float(np.linalg.eigvalsh(root @ falls @ root.T)[0]))
     return found
 
@@ -61,36 +59,24 @@ def most_knots(count: int) -> int:
 def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | None:
     """(K-1,) the intervals to halve after a refusal; None if there are enough knots already.
 
-    nearby: of the motion. All of them while that is possible, but near its time if V falls at its
-    instant; else also, of those before it, the ones on which the motion moves farthest in what was
-    tried there.
+    nearby: of the motion. All of them, the nearest to its time first; only those near it if V falls
+    at its instant, and only those that are not proved if V falls at every knot.
     """
-    t, x = setting.policy.t, setting.policy.x.control
-    K = len(t)
-    diagnosis = refusal.diagnosis if isinstance(refusal, NoFunnel) else None
-    alone = isinstance(refusal, Unproved) or (
-        diagnosis is not None and diagnosis.dominant == "knots"
-    )
-    if 2 * K - 1 <= MOST_KNOTS and not alone:
-        return np.ones(K - 1, dtype=bool)
-    when = refusal_time(refusal)
-    if when is None or K >= MOST_KNOTS:
+    t, when = setting.policy.t, refusal_time(refusal)
+    if when is None or len(t) >= MOST_KNOTS:
         return None
+    chosen = np.ones(len(t) - 1, dtype=bool)
     if isinstance(refusal, Unproved):
-        return _first(refusal.intervals, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - K)
-    around = nearby * float(t[-1] - t[0])
-    chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
-    if diagnosis is not None and not alone:
-        moved = (np.ptp(x, axis=1) / np.asarray(diagnosis.widths)).max(axis=1)
-        chosen |= (t[:-1] <= when) & (moved > 1)
-    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - K)
+        chosen = refusal.intervals
+    elif isinstance(refusal, NoFunnel) and refusal.diagnosis.dominant == "knots":
+        around = nearby * float(t[-1] - t[0])
+        chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
+    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - len(t))
 
 
 def refusal_time(refusal: Infeasible) -> float | None:
     """When in the motion something was refused; None if it says nothing about that."""
-    if isinstance(refusal, Unproved):
-        return refusal.t
-    return refusal.t if isinstance(refusal, NoFunnel) else None
+    return refusal.t if isinstance(refusal, NoFunnel | Unproved) else None
 
 
 def _first(chosen: BoolArray, order: FloatArray, count: int) -> BoolArray:

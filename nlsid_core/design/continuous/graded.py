@@ -6,7 +6,7 @@ a convolution), M_q monomials of degree q in z. Parts of one polynomial may diff
 """
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, reduce
 from math import comb
 from typing import TypeAlias
 
@@ -120,17 +120,6 @@ def _positions(rows: bytes, among: bytes, size: int) -> IntArray:
 @lru_cache(maxsize=4096)
 def _restriction(S: int, level: int, index: int) -> FloatArray:
     """(S+1, S+1) row k: s^k r^(S-k) written in σ^j τ^(S-j);  for S·level ≤ 53."""
-    whole = 2**level
-    # s = (iτ + (i+1)σ)/2^level, r = ((2^level - i)τ + (2^level - i - 1)σ)/2^level; σ⁰ first.
-    s, r = [index, index + 1], [whole - index, whole - index - 1]
-    rows = []
-    for k in range(S + 1):
-        row = [1]
-        for factor in [s] * k + [r] * (S - k):
-            row = [
-                (row[j] * factor[0] if j < len(row) else 0)
-                + (row[j - 1] * factor[1] if j > 0 else 0)
-                for j in range(len(row) + 1)
-            ]
-        rows.append([entry / whole**S for entry in row])
-    return np.array(rows)
+    s = np.array([index, index + 1]) / 2**level  # s = s_0 τ + s_1 σ, and r = 1 - s so, too
+    factors = [k * [s] + (S - k) * [1 - s] for k in range(S + 1)]
+    return np.array([reduce(np.convolve, row, np.ones(1)) for row in factors])

@@ -13,11 +13,11 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.expanded_sweep import swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.design.continuous.setting import Setting
+from nlsid_core.design.continuous.sweep import swept, wanted_of
 from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel

@@ -91,6 +91,14 @@ def refuse_degree(field: VectorField) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """One interval's L-steps: solutions at its start and end per vertex; margins include ρ̇/ρ."""
+
+    start: list[SphereSolution]
+    end: list[SphereSolution]
+
+
 def corners_of(boxed: Sequence[bool]) -> FloatArray:
     """(corners, entries) of ±1 for the entries that have a box, else 0; the last changes first."""
     corners = list(product(*((-1.0, 1.0) if one else (0.0,) for one in boxed)))

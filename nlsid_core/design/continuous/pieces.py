@@ -6,6 +6,7 @@ which no proof is found is halved, with a new L-step in its middle. `witnesses` 
 for the kernel, which decides.
 """
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -14,8 +15,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.design.continuous.closed_loop import SHARED, Pieces, batches, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
-from nlsid_core.design.continuous.lstep import LSteps, section_at
-from nlsid_core.design.continuous.sweep import Ends
+from nlsid_core.design.continuous.lstep import Ends, LSteps, section_at
 from nlsid_core.design.continuous.witnesses import (
     affine,
     documents,
@@ -30,6 +30,7 @@ from nlsid_core.polynomial.maps import monomials
 from nlsid_core.sos.sphere import ONE, SphereProgram, SphereSolution
 
 MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
+ENDS = 2  # parts of an interval that may fail at one level: of more, smaller ones fail as well
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def prove_pieces(
     *,
     kept: Proved | None = None,
 ) -> Proved:
-    """A proof for all time, or parts on which there is none.
+    """A proof for all time, or the first part on each interval where there is none.
 
     ends: L-steps at the ends of the intervals, where they are at hand. kept: pieces that are proved
     already.
@@ -88,11 +89,12 @@ def prove_pieces(
         done = [(replace(kept.pieces, kappa=steps.kappa), kept.margins)]
         over = set(kept.pieces.interval.tolist())
     waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1) if k not in over]
-    unproved: list[Part] = []
+    unproved: dict[int, Part] = {}
     while waiting:
-        solved = [_solved(steps, funnel, part, known) for part in waiting]
-        unproved += [part for part, good in zip(waiting, solved, strict=True) if not good]
-        waiting = [part for part, good in zip(waiting, solved, strict=True) if good]
+        for part in waiting:  # the rest of an interval is of no use without it
+            if part.interval not in unproved and not _solved(steps, funnel, part, known):
+                unproved[part.interval] = part
+        waiting = [part for part in waiting if part.interval not in unproved]
         if not waiting:
             break
         pieces = rounded(_pieces(steps, funnel, waiting, known))
@@ -107,9 +109,14 @@ def prove_pieces(
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
         failed = [part for part, good in zip(waiting, by_part.tolist(), strict=True) if not good]
-        unproved += [part for part in failed if part.level == MAX_LEVEL]
-        waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
-    return Proved(*_joined(steps, done), unproved=tuple(unproved))
+        count = Counter(part.interval for part in failed)
+        for part in failed:
+            if part.level == MAX_LEVEL or count[part.interval] > ENDS:
+                unproved[part.interval] = part
+        waiting = [
+            half for part in failed if part.interval not in unproved for half in part.halves()
+        ]
+    return Proved(*_joined(steps, done), unproved=tuple(unproved.values()))
 
 
 def _solved(

@@ -13,7 +13,6 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
-from nlsid_core.design.continuous.expanded_sweep import Swept, swept, wanted_of
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.finer import Unproved
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
@@ -25,7 +24,7 @@ from nlsid_core.design.continuous.held_sweep import (
 )
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import Again, Wanted
+from nlsid_core.design.continuous.sweep import Swept, Wanted, swept, wanted_of
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -180,5 +179,5 @@ def _proved(setting: Setting, wanted: Wanted, progress: Progress) -> Found:
         )
         kept, margins = shown, np.where(left, LARGER, 1.0) * wanted.margins
         wanted = replace(wanted, margins=margins)
-        again = Again(made.rho, made.ends, int(np.flatnonzero(left)[-1]))
+        again = made._replace(last=int(np.flatnonzero(left)[-1]))
     raise refusal

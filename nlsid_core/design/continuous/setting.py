@@ -9,7 +9,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.expansion import Expansion
+from nlsid_core.design.continuous.expansion import LOWEST, Expansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     LSteps,
@@ -17,7 +17,6 @@ from nlsid_core.design.continuous.lstep import (
     section_at,
 )
 from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
-from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
 from nlsid_core.design.continuous.witnesses import affine
 from nlsid_core.dynamics import Nominal, Rates, VectorField
@@ -226,7 +225,8 @@ def refuse_saturated(nominal: Nominal, limits: FloatArray) -> None:
         if not (low < least and most < high):
             raise DataError(
                 f"the nominal's input {int(i)} needs [{least:.6g}, {most:.6g}], its limits are "
-                f"[{low:g}, {high:g}]: no room is left to correct anything"
+                f"[{low:g}, {high:g}]: no room is left to correct anything. Plan it within the "
+                "limits (`limits` of plan_motion), or in more seconds"
             )
 
 

@@ -10,10 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from nlsid_core.design.continuous.lstep import LSteps, section_at
+from nlsid_core.design.continuous.lstep import Ends, LSteps, section_at
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Setting
-from nlsid_core.design.continuous.sweep import Ends
 from nlsid_core.design.continuous.validity import validity_caps
 from nlsid_core.design.continuous.vstep import improved
 from nlsid_core.errors import Infeasible, SolverError

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.lstep import LSteps, Section, coordinates, section_at
-from nlsid_core.design.continuous.sweep import Ends
+from nlsid_core.design.continuous.lstep import Ends, LSteps, Section, coordinates, section_at
 from nlsid_core.design.continuous.validity import validity_rows
 from nlsid_core.design.continuous.vstep_program import ShapeProgram
 from nlsid_core.funnels.continuous import ContinuousFunnel
