@@ -68,9 +68,11 @@ def _read_back(out: Path) -> tuple[dict[str, int], list[str]]:
                     lost.append(f"{topic}: its messages are kept, and cannot be read: {why}")
             found[topic] = found.get(topic, 0) + len(batch)
             sequences.setdefault((topic, bag.strands[channel.key]), []).append(batch.sequence)
-    for (topic, _), parts in sequences.items():
-        if gaps := missing(np.concatenate(parts)):
-            lost.append(f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost")
+    lost += [
+        f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
+        for (topic, _), parts in sequences.items()
+        if (gaps := missing(np.concatenate(parts)))
+    ]
     return found, lost
 
 

@@ -93,7 +93,10 @@ class DifferenceEquation(Recorded):
         return self.a * self.c
 
     def state_after(self, y: ArrayLike, u: ArrayLike) -> FloatArray:
-        """The state (n,) that the last n samples y(t-n)…y(t-1), u(t-n)…u(t-1) determine."""
+        """The state (n,) that the last n samples y(t-n)…y(t-1), u(t-n)…u(t-1) determine.
+
+        Sums go from the newest sample to the oldest, one after another, as in the monitor in C.
+        """
         y_lags, u_lags = np.asarray(y, dtype=np.float64), np.asarray(u, dtype=np.float64)
         n = len(self)
         if y_lags.shape != (n,) or u_lags.shape != (n,):
@@ -101,8 +104,8 @@ class DifferenceEquation(Recorded):
         newest = slice(None, None, -1)
         return np.array(
             [
-                np.dot(self.a[i:], y_lags[newest][: n - i])
-                + np.dot(self.b[i + 1 :], u_lags[newest][: n - i])
+                np.cumsum(self.a[i:] * y_lags[newest][: n - i])[-1]
+                + np.cumsum(self.b[i + 1 :] * u_lags[newest][: n - i])[-1]
                 for i in range(n)
             ]
         )
