@@ -396,8 +396,7 @@ def test_a_sabotaged_trial_is_caught_and_named(
     chain: Path, tmp_path: Path, name: str, fault: str
 ) -> None:
     write_faulty_copy(trial(name), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS[fault])
-    result = replay(chain, tmp_path / "bag")
-    bad = result.first_bad
+    bad = replay(chain, tmp_path / "bag").first_bad
     assert bad is not None
     assert bad.status in (Status.OUTSIDE, Status.ASSUMPTION_VIOLATED)
     assert f"at t = {bad.t:g} s" in bad.reason

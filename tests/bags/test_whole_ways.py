@@ -227,6 +227,7 @@ def test_an_unknown_simulated_robot_is_an_error(tmp_path: Path) -> None:
     config.write_text(text.replace("  robot: pendulum\n", "  robot: pendulums\n"))
     said = nlsid("demo", "--robot", config, "--out", tmp_path, status=None)
     assert "there are: pendulum, arm" in said
+    assert "is not this demo's" in nlsid("demo", "--out", tmp_path, status=None)  # nothing is lost
 
 
 @pytest.mark.slow
