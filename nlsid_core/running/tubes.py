@@ -354,7 +354,7 @@ class TubeRun:
     def _used(
         self, t: float, lasting: list[int], limits: "list[Limits]", innovations: Rows
     ) -> tuple[float, str]:
-        """The most of what the tubes that last assume that is used, and what is exceeded."""
+        """The largest share that is used of the lasting tubes' assumptions; what is exceeded."""
         spent, most = max((self._spent[j] / limits[j].level, j) for j in lasting)
         peak, sharpest = max((limits[j].sharpest(innovations[j]), j) for j in lasting)
         used = max(spent, peak)
