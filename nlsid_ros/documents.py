@@ -122,9 +122,8 @@ class DesignSubscription:
             self._check = None
 
     def _subscribe(self) -> None:
-        topic = f"{self._node.values.source}/design"
         self._subscription = self._node.create_subscription(
-            String, topic, self._on_bundle, qos.DOCUMENT
+            String, f"{self._node.values.source}/design", self._on_bundle, qos.DOCUMENT
         )
 
     def _on_bundle(self, message: String) -> None:
@@ -148,7 +147,9 @@ class DesignSubscription:
         count = self._node.count_publishers(topic)
         if count > 1:
             if not self._crowded:
-                self._refuse(f"{topic} has {count} publishers; stop all but one")
+                self._refuse(
+                    f"{topic} has {count} publishers; stop all but one, or wait if one died"
+                )
             self._crowded = True
             self._waiting = None
         elif self._crowded and count == 1:  # which the one that is left has published is not known

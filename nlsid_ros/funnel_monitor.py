@@ -192,8 +192,9 @@ class FunnelMonitor(ManagedNode):
         self._unfit_commands.clear()
         self._heard_ns.clear()
         self._forget()
-        self._tell(f"no {design.name} yet")
-        self.get_logger().info(f"watching {watch.pairing}")
+        heard = ", ".join(sorted(topic.name for topic in self._topics.values()))
+        self._tell(f"no {design.name} yet; listening on {heard}")
+        self.get_logger().info(f"watching {watch.pairing}, on {heard}")
         if self.values.forecast and not watch.monitor.goes_on:
             self.get_logger().warning("no forecasts: they are of tubes around a simulation")
         self._begin()

@@ -86,7 +86,9 @@ class FunnelPublisher(ManagedNode):
         self._report()
 
     def _report(self) -> None:
-        self.report(*self._said, {})
+        level, said = self._said
+        message, _, assuming = said.partition("\n")
+        self.report(level, message, {"assuming": assuming.strip()})
 
 
 main = entry_point(FunnelPublisher)

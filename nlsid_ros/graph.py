@@ -46,8 +46,7 @@ def _name(endpoint: TopicEndpointInfo) -> str:
 
 def namesakes(node: Node) -> str:
     """Say that other nodes have the same name as this one; empty if none has."""
-    own = (node.get_name(), node.get_namespace())
-    count = node.get_node_names_and_namespaces().count(own)
+    count = node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace()))
     if count < 2:
         return ""
     return f"{count} nodes are called {node.get_fully_qualified_name()}; stop all but one"

@@ -167,8 +167,7 @@ def _filled(kind: Any, content: Any, source: str) -> Any:
     try:
         kind(check_fields=True, **fields)  # lengths, and ranges of numbers
     except (AssertionError, TypeError, ValueError, OverflowError) as error:
-        reason = str(error).partition(" and each ")[0]
-        raise BagError(f"{source}: {reason}") from error
+        raise BagError(f"{source}: {str(error).partition(' and each ')[0]}") from error
     return kind(**fields)
 
 

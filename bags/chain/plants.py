@@ -111,8 +111,9 @@ class Plant:
     def measure(self, _torque: ArrayLike = 0.0, /) -> FloatArray:
         """(2n,) the state as the encoders see it, whatever the torque."""
         n = self.robot.joints
-        sizes = np.repeat([ANGLE_NOISE, RATE_NOISE], n)
-        return self.state + sizes * self._rng.standard_normal(2 * n)
+        return self.state + np.repeat([ANGLE_NOISE, RATE_NOISE], n) * self._rng.standard_normal(
+            2 * n
+        )
 
     def step(self, torque: ArrayLike, push: ArrayLike = 0.0, /) -> None:
         """Hold `torque` (n,), cut to the drives' limits, for one sample; `push` in N·m is added."""

@@ -55,8 +55,7 @@ def load_problem(path: Path) -> ContinuousTracking:
         if name in kinds:
             options[name] = files.member(document, name, kinds[name], source=source)
         else:
-            shape = shapes.get(name, (None, 3))
-            options[name] = files.array(document, name, shape, source=source)
+            options[name] = files.array(document, name, shapes.get(name, (None, 3)), source=source)
     goal = files.member(document, "goal", dict, source=source)
     centre = files.array(goal, "centre", (field.n,), source=source)
     P = files.array(goal, "P", (field.n, field.n), source=source)

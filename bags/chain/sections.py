@@ -123,7 +123,8 @@ def _problem(details: ErrorDetails, kind: type[Section]) -> str:
         if section is not None and (unit := _unit(section, key)):
             message = f"{message}, in {unit}"
     said = f"{'.'.join(where)}: {message}"
-    return said if message == "Field required" else f"{said} (found {found!r:.60})"
+    is_of_key = message == "Field required" or details["type"] == "extra_forbidden"
+    return said if is_of_key else f"{said} (found {found!r:.60})"
 
 
 def no_such_key(key: str, known: Iterable[str]) -> str:

@@ -7,13 +7,14 @@ package, where ROS looks for them.
 
 from pathlib import Path
 
+from bags.recordings.names import listed
 from nlsid_core.errors import DataError
 
 
 def config_file(name: str) -> Path:
     """The shipped configuration called `name`, such as `f1tenth.yaml`.
 
-    Raises DataError, with the places searched, when no such file was installed.
+    Raises DataError, with the names that there are, when no such file was installed.
     """
     return shipped_file("config", name)
 
@@ -26,5 +27,5 @@ def shipped_file(folder: str, name: str) -> Path:
     for place in places:
         if (place / name).is_file():
             return place / name
-    searched = ", ".join(str(place) for place in places)
-    raise DataError(f"no {folder} file '{name}' was installed; searched {searched}")
+    there = sorted({file.name for place in places for file in place.glob("*")})
+    raise DataError(f"no {folder} file '{name}' is installed; there are: {listed(there)}")

@@ -30,8 +30,7 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
     """
     data, options = read_signals_of(bags, config), config.identification
     validation = data.select(options.validation)
-    train = data.without(options.validation)
-    fit = identify_states(train, validation, degrees=options.degrees)
+    fit = identify_states(data.without(options.validation), validation, degrees=options.degrees)
     files.write_document(out / documents.MODEL, fit.model.document())
     if report_available():
         from bags.pictures import plots, tubes  # matplotlib only where something is drawn

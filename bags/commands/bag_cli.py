@@ -307,7 +307,7 @@ def import_command(
 
 def _say_notes(notes: "Sequence[str]") -> None:
     for note in notes:
-        out.print(f"not as stated: {note}", soft_wrap=True)
+        out.print(f"note: {note}", soft_wrap=True)
 
 
 def _beside(bag: Path, what: str) -> Path:

@@ -85,7 +85,12 @@ def run_demo(out: Path, console: Console, robot: str) -> bool:
 def _driven(out: Path, console: Console, shown: Shown) -> bool:
     """Run every step on recordings that ship: what was found, and what it means."""
     out.mkdir(parents=True, exist_ok=True)
-    shutil.copy(config_file(shown.config), out / CONFIG)
+    config = config_file(shown.config).read_bytes()
+    if any(out.iterdir()) and not (
+        (out / CONFIG).is_file() and (out / CONFIG).read_bytes() == config
+    ):
+        raise DataError(f"{out} is there already and is not this demo's: give another --out")
+    (out / CONFIG).write_bytes(config)
     settings = load_config(out / CONFIG)
 
     bags = shown.bags[0].parent

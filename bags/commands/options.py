@@ -46,7 +46,11 @@ class Clock(StrEnum):
 def _folder(path: Path) -> Path:
     """Refuse a file in the place of a folder."""
     if path.is_file():
-        raise DocumentError(f"{path} is a file: give the design's folder, {path.parent}")
+        known = any((path.parent / name).is_file() for name in (CONFIG, "model.json"))
+        raise DocumentError(
+            f"{path} is a file: give the design's folder"
+            f"{f', {path.parent}' if known else ' that `nlsid learn` or `nlsid identify` wrote'}"
+        )
     return path
 
 

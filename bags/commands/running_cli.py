@@ -52,6 +52,7 @@ def monitor(
 
     Status 0: every bag is inside, and its errors are as small as assumed. Status 1: one is not, or
     raises the CUSUM alarm. Status 2: something was not judged. A tube of one output is drawn too.
+    Of a bag with other topic names make a copy: `nlsid bag convert BAG --out NEW --rename OLD=NEW`.
     Bags that the design was made with are left out where there are others. -y, -u and --period
     say where state and input of a continuous funnel are.
     """
@@ -122,7 +123,11 @@ def run(
         raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
     given = arguments or []
     if given and ":=" not in given[0]:  # a design's folder
-        given[0] = f"funnel:={Path(given[0]).absolute()}"
+        design = Path(given[0]).absolute()
+        proofs = (design if design.is_dir() else design.parent).glob("*.proof.json")
+        if workflow in ("monitor", "control") and not any(proofs):
+            raise typer.BadParameter(f"{given[0]}: no design is there; `nlsid learn` makes one")
+        given[0] = f"funnel:={design}"
     commands = launch_file(workflow).commands(given)
     raise typer.Exit(run_together(commands, respawn="respawn:=true" in given))
 

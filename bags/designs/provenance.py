@@ -118,16 +118,19 @@ def _judged(
         if bound < needed
     ]
     rank, count = given.get("rank", 1), distinct(trials)
-    if given["safety_factor"] < 1:
-        wrong.append(f"{what}: the safety factor is below 1")
     if type(rank) is not int:
         raise DocumentError("a rank is a whole number")
-    if trials and not 1 <= rank <= len(trials):
-        wrong.append(f"{what}: the rank is not from 1 to the number of trials")
-    if not trials:
-        wrong.append(f"{what}: it was measured on no trial")
-    if any(trial.shares(other) for trial in trials for other in before):
-        wrong.append(f"{what}: a trial that chose it cannot measure it")
+    faults = {
+        "the safety factor is below 1": given["safety_factor"] < 1,
+        "the rank is not from 1 to the number of trials": (
+            bool(trials) and not 1 <= rank <= len(trials)
+        ),
+        "it was measured on no trial": not trials,
+        "a trial that chose it cannot measure it": any(
+            trial.shares(other) for trial in trials for other in before
+        ),
+    }
+    wrong += [f"{what}: {fault}" for fault, holds in faults.items() if holds]
     measured, factor = Fraction(given["measured"]), Fraction(given["safety_factor"])
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}{'s' if count != 1 else ''}"

@@ -65,8 +65,7 @@ class CheckBag:
         if counts:
             numbers["lost"] = float(sum(int(text) for text in counts if text.isdigit()))
         if lost := numbers.get("lost"):
-            said = f"its recorder lost {lost:.0f} messages"
-            findings.append(Finding(Level.LOOK, "losses", said))
+            findings.append(Finding(Level.LOOK, "losses", f"its recorder lost {lost:.0f} messages"))
         if refused:
             findings.insert(0, Finding(Level.BAD, "identify", refused))
         wrong = sorted((f for f in findings if f.level is not Level.GOOD), key=lambda f: -f.level)

@@ -63,7 +63,7 @@ def _errors(axes: Axes, found: Catching, j: int) -> None:
     widest = width.half_width if width.most is None else width.most
     most = 1.15 * min(max(widest, width.range / 2), 2.0 * max(width.half_width, width.range / 2))
     axes.set_ylim(-most, most)
-    axes.set_ylabel(f"error of {width.name} [{width.unit}]", fontsize=8)
+    axes.set_ylabel(f"error of {width.name}" + f" [{width.unit}]" * bool(width.unit), fontsize=8)
     said = f"half-width {width.said}: {width.part}"
     axes.set_title(fill(said, TITLE), fontsize=8, loc="left", pad=36)
     axes.legend(frameon=False, fontsize=7, loc="lower left", bbox_to_anchor=(-0.02, 1), ncols=2)

@@ -13,6 +13,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Model, Validation
 from nlsid_core.identification.prediction import history, learns, simulate_started
 from nlsid_core.identification.validation import unscored
+from nlsid_core.models import Signal
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
@@ -71,8 +72,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     for i in range(n_y):
         over_time, auto, *crossed = panels[i]
         for trial, y in zip(test, simulated, strict=True):
-            left = trial.y[start:, i] - y[start:, i]
-            t, e = thinned(trial.t[start:] - trial.t[0], left, DRAWN)
+            t, e = thinned(trial.t[start:] - trial.t[0], trial.y[start:, i] - y[start:, i], DRAWN)
             over_time.plot(t, e, lw=0.8)
         over_time.set_title(f"residual of {axis_name(first, i)}", fontsize=8, loc="left")
         over_time.set_xlabel("time [s]", fontsize=8)
@@ -106,7 +106,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
 
 def axis_name(trial: Trajectory, output: int) -> str:
     """The output with its unit."""
-    return f"{trial.y_names[output]} [{trial.y_units[output]}]"
+    return Signal(trial.y_names[output], trial.y_units[output]).label
 
 
 def _correlations(

@@ -100,7 +100,7 @@ def margins(replays: Sequence[Replay]) -> Figure:
         _margin(lower, replay)
         lower.set_xlabel("time [s]", fontsize=8)
         if index % columns == 0:
-            upper.set_ylabel(f"{replay.axis}\n[{replay.unit}]", fontsize=8)
+            upper.set_ylabel(replay.axis + f"\n[{replay.unit}]" * bool(replay.unit), fontsize=8)
             lower.set_ylabel("margin,\nassumption used", fontsize=8)
     for kind in (0, 1):
         _same_limits([axes for axes in panels[kind::2].flat if axes.get_visible()])

@@ -109,7 +109,7 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     methods = tables.methods_table(fit, test, columns)
     model, proved = chosen.model, tables.stability_sentence(chosen)
     answers, drives = (
-        ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
+        ", ".join(s.label for s in (part if isinstance(part, tuple) else (part,)))
         for part in (model.y, model.u)
     )
     calibrated = ", calibration trials for neither: they scale the tube"

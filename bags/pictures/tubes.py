@@ -14,7 +14,7 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.designs import AnyDesign
 from nlsid_core.funnels import ContinuousFunnel, TubeFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
-from nlsid_core.models import Signal, StateModel
+from nlsid_core.models import StateModel
 
 TUBE = "#dbe8f4"
 TIMES = 200  # at which a tube in continuous time, or without an end, is drawn
@@ -44,8 +44,8 @@ def draw_tube(design: AnyDesign) -> Figure:
     for axes, pair in zip(panels, pairs, strict=False):
         for stage in design.stages:
             _projection(axes, stage.funnel, pair)
-        axes.set_xlabel(_name(signals[pair[0]]), fontsize=8)
-        axes.set_ylabel(_name(signals[pair[1]]), fontsize=8)
+        axes.set_xlabel(signals[pair[0]].label, fontsize=8)
+        axes.set_ylabel(signals[pair[1]].label, fontsize=8)
 
     over_time = panels[len(pairs) :]
     for stage in design.stages:
@@ -56,7 +56,7 @@ def draw_tube(design: AnyDesign) -> Figure:
             if stage is not design.stages[0]:
                 axes.axvline(t[0], color=GREY, lw=LINE, ls=":")
     for axes, signal in zip(over_time, signals, strict=True):
-        axes.set_title(_name(signal), fontsize=9, loc="left")
+        axes.set_title(signal.label, fontsize=9, loc="left")
         axes.set_xlabel("time [s]", fontsize=8)
     legend(figure, over_time[:1], loc="outside lower left")
     return figure
@@ -89,7 +89,7 @@ def draw_free_run(model: StateModel, validation: Dataset) -> Figure:
     for i, (left, right) in enumerate(panels):
         left.plot(t, trial.y[:, i], color=INK, lw=2.0, label="measured")
         left.plot(t, simulated[:, i], color=ORANGE, lw=1.0, label="simulated")
-        left.set_ylabel(_name(model.x[i]), fontsize=8)
+        left.set_ylabel(model.x[i].label, fontsize=8)
         right.plot(t, trial.y[:, i] - simulated[:, i], color=BLUE, lw=0.5)
         for side in (-NOISE_BAND, NOISE_BAND):
             right.axhline(side * model.noise[i], color=RED, lw=LINE, ls=":")
@@ -131,7 +131,3 @@ def _projection(axes: Axes, funnel: ContinuousFunnel, pair: tuple[int, int]) -> 
     axes.plot(*path.T, color=INK, lw=LINE, zorder=4)
     axes.plot(*path[0], "o", color=INK, ms=5, mfc="white", zorder=5)
     axes.plot(*path[-1], "o", color=INK, ms=5, zorder=5)
-
-
-def _name(signal: Signal) -> str:
-    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name

@@ -329,8 +329,7 @@ class Bag:
 
         Memory: one batch. Raises BagError where the bag is damaged.
         """
-        for channel, batch, _ in self.parts(topics, progress=progress):
-            yield channel, batch
+        yield from (part[:2] for part in self.parts(topics, progress=progress))
 
     def parts(
         self, topics: Sequence[str] | None = None, *, progress: Progress = silent

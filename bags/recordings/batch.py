@@ -62,8 +62,10 @@ class LogOrder:
     def add(self, channel: int, log_ns: IntArray) -> None:
         """The next messages of a channel of one file: log_ns (N,), N > 0, as recorded."""
         before = np.concatenate([[self._newest.get(channel, log_ns[0])], log_ns[:-1]])
-        for k in np.flatnonzero(log_ns < before):
-            self.back.append((self._count + int(k), int(before[k]), int(log_ns[k])))
+        self.back += [
+            (self._count + int(k), int(before[k]), int(log_ns[k]))
+            for k in np.flatnonzero(log_ns < before)
+        ]
         self._newest[channel] = int(log_ns[-1])
         self._count += len(log_ns)
 

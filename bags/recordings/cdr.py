@@ -208,8 +208,7 @@ def _taken(layout: Layout, batch: Batch) -> list[Numbers]:
         found = found != 0 if is_bool else found.astype(found.dtype.newbyteorder("="), copy=False)
         for target, column in zip(targets.tolist(), found, strict=True):
             columns[target] = column if length is None else np.fromiter(column, object, n)
-    for target, text in layout.texts:
-        columns[target] = np.fromiter(repeat(text, n), object, n)
+    columns |= {target: np.fromiter(repeat(text, n), object, n) for target, text in layout.texts}
     return [columns[target] for target in range(len(columns))]
 
 

@@ -362,12 +362,14 @@ class McapFile:
             statistics = self._parse(Statistics.read, content, length)
             found.stated = counted(statistics)
             self._total = statistics.message_count
-            for what, said, there in (
-                ("attachments", statistics.attachment_count, len(found.attachments)),
-                ("metadata records", statistics.metadata_count, len(found.metadata)),
-            ):
-                if said != there:
-                    found.lost.append(f"it has {there} {what}, its statistics say {said}")
+            found.lost += [
+                f"it has {there} {what}, its statistics say {said}"
+                for what, said, there in (
+                    ("attachments", statistics.attachment_count, len(found.attachments)),
+                    ("metadata records", statistics.metadata_count, len(found.metadata)),
+                )
+                if said != there
+            ]
         elif opcode == Opcode.DATA_END:
             self._check_data(found, content)
 
@@ -520,8 +522,9 @@ def summarised(read: Read, size: int) -> Contents | None:
     places = [(m.offset, m.length) for m in metadata] + found.attachments
     if any(not len(MAGIC) <= offset <= offset + length <= start for offset, length in places):
         raise BagError("the summary names metadata or attachments outside the file")
-    for m in metadata:
-        found.metadata.append(parse(Metadata.read, read(m.offset, m.length)[RECORD.size :]))
+    found.metadata += [
+        parse(Metadata.read, read(m.offset, m.length)[RECORD.size :]) for m in metadata
+    ]
     return found
 
 

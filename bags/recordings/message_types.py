@@ -114,8 +114,7 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
         else:
             parsed = parse(msgtype, embedded)
         parsed = completed(parsed, noetic) | {name: standard[name] for name in ROS1_DIFFERS}
-        types = registered(parsed)
-        text, _ = types.generate_msgdef(msgtype, ros_version=2)
+        text, _ = registered(parsed).generate_msgdef(msgtype, ros_version=2)
     return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
 

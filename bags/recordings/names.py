@@ -13,8 +13,11 @@ LISTED: Final = 20
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """`; did you mean 'a' or 'b'?` for the candidates nearest to `name`; empty if none is near."""
     known = list(candidates)
-    near = [each for each in known if _unpadded(each) == _unpadded(name)]
-    near = near or get_close_matches(name, known, n=SHOWN, cutoff=CLOSE)
+    near = (
+        [each for each in known if _unpadded(each) == _unpadded(name)]
+        or [each for each in known if name.startswith("/") and each.endswith(name)]
+        or get_close_matches(name, known, n=SHOWN, cutoff=CLOSE)
+    )
     if not near:
         return ""
     return f"; did you mean {' or '.join(repr(found) for found in near)}?"

@@ -122,10 +122,8 @@ class RemotePath(PosixPath):
             return
         folder = f"{self._key}/" if self._key else None
         found = obstore().list_with_delimiter(self._store, folder)
-        for key in found["common_prefixes"]:
-            yield key, Entry(0, True, "")
-        for described in found["objects"]:
-            yield described["path"], _entry(described)
+        yield from ((key, Entry(0, True, "")) for key in found["common_prefixes"])
+        yield from ((described["path"], _entry(described)) for described in found["objects"])
 
     @property
     def _key(self) -> str:

@@ -115,10 +115,12 @@ class SqliteFile:
     def _add_channels(self) -> None:
         definitions: dict[str, tuple[str, str]] = {}
         if self._columns("message_definitions"):
-            for name, encoding, text in self._rows(
+            rows = (
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            ):
-                definitions[str(name)] = str(encoding), str(text)
+            )
+            definitions = {
+                str(name): (str(form), str(text)) for name, form, text in self._rows(rows)
+            }
         columns = self._columns("topics")
         for row in self._rows("SELECT * FROM topics ORDER BY id"):
             topic = {column: str(value) for column, value in zip(columns, row, strict=True)}

@@ -198,8 +198,7 @@ def runs(file: DataFile, channels: Collection[int]) -> Iterator[tuple[Block, Bat
     if isinstance(file, McapFile):
         yield from file.runs(channels)
         return
-    for block in file.contents.blocks:
-        yield block, file.block_batches(block, channels)
+    yield from ((block, file.block_batches(block, channels)) for block in file.contents.blocks)
 
 
 def packed(batch: Batch) -> Any:

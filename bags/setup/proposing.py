@@ -291,9 +291,7 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
         role: [{"name": s.name, "unit": s.unit, "path": s.path} for s in signals]
         for role, signals in chosen.items()
     }
-    for signals in chosen.values():
-        for signal in signals:
-            proposal.why[signal.path] = signal.why
+    proposal.why |= {s.path: s.why for signals in chosen.values() for s in signals}
     for y in chosen["response"]:
         pairs = [
             p

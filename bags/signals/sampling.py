@@ -232,8 +232,7 @@ class Sampler:
     @property
     def newest_command_ns(self) -> float:
         """The newest stamp of a command; -inf before the first."""
-        commands = self._kept[len(self.responses) :]
-        return max(kept.newest_ns for kept in commands)
+        return max(kept.newest_ns for kept in self._kept[len(self.responses) :])
 
     def flush(self, until_ns: int | None = None) -> list[Sample]:
         """Stop waiting: for commands of samples up to `until_ns`, or for anything (None).

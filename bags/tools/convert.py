@@ -8,6 +8,7 @@ import heapq
 import math
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
@@ -29,7 +30,6 @@ from bags.recordings.message_types import (
     is_stamped,
     standard_types,
 )
-from bags.recordings.quality import Profile
 from bags.recordings.storage import Channel, Raw, Spans
 from bags.recordings.writer import BagWriter, refuse_existing
 from bags.tools.copies import Into, What
@@ -39,7 +39,7 @@ from nlsid_core.progress import Progress, silent
 REPORT_EVERY: Final = 1000  # messages between two reports of progress
 SINCE_1970: Final = 1e8  # s, three years: a larger number is no time since the first message
 LATEST: Final = 2**31 * 10**9  # ns: from here on a stamp's seconds have no room in a message
-STORAGES: Final = ("mcap", "sqlite3", "ros1")
+STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3", "ros1": ".bag"}  # how their files end
 
 
 @dataclass
@@ -84,17 +84,17 @@ def convert(
         BagError: if a topic is not there, if two bags have one topic with different types, if
             nothing is chosen, and if a new bag exists.
     """
-    what, into = what or What(), into or Into()
-    channels = _channels(bags, what)
+    what, into = what or What(), _as_named(out, into or Into())
+    copied = Copied()
+    channels = _channels(bags, what, into.storage, copied.notes)
     chosen = zip(bags, channels, strict=True)
     topics = {bag.channels[key].topic for bag, known in chosen for key in known}
     for first, second in combinations(bags, 2):
         for topic in topics & first.topics.keys() & second.topics.keys():
             _refuse_another_type(topic, first, second)
     spans = _spans(bags, what)
-    restamped = _restamping(bags, what.restamp)
-    copied = Copied()
-    unreadable: dict[tuple[str, str], int] = {}
+    restamped = _restamping(bags, channels, what.restamp, copied.notes)
+    unreadable: Counter[tuple[str, str]] = Counter()
     total = sum(channel.count for known in channels for channel in known.values())
     whole = len(bags) == 1 and not nearly and not what.restamp
     with _written(out, into, bags, channels) as parts:
@@ -113,18 +113,18 @@ def convert(
                 continue
             channel = channels[n][raw.key]
             if raw.error:
-                reason = channel.topic, raw.error
-                unreadable[reason] = unreadable.get(reason, 0) + 1
+                unreadable[channel.topic, raw.error] += 1
                 continue
             writer = parts.at(raw.log_ns)
             number = writer.add_copy(*parts.sources[n, raw.key])
             made = restamped(n, raw)
             writer.mcap.add(number, made.log_ns, made.publish_ns, made.sequence, made.data)
             copied.messages += 1
-        for bag in bags:
-            copied.notes += [*bag.lost, *bag.disagreements]
-        for (topic, why), count in unreadable.items():
-            copied.notes.append(f"{topic}: {count} messages are left out: {why}")
+        copied.notes += [note for bag in bags for note in (*bag.lost, *bag.disagreements)]
+        copied.notes += [
+            f"{topic}: {count} messages are left out: {why}"
+            for (topic, why), count in unreadable.items()
+        ]
         if not copied.messages and (copied.notes or what != What()):
             said = "".join(f"; {note}" for note in copied.notes[:5])
             raise BagError(f"{bags[0].path}: no message can be read there{said}")
@@ -137,9 +137,11 @@ def convert(
     return copied
 
 
-def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
+def _channels(
+    bags: Sequence[Bag], what: What, storage: str, notes: list[str]
+) -> list[dict[int, Channel]]:
     """The chosen channels of each bag by key, under their new names, with what the publishers of
-    all bags offered.
+    all bags offered; notes: get what the storage has no room for.
     """
     there = {topic for bag in bags for topic in bag.topics}
     for pattern in what.topics or ():
@@ -151,7 +153,9 @@ def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
     for text in what.rename or ():
         old, equals, new = text.partition("=")
         if not equals or not new or old not in there or new in {*there, *names.values()}:
-            raise BagError(f"--rename {text}: expected /old=/new, a topic and a name that is none")
+            raise BagError(
+                f"--rename {text}: expected /old=/new, the name of a topic and one that none has"
+            )
         names[old] = new
     found = []
     for bag in bags:
@@ -160,14 +164,26 @@ def _channels(bags: Sequence[Bag], what: What) -> list[dict[int, Channel]]:
             topic = channel.topic
             if what.topics and not any(fnmatchcase(topic, pattern) for pattern in what.topics):
                 continue
-            profiles: dict[Profile, None] = {}
-            for other in bags:
-                profiles |= dict.fromkeys(other.offered(topic))
+            if storage != "mcap" and channel.encoding != "cdr":
+                notes.append(f"{topic} is left out: {storage} keeps no {channel.encoding}")
+                continue
+            profiles = dict.fromkeys(profile for other in bags for profile in other.offered(topic))
             known[channel.key] = replace(
                 channel, topic=names.get(topic, topic), offered=tuple(profiles)
             )
         found.append(known)
     return found
+
+
+def _as_named(out: Path, into: Into) -> Into:
+    """In the storage that the new file's ending says, if none is named."""
+    ending = next((name for name, end in STORAGES.items() if end == out.suffix), "mcap")
+    into = replace(into, storage=into.storage or ending)
+    if into.storage not in STORAGES:
+        raise BagError(f"no storage '{into.storage}'; there are: {', '.join(STORAGES)}")
+    if into.compression and into.storage != "mcap":
+        raise BagError(f"--compression {into.compression} is of mcap, not of {into.storage}")
+    return into
 
 
 def _refuse_another_type(topic: str, first: Bag, second: Bag) -> None:
@@ -219,7 +235,7 @@ def _moment(text: str, origin_ns: int) -> int:
     except ValueError as error:
         raise BagError(
             f"'{text}' is no moment: give s after the first message, s since 1970, or a date "
-            "as 2024-05-01T12:00:00"
+            "as 2024-05-01T12:00:00; for --around also a topic of the bag"
         ) from error
     whole = date if date.tzinfo else date.replace(tzinfo=UTC)
     return int(whole.replace(microsecond=0).timestamp()) * 10**9 + whole.microsecond * 1000
@@ -234,8 +250,10 @@ def _seconds(text: str) -> float:
     return seconds if abs(seconds) < 2**31 else math.nan
 
 
-def _restamping(bags: Sequence[Bag], rule: str) -> Callable[[int, Raw], Raw]:
-    """What makes a message of bag n the one that is written."""
+def _restamping(
+    bags: Sequence[Bag], channels: Sequence[Mapping[int, Channel]], rule: str, notes: list[str]
+) -> Callable[[int, Raw], Raw]:
+    """What makes a message of bag n the one that is written; notes: get what it does not move."""
     if not rule:
         return lambda _, raw: raw
     shift = 0.0 if rule in ("header", "log") else _seconds(rule)
@@ -243,9 +261,18 @@ def _restamping(bags: Sequence[Bag], rule: str) -> Callable[[int, Raw], Raw]:
         raise BagError(f"--restamp {rule}: header, log, or s as +3600")
     shift_ns = round(shift * 1e9)
     stamped = [
-        {channel.key: is_stamped(*bag.types_on(channel.topic)) for channel in bag.channels}
-        for bag in bags
+        {
+            key: channel.encoding == "cdr" and is_stamped(*bag.types_on(bag.channels[key].topic))
+            for key, channel in known.items()
+        }
+        for bag, known in zip(bags, channels, strict=True)
     ]
+    chosen = zip(channels, stamped, strict=True)
+    if without := {known[key].topic for known, has in chosen for key in has if not has[key]}:
+        notes.append(
+            f"without a header of their own, the stamps in their messages stay as they are: "
+            f"{', '.join(sorted(without))}"
+        )
 
     def restamped(n: int, raw: Raw) -> Raw:
         data, at = raw.data, raw.log_ns
@@ -279,7 +306,7 @@ class _Parts:
         }
         self._writer: BagWriter | None = None
         self._first_ns, self._until_ns = 0, NEVER
-        self._compression = "" if into.compression == "none" else into.compression
+        self._packed = into.compression or "zstd"
         self._most = NEVER if into.max_size is None else into.max_size * 1e6
 
     @property
@@ -296,7 +323,7 @@ class _Parts:
 
     def takes(self, block: Block, numbers: Mapping[int, int]) -> bool:
         """Whether a chunk of the only bag fits as it is; numbers: of its channels -> keys."""
-        if self._into.storage != "mcap" or block.compression != self._compression:
+        if self._into.storage != "mcap" or (block.compression or "none") != self._packed:
             return False
         writer = self.at(block.start_ns)
         copied = (writer.add_copy(*self.sources[0, key]) == n for n, key in numbers.items())
@@ -315,9 +342,7 @@ class _Parts:
             for key, value in bag.custom.items():
                 if custom.setdefault(key, value) != value:
                     custom[key] = f"{custom[key]}; {value}"
-        writer = BagWriter(
-            self._out.with_name(self.name), custom=custom, compression=self._into.compression
-        )
+        writer = BagWriter(self._out.with_name(self.name), custom=custom, compression=self._packed)
         for bag in self._bags:
             for record in bag.kept_beside:
                 writer.mcap.keep(record)
@@ -349,21 +374,18 @@ def _written(
     out: Path, into: Into, bags: Sequence[Bag], channels: Sequence[Mapping[int, Channel]]
 ) -> Iterator[_Parts]:
     """New bags, which get their names in the end; nothing is left after an error."""
-    if into.storage not in STORAGES:
-        raise BagError(f"no storage '{into.storage}'; there are: {', '.join(STORAGES)}")
     for size, unit in ((into.every, "s"), (into.max_size, "MB")):
         if size is not None and not size > 0:
             raise BagError(f"a part of {size:g} {unit}")
     out.parent.mkdir(parents=True, exist_ok=True)
+    ending = STORAGES[into.storage]
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-        parts = _Parts(Path(folder) / out.name, into, bags, channels)
-        refuse_existing(out.with_name(parts.name))
+        parts = _Parts(Path(folder) / out.name.removesuffix(ending), into, bags, channels)
+        as_file = ending if ending in (out.suffix, ".bag") else ""
+        refuse_existing(out.with_name(parts.name + as_file))
         try:
             yield parts
-            made = [
-                path if into.storage == "mcap" else _by_rosbags(path, into.storage)
-                for path in parts.end()
-            ]
+            made = [_stored(path, into.storage, as_file) for path in parts.end()]
         finally:
             parts.abandon()
         parts.paths = [out.with_name(path.name) for path in made]
@@ -373,12 +395,19 @@ def _written(
             path.rename(final)
 
 
-def _by_rosbags(bag: Path, storage: str) -> Path:
-    """The bag in another storage; BagError if it cannot be put there."""
+def _stored(bag: Path, storage: str, ending: str) -> Path:
+    """The bag in its storage, with an ending as a file; BagError if it cannot be put there."""
+    made = bag
+    if storage != "mcap":
+        made = bag.with_name("made") / f"{bag.name}{ending if storage == 'ros1' else ''}"
+        _by_rosbags(bag, made, storage)
+    return made / f"{bag.name}{ending}" if ending and made.is_dir() else made
+
+
+def _by_rosbags(bag: Path, made: Path, storage: str) -> None:
     from rosbags.convert.converter import ConverterError
     from rosbags.convert.converter import convert as convert_bag
 
-    made = bag.with_suffix(".bag") if storage == "ros1" else bag.with_name("made") / bag.name
     made.parent.mkdir(exist_ok=True)
     try:
         with redirect_stdout(StringIO()):
@@ -387,4 +416,3 @@ def _by_rosbags(bag: Path, storage: str) -> Path:
             )
     except ConverterError as error:
         raise BagError(f"it cannot be written as {storage}: {error}") from error
-    return made

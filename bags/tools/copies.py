@@ -25,8 +25,10 @@ class What:
 class Into:
     """How new bags are written."""
 
-    storage: Annotated[str, "mcap, sqlite3 or ros1."] = "mcap"
-    compression: Annotated[str, "Of mcap: zstd, lz4 or none."] = "zstd"
+    storage: Annotated[
+        str, "mcap, sqlite3 or ros1; default: what the ending of --out says, else mcap."
+    ] = ""
+    compression: Annotated[str, "Of mcap: zstd (the default), lz4 or none."] = ""
     every: Annotated[float | None, "s per part: OUT_01, OUT_02, ..."] = None
     max_size: Annotated[float | None, "MB per part."] = None
 

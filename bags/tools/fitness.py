@@ -125,9 +125,8 @@ def _look_at(bag: Bag, u_texts: Sequence[str], y_texts: Sequence[str], look: Fit
     u_names, y_names = list(expanded(bag, u_texts)), list(expanded(bag, y_texts))
     read = read_signals(bag, [*u_names, *y_names], sort=True)
     commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
-    for name, samples in read.items():
-        if doubt := samples.doubt(responds=name in y_names):
-            look.findings.append(Finding(Level.BAD, "publishers", doubt))
+    doubts = [samples.doubt(responds=name in y_names) for name, samples in read.items()]
+    look.findings.extend(Finding(Level.BAD, "publishers", doubt) for doubt in doubts if doubt)
     for samples in measured:
         look.findings.extend(_regularity(samples))
         look.findings.extend(_range(samples))

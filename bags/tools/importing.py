@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -286,24 +286,18 @@ def _stamps(times: FloatArray, start_ns: int) -> IntArray:
 
 
 def _make_room(message: Any, steps: Sequence[Step]) -> None:
-    """Let the arrays on the way be long enough, and have the named elements."""
-    for owner, step in _walk(message, steps):
-        array = getattr(owner, step.field)
-        if step.key is not None:
-            names = getattr(owner, step.key[0])
-            if step.key[1] not in names:
-                names.append(step.key[1])
-            needed = len(names)
-        else:
-            needed = 0 if step.index is None else step.index + 1
-        if isinstance(array, np.ndarray) and len(array) < needed:
-            setattr(owner, step.field, np.pad(array, (0, needed - len(array))))
-
-
-def _walk(message: Any, steps: Sequence[Step]) -> Iterator[tuple[Any, Step]]:
-    for k, step in enumerate(steps):
-        yield message, step
-        if k < len(steps) - 1:
-            if step.picks:
-                raise BagError(f"'{step.field}': elements that are messages cannot be imported")
-            message = getattr(message, step.field)
+    """Let the array at the end of the way be long enough, and have the named element."""
+    *outer, last = steps
+    for step in outer:
+        if step.picks:
+            raise BagError(f"'{step.field}': elements that are messages cannot be imported")
+        message = getattr(message, step.field)
+    array = getattr(message, last.field)
+    needed = 0 if last.index is None else last.index + 1
+    if last.key is not None:
+        names = getattr(message, last.key[0])
+        if last.key[1] not in names:
+            names.append(last.key[1])
+        needed = len(names)
+    if isinstance(array, np.ndarray) and len(array) < needed:
+        setattr(message, last.field, np.pad(array, (0, needed - len(array))))

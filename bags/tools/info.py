@@ -69,19 +69,18 @@ class Messages:
     @property
     def odd(self) -> list[str]:
         """What is wrong with them and with their stamps, in words."""
-        odd = []
-        if self.stamps is not None and self.stamps.clock is None:
-            odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
-        elif self.stamps is not None:
-            if self.stamps.backward:
-                odd.append(f"header stamps go back in {self.stamps.backward} places")
-            if self.stamps.duplicates:
-                odd.append(f"{self.stamps.duplicates} header stamps repeat the one before")
-        if self.missing:
-            odd.append(f"{self.missing} sequence numbers are missing: messages were lost")
-        if self.unreadable:
-            odd.append(f"cannot be read: {self.unreadable[:300]}")
-        return odd
+        stamps = self.stamps or Stamps(0, 0, None)
+        is_zero = self.stamps is not None and stamps.clock is None
+        odd = {
+            "every header stamp is 0: its publisher does not fill it in; use log time": is_zero,
+            f"header stamps go back in {stamps.backward} places": stamps.backward,
+            f"{stamps.duplicates} header stamps repeat the one before": (
+                stamps.duplicates and not is_zero
+            ),
+            f"{self.missing} sequence numbers are missing: messages were lost": self.missing,
+            f"cannot be read: {self.unreadable[:300]}": self.unreadable,
+        }
+        return [text for text, holds in odd.items() if holds]
 
 
 @dataclass(frozen=True, eq=False)

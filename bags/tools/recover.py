@@ -67,11 +67,12 @@ def _read_back(out: Path) -> tuple[dict[str, int], list[str]]:
                 if why := _unreadable(bag, topic, batch.data(0)):
                     lost.append(f"{topic}: its messages are kept, and cannot be read: {why}")
             found[topic] = found.get(topic, 0) + len(batch)
-            strand = topic, bag.strands[channel.key]
-            sequences.setdefault(strand, []).append(batch.sequence)
-    for (topic, _), parts in sequences.items():
-        if gaps := missing(np.concatenate(parts)):
-            lost.append(f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost")
+            sequences.setdefault((topic, bag.strands[channel.key]), []).append(batch.sequence)
+    lost += [
+        f"{topic}: {gaps} sequence numbers are missing: never recorded, or lost"
+        for (topic, _), parts in sequences.items()
+        if (gaps := missing(np.concatenate(parts)))
+    ]
     return found, lost
 
 

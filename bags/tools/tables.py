@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
@@ -27,7 +28,7 @@ from bags.recordings.mcap_records import NEVER
 from bags.recordings.message_types import decode, fields_of
 from bags.recordings.writer import refuse_existing
 from bags.signals.columns import Columns, TopicReader, joined_columns
-from bags.signals.expressions import Expression, Running
+from bags.signals.expressions import SIGNAL_CLOCKS, Expression, Running
 from bags.signals.reader import expanded
 from bags.signals.signal import NO_FIELD, SignalPath, attribute
 from nlsid_core.errors import BagError
@@ -81,7 +82,6 @@ def export_topics(
         raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
     out = Path(out)
     refuse_existing(out)
-    writer = _Csv if form == "csv" else _Parquet
     left_out: list[str] = []
     wanted = _wanted(bag, signals, left_out)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -92,27 +92,25 @@ def export_topics(
         folder = Path(beside) / out.name
         folder.mkdir()
         files: dict[str, _Csv | _Parquet] = {}
-        for topic in wanted:
-            name = topic.strip("/").replace("/", "__")
-            while name in {file.path.stem for file in files.values()}:  # /a/b and /a__b
-                name += "_"
-            files[topic] = writer(folder / f"{name}.{form}")
-            stack.callback(files[topic].close)
-        counts = dict.fromkeys(wanted, 0)
+        counts: dict[str, int] = {}
         refused = None if signals else left_out
         for topic, table in _tables(bag, wanted, refused, progress):
+            if topic not in files:
+                name = topic.strip("/").replace("/", "__")
+                while name in {file.path.stem for file in files.values()}:  # /a/b and /a__b
+                    name += "_"
+                path, kind = folder / f"{name}.{form}", bag.types_on(topic)
+                files[topic] = _Csv(path) if form == "csv" else _Parquet(path, wanted[topic], kind)
+                stack.callback(files[topic].close)
             files[topic].write(table)
-            counts[topic] += len(table[TIMES[0]])
-        kept = {topic: file for topic, file in files.items() if topic in wanted and counts[topic]}
-        for file in set(files.values()) - set(kept.values()):
-            file.path.unlink(missing_ok=True)
-        if not kept:
+            counts[topic] = counts.get(topic, 0) + len(table[TIMES[0]])
+        if not files:
             what = "; ".join(left_out) or "there are no messages"
             raise BagError(f"{bag.path}: nothing was exported: {what}")
         stack.close()
         folder.rename(out)
     return Exported(
-        {out / file.path.name: counts[topic] for topic, file in kept.items()},
+        {out / files[topic].path.name: counts[topic] for topic in wanted if topic in files},
         tuple(left_out),
         (*bag.lost, *bag.disagreements),
     )
@@ -120,7 +118,7 @@ def export_topics(
 
 def frame(
     bag: Bag | Path | str,
-    wanted: Sequence[str],
+    wanted: Sequence[str] | str,
     *,
     clock: str = "header",
     period: float | None = None,
@@ -134,7 +132,7 @@ def frame(
 
     Args:
         bag: where it is, or one that is open.
-        wanted: topics, `/odom`, or signals, `/odom:pose.pose.position.x|to(mm)`.
+        wanted: topics, `/odom`, or signals, `/odom:pose.pose.position.x|to(mm)`; none: all topics.
         clock: `header` (log times of types without a header) or `log`.
         period: s between rows.
 
@@ -144,8 +142,11 @@ def frame(
         which arrays are too long for a table: pixels, points.
 
     Raises:
-        BagError: without pandas, as `read_signals` for damage, and if nothing is there.
+        BagError: without pandas, for another clock or a period of 0, as `read_signals` for damage,
+            and if nothing is there.
     """
+    if clock not in SIGNAL_CLOCKS or (period is not None and not period > 0):
+        raise BagError(f"a frame has the clock header or log and a period > 0: {clock}, {period}")
     if find_spec("pandas") is None:
         raise BagError("a frame needs pandas: pip install 'nlsid[export]'")
     import pandas
@@ -153,7 +154,7 @@ def frame(
     parts: dict[str, list[Table]] = {}
     with nullcontext(bag) if isinstance(bag, Bag) else Bag(bag) as source:
         left_out: list[str] = []
-        tables = _wanted(source, wanted, left_out)
+        tables = _wanted(source, [wanted] if isinstance(wanted, str) else wanted, left_out)
         for topic, table in _tables(source, tables, None, silent):
             parts.setdefault(topic, []).append(table)
         frames = []
@@ -362,19 +363,49 @@ def _cells(column: Numbers) -> list[Any]:
 
 
 class _Parquet:
-    def __init__(self, path: Path) -> None:
+    """Columns of the types that the messages state, also where the first arrays are empty."""
+
+    def __init__(
+        self, path: Path, columns: Mapping[str, Expression], kind: tuple[str, Typestore]
+    ) -> None:
         self.path = path
+        self._columns, self._kind = columns, kind
         self._writer: Any = None
 
     def write(self, table: Table) -> None:
         import pyarrow
         from pyarrow import parquet
 
-        rows = pyarrow.table(dict(table))
         if self._writer is None:
-            self._writer = parquet.ParquetWriter(self.path, rows.schema, compression="zstd")
-        self._writer.write_table(rows.cast(self._writer.schema))
+            schema = pyarrow.schema([(name, self._type(name, table[name])) for name in table])
+            self._writer = parquet.ParquetWriter(self.path, schema, compression="zstd")
+        self._writer.write_table(pyarrow.table(dict(table), self._writer.schema))
+
+    def _type(self, name: str, column: Numbers) -> Any:
+        """Arrow's type of texts and arrays as stated, of numbers after their operations."""
+        import pyarrow
+
+        if column.dtype != object:
+            return pyarrow.from_numpy_dtype(column.dtype)
+        msgtype, types = self._kind
+        found: FieldDesc = (Nodetype.NAME, msgtype)
+        for step in self._columns[name].path.steps:
+            found = fields_of(str(found[1]), types)[step.field]
+        return _arrow(found, types)
 
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def _arrow(found: FieldDesc, types: Typestore) -> Any:
+    """Arrow's type of a field."""
+    import pyarrow
+
+    if found[0] == Nodetype.NAME:
+        fields = fields_of(str(found[1]), types)
+        return pyarrow.struct([(attribute(n), _arrow(f, types)) for n, f in fields.items()])
+    if found[0] != Nodetype.BASE:
+        return pyarrow.list_(_arrow(found[1][0], types))
+    name = str(found[1][0])
+    return pyarrow.type_for_alias({"byte": "uint8", "char": "uint8"}.get(name, name))

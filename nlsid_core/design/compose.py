@@ -90,8 +90,7 @@ def read_stage(number: int, path: Path) -> Stage:
         beside = path.parent / name
         if beside.name != name or not beside.is_file():
             raise CertificateMismatch(f"{path}: the {role} file {name!r} is not beside it")
-        content = beside.read_bytes()
-        contents[f"stage{number}.{role}.json"] = content
+        contents[f"stage{number}.{role}.json"] = beside.read_bytes()
         renamed[role] = about[role] | {"file": f"stage{number}.{role}.json"}
     own = document | {"claim": claim | {"about": renamed}}
     contents[f"stage{number}.proof.json"] = files.encode(own)

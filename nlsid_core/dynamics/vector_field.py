@@ -167,8 +167,7 @@ class VectorField:
         if rows.shape != (self.n, 2):
             raise ShapeError(f"the box of a push on {self.n} states has shape {rows.shape}")
         states = np.flatnonzero(rows.any(axis=1)).tolist()
-        first = len(self.uncertain)
-        names = [f"w{first + j}" for j in range(len(states))]
+        names = [f"w{len(self.uncertain) + j}" for j in range(len(states))]
         added = dict(zip(states, variables(names), strict=True))
         return replace(
             self,

@@ -72,8 +72,7 @@ class Candidate(Generic[M]):
 
     def error_percent(self, dataset: Dataset) -> float:
         """100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation over `dataset`."""
-        n = unscored(dataset, self.transient)
-        return simulation_percent(self.model, dataset, transient=n)
+        return simulation_percent(self.model, dataset, transient=unscored(dataset, self.transient))
 
     @property
     def unproved(self) -> str:

@@ -20,6 +20,11 @@ class Signal:
     unit: str = ""
     path: str = ""
 
+    @property
+    def label(self) -> str:
+        """The name and the unit, if it has one."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
     def document(self) -> Json:
         """The JSON form."""
         return {"name": self.name, "unit": self.unit, "path": self.path}

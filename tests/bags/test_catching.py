@@ -209,8 +209,7 @@ def test_a_tube_beside_which_trials_hardly_move_is_warned_of(
     found: Catching, train: Dataset
 ) -> None:
     moves = [np.ptp(train.select([name]).trajectories[0].y) for name, _ in found.shares]
-    width = found.widths[0]
-    assert width.moves == pytest.approx(np.median(moves))
+    assert found.widths[0].moves == pytest.approx(np.median(moves))
     assert found.still == []
     motor = Width("speed", "rad/s", 20.5, 52.4, 3.7, moves=28.0)
     [said] = replace(found, widths=(motor,)).still
@@ -397,8 +396,7 @@ def arm(tmp_path: Path) -> Path:
 
 def test_path_and_goal_of_a_joint_are_the_proved_half_widths_rounded_up(arm: Path) -> None:
     widths = designed().funnel.half_widths
-    found = tolerances(arm)
-    found.write(arm)
+    tolerances(arm).write(arm)
     content = yaml.safe_load((arm / CONTROLLER).read_text())
     constraints = content["joint_trajectory_controller"]["ros__parameters"]["constraints"]
     assert constraints == {

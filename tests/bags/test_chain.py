@@ -248,8 +248,7 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     path = edited(tmp_path, funnel={"safety_factor": 1.5})
     for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
-    done = nlsid("funnel", tmp_path, "--config", path)
-    assert "for ever" in done
+    assert "for ever" in nlsid("funnel", tmp_path, "--config", path)
     assert not (tmp_path / documents.POLICY).exists()
     nlsid("check", tmp_path / documents.FUNNEL_PROOF)
     bags = [str(trial("05")), str(trial("11"))]
@@ -345,8 +344,7 @@ def test_the_stretches_that_were_not_judged_begin_and_end(chain: Path) -> None:
     assert first.why == "no speed at t = 2 s; then 3 to start a new run"
     assert (second.start, second.end, second.samples) == (14.0, 20.0, 7)
     assert second.why == "6 samples are missing; then no speed at t = 2 s"
-    left = found.span - found.judged_span
-    assert left == first.samples + second.samples == 11
+    assert found.span - found.judged_span == first.samples + second.samples == 11
 
 
 def test_bags_of_another_period_are_said_once_with_both_periods(chain: Path) -> None:
@@ -427,8 +425,7 @@ def test_monitor_command_summarises_draws_and_ends_with_status_0(chain: Path) ->
     bags = [str(trial(name)) for name in TEST]
     done = nlsid("monitor", chain, *bags)
     assert done.count("inside") == len(TEST)
-    picture = (chain / documents.MARGIN_PLOT).read_bytes()
-    assert picture.startswith(b"\x89PNG")
+    assert (chain / documents.MARGIN_PLOT).read_bytes().startswith(b"\x89PNG")
 
 
 def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(

@@ -328,8 +328,7 @@ def test_messages_compressed_one_by_one_are_unpacked(tmp_path: Path, storage: st
     else:
         bag = sqlite_bag(tmp_path / "a.db3", [("/x", FLOAT[1], data) for data in packed])
     assert read_signals(bag, ["/x:data"])["/x:data"].values.tolist() == ramp(50)
-    recovered = recover(bag, tmp_path / "whole")
-    assert recovered.messages == 50
+    assert recover(bag, tmp_path / "whole").messages == 50
     with Bag(tmp_path / "whole") as whole:
         assert {message.data[:4] for message in whole.messages()} == {b"\0\1\0\0"}
 
@@ -583,6 +582,12 @@ def test_a_schema_that_is_not_read_is_copied_as_it_is(tmp_path: Path) -> None:
         assert [m.data for m in before.messages()] == [m.data for m in after.messages()]
     status, said = run("export", bag, "--out", tmp_path / "out")
     assert (status, "left out" in said, "protobuf" in said) == (0, True, True)
+    for ending in (".db3", ".bag", ".mcap"):
+        status, said = run("convert", bag, "--out", tmp_path / f"b{ending}", "--restamp", "+1")
+        unmoved = "stay as they are: /p, /x" if ending == ".mcap" else "stay as they are: /x"
+        assert (status, "/p is left out" in said, unmoved in said) == (0, ending != ".mcap", True)
+        assert (tmp_path / f"b{ending}").is_file()
+        assert bag_info(tmp_path / f"b{ending}").span_ns[1] == 10**9 + 2
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])

@@ -80,8 +80,7 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
 def test_every_file_has_its_digest_and_the_proofs_that_it_is_a_part_of(design: Path) -> None:
     page = folder_page(design)
     for path in design.glob("*.json"):
-        digest = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
-        assert page.count(digest) == 1, path
+        assert page.count(f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}") == 1, path
     model = page[page.index("<td>model.json</td>") :].partition("</tr>")[0]
     assert "model of funnel.proof.json; model of model.proof.json" in model
 

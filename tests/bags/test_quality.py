@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -310,19 +311,15 @@ def _rosbags(profile: Profile) -> Qos:
 
 def counts_by_rosbags(bag: Path) -> dict[str, int]:
     """What rosbags reads of a folder, which it opens by its metadata.yaml."""
-    found: dict[str, int] = {}
     with Reader(bag) as reader:
-        for connection, _, _ in reader.messages(reader.connections):
-            found[connection.topic] = found.get(connection.topic, 0) + 1
-    return found
+        return Counter(connection.topic for connection, *_ in reader.messages(reader.connections))
 
 
 def counts_by_mcap(bag: Path) -> dict[str, int]:
-    found: dict[str, int] = {}
+    found: Counter[str] = Counter()
     for file in sorted(bag.glob("*.mcap")):
         with file.open("rb") as stream:
-            for _, channel, _ in make_reader(stream).iter_messages():
-                found[channel.topic] = found.get(channel.topic, 0) + 1
+            found.update(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
     return found
 
 

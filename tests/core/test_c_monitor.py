@@ -116,6 +116,9 @@ def test_the_program_of_the_page_reads_a_table_of_samples(
         check=False,
     )
     assert said.returncode == 1
+    assert (  # neither the heading nor the other line is a sample
+        subprocess.run(tmp_path / "monitor", input=b"t,y,u\nhello\n", check=False).returncode == 2
+    )
     assert re.findall(r" (.*) ", said.stdout) == [
         reading.status.value for reading in replay(made, run).readings
     ]

@@ -103,7 +103,8 @@ def test_nav2s_manager_brings_nodes_up_in_order_and_down_in_reverse(
     bench.start("funnel_monitor", autostart=False, __ns="/robot")
     for transition, state in ((CONFIGURE, INACTIVE), (ACTIVATE, ACTIVE)):
         assert [asked(bench, name, transition) for name in names] == [(True, state)] * 2
-    bench.hears("no speed yet", "robot/funnel_monitor")
+    bench.hears("no speed yet; listening on /robot/cmd_vel, /robot/odom", "robot/funnel_monitor")
+    assert "\n" not in bench.said["robot/funnel_publisher"][-1][0]
     for transition, state in DOWN:
         assert [asked(bench, name, transition) for name in names[::-1]] == [(True, state)] * 2
 

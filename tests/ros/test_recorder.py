@@ -153,8 +153,7 @@ def test_a_type_nobody_describes_is_refused_by_name_and_the_others_go_on(
     assert robot.levels[RECORDER] == DiagnosticStatus.ERROR
     robot.publish(3)
     time.sleep(0.3)
-    output = stop(recorder)
-    assert "in the parameter definitions" in output
+    assert "in the parameter definitions" in stop(recorder)
     assert three_readers(bag, "/joints") == [robot.sent] * 3
 
 
@@ -237,8 +236,7 @@ def test_messages_that_dds_lost_are_counted(robot: Joints, tmp_path: Path) -> No
         sensor.publish(String(data="last"))
         time.sleep(0.05)
     robot.hears("messages lost on /sensor", RECORDER)
-    output = stop(recorder)
-    assert "messages lost" in output
+    assert "messages lost" in stop(recorder)
     with Bag(bag) as source:
         lost, received = int(source.custom["/sensor lost"]), source.count("/sensor")
     assert lost > 0

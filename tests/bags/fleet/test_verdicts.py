@@ -73,8 +73,7 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(funnel: Path) -> None:
 def test_bags_that_made_the_design_are_not_counted_for_the_next(funnel: Path) -> None:
     bags = {path.name: path for path in f1tenth()}
     found = held_against(funnel, bags)
-    tests = load_config(CONFIG).split.test
-    assert {row.bag for row in found.others} == set(tests)
+    assert {row.bag for row in found.others} == set(load_config(CONFIG).split.test)
     assert "probability 1/9 = 0.112 at most" in found.ranks[0]
 
 
