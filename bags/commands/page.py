@@ -66,7 +66,10 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
     is_rejected = REJECTED in decided
     model = _model_chapter(folder / documents.REPORT)
     if not proofs and not model:
-        raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
+        raise DocumentError(
+            f"{folder}: no proof and no {documents.REPORT} to make a report of; `nlsid learn` "
+            "makes both"
+        )
     if model and is_rejected:
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()

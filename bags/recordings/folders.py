@@ -70,8 +70,10 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
         )
         if not inside:
             raise BagError(
-                f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)}); of folders "
-                f"in folders give a pattern, '{path}/*/*', in quotes"
+                f"{path} is a design's folder; a recording belongs here"
+                if (path / "model.json").is_file()
+                else f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)}); of "
+                f"folders in folders give a pattern, '{path}/*/*', in quotes"
             )
         found += inside
     return list(dict.fromkeys(found))

@@ -354,7 +354,7 @@ def _role(text: str, msgtype: str) -> tuple[float, str]:
     topic, _, field = text.lower().partition(":")
     share, why = 0.5, []
     if msgtype in COMMANDS:
-        share, why = share + 0.3, [f"{msgtype} mostly commands"]
+        share, why = share + 0.3, [f"{msgtype} is mostly a command's type"]
     if msgtype in RESPONSES:
         share, why = share - 0.3, [f"{msgtype} is measured"]
     for words, sign in ((SAYS_COMMAND, 1.0), (SAYS_RESPONSE, -1.0)):
