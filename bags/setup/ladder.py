@@ -8,8 +8,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.choosing import Attempt, Choice, HeldOut, Row
@@ -48,8 +46,7 @@ def choose(
 ) -> Choice:
     """Try what there is for such data: all on the first fold, the best of each stage on all.
 
-    Who falls back on the other folds takes nobody's place. known: what was tried before. A stage
-    sees what its own attempts gave on the first fold.
+    known: what was tried before. A stage sees what its own attempts gave on the first fold.
     """
     rows = list(known)
     for number, (stage, kept) in enumerate(stages):
@@ -59,24 +56,17 @@ def choose(
             if all(row.attempt != attempt for row in seen):
                 progress(str(attempt), number / len(stages))
                 seen.append(held_out.glance(attempt))
-        left = kept
-        for row in sorted(seen[begun:], key=lambda row: row.percent):
+        for place, row in enumerate(sorted(seen[begun:], key=lambda row: row.percent)):
             best = least(rows)
+            limit = DROPPED * (math.inf if best is None else best.percent)
             if row.refusal:
                 rows.append(row)
-            elif best is None or kept == EVERY or (left and _keeps_up(row, best)):
+            elif kept == EVERY or (place < kept and row.percent <= limit):
                 progress(str(row.attempt), (number + 0.5) / len(stages))
                 rows.append(held_out.judged(row))
-                left -= best is not None and _keeps_up(rows[-1], best)
             else:
                 rows.append(replace(row, refusal=f"{row.percent:.3g} % on one fold"))
     return Choice(held_out, tuple(rows))
-
-
-def _keeps_up(row: Row, best: Row) -> bool:
-    """Whether it is about as good, where both were judged."""
-    both = ~np.isnan(row.errors)
-    return bool(np.mean(row.judged[both]) <= DROPPED**2 * np.mean(best.judged[both]))
 
 
 def tried(train: Dataset, stages: "Stages", *, progress: Progress) -> Choice | None:

@@ -13,7 +13,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_033,
-    ("bags",): 11_915,
+    ("bags",): 11_910,
     ("nlsid_ros",): 2_659,
     ("tests",): 22_333,
     ("benchmarks", "examples"): 3_796,
