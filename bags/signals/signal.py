@@ -49,7 +49,9 @@ class SignalPath:
         """Read `topic:field.path[index]`; BagError says what is wrong with it."""
         topic, colon, path = text.partition(":")
         if not colon:
-            raise BagError(f"'{text}' has no ':'; {_FORM}" if text else "it is read from no topic")
+            raise BagError(
+                (f"'{text}' has no ':'" if text else "it is read from no topic") + f"; {_FORM}"
+            )
         if not _TOPIC.fullmatch(topic):
             raise BagError(f"'{topic}' in '{text}' is not a topic's name; {_FORM}")
         steps, at = [], 0
