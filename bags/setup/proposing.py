@@ -19,7 +19,7 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup import ladder
-from bags.setup.candidates import Found, Pair, Unfit, is_named
+from bags.setup.candidates import Found, Pair, Unfit, is_named, slope_window
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.proposal import GRADES, POOR, Proposal, Signal
@@ -134,7 +134,7 @@ def propose(
         _say_model(proposal, more, trials.train)
     _say_funnel(proposal, len(trials.train) if len(trials.train) > 1 else STRETCHES)
     if POOR < proposal.error < math.inf:
-        _say_poor(proposal)
+        _say_poor(proposal, found)
     return proposal
 
 
@@ -229,11 +229,18 @@ def followed(proposal: Proposal, found: Found) -> list[Pair]:
     return follows[:OTHERS]
 
 
-def _say_poor(proposal: Proposal) -> None:
-    proposal.walls.append(
+def _say_poor(proposal: Proposal, found: Found) -> None:
+    signals = proposal.content["signals"]
+    wall = (
         f"nothing that was tried has less than {proposal.error:.3g} % error: the tube will be "
         "wide; another pair of signals, or more of them, may say more"
     )
+    if len(signals["response"]) == len(signals["excitation"]) == 1 and (
+        also := followed(proposal, found)
+    ):
+        said = ", ".join(f"{pair.command.text} ({pair.correlation:+.2f})" for pair in also)
+        wall += f": it follows {said} too (-u, once for each)"
+    proposal.walls.append(wall)
 
 
 def _unwrapped(text: str) -> bool:
@@ -305,6 +312,12 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
             if abs(best.correlation) < RELATED:
                 proposal.walls.append(
                     f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
+                )
+            washed = "|washout" in y.path
+            if best.response.is_position and not best.command.is_position and not washed:
+                proposal.walls.append(
+                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
+                    f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
                 )
 
 

@@ -63,7 +63,8 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
     at its instant, and only those that are not proved if V falls at every knot.
     """
     t, when = setting.policy.t, refusal_time(refusal)
-    if when is None or len(t) >= MOST_KNOTS:
+    room = MOST_KNOTS - len(t)
+    if room <= 0 or (when is None and room < len(t) - 1):
         return None
     chosen = np.ones(len(t) - 1, dtype=bool)
     if isinstance(refusal, Unproved):
@@ -71,7 +72,7 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
     elif isinstance(refusal, NoFunnel) and refusal.diagnosis.dominant == "knots":
         around = nearby * float(t[-1] - t[0])
         chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
-    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - len(t))
+    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - (when or 0.0)), room)
 
 
 def refusal_time(refusal: Infeasible) -> float | None:
