@@ -62,9 +62,9 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
     nearby: of the motion. All of them, the nearest to its time first; only those near it if V falls
     at its instant, and only those that are not proved if V falls at every knot.
     """
-    t, when = setting.policy.t, refusal_time(refusal)
-    room = MOST_KNOTS - len(t)
-    if room <= 0 or (when is None and room < len(t) - 1):
+    t, said = setting.policy.t, refusal_time(refusal)
+    room, when = MOST_KNOTS - len(t), 0.0 if said is None else said
+    if room <= 0 or (said is None and room < len(t) - 1):
         return None
     chosen = np.ones(len(t) - 1, dtype=bool)
     if isinstance(refusal, Unproved):
@@ -72,7 +72,7 @@ def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | 
     elif isinstance(refusal, NoFunnel) and refusal.diagnosis.dominant == "knots":
         around = nearby * float(t[-1] - t[0])
         chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
-    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - (when or 0.0)), room)
+    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - when), room)
 
 
 def refusal_time(refusal: Infeasible) -> float | None:
