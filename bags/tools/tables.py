@@ -408,4 +408,6 @@ def _arrow(found: FieldDesc, types: Typestore) -> Any:
     if found[0] != Nodetype.BASE:
         return pyarrow.list_(_arrow(found[1][0], types))
     name = str(found[1][0])
-    return pyarrow.type_for_alias({"byte": "uint8", "char": "uint8"}.get(name, name))
+    return pyarrow.type_for_alias(
+        {"byte": "uint8", "char": "uint8", "octet": "uint8", "wstring": "string"}.get(name, name)
+    )
