@@ -126,7 +126,7 @@ class RemotePath(PosixPath):
         return Parts()
 
     def forget(self) -> None:
-        """Let go of what was fetched of it, and of those below it."""
+        """Drop all that was fetched, here and below."""
         self.__dict__.pop("_held", None)
         for child in self._below.values():
             child.forget()
