@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 17_920,
-    ("bags",): 11_918,
+    ("bags",): 11_821,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_320,
+    ("tests",): 22_309,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
