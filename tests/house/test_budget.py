@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 17_920,
     ("bags",): 11_821,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_309,
+    ("tests",): 21_617,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
