@@ -1,6 +1,7 @@
 """What holds at run time for every kind of design with a policy: its monitor, its controller."""
 
 import math
+import re
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -102,7 +103,7 @@ def test_a_run_as_it_should_be_is_inside_until_the_proof_is_over(run: Run) -> No
 @pytest.mark.parametrize(
     ("when", "what", "reason"),
     [
-        (5.0, "state", "nan"),
+        (5.0, "state", r"nan\]? at t ="),
         (5.0, "input", "no "),
         (5.0, "no input", "no "),
         (math.nan, "", "stamp is nan"),
@@ -122,7 +123,7 @@ def test_a_sample_that_cannot_be_judged_ends_the_run(
     for reading in (bad, later):
         assert reading.status is Status.UNKNOWN
         assert math.isnan(reading.margin)
-        assert reason in reading.reason
+        assert re.search(reason, reading.reason)
     monitor.restart()
     for k in range(5):
         reading = monitor.update((9 + k) * run.period, run.y[k], run.u[k])
@@ -171,7 +172,7 @@ def test_a_robot_away_from_the_start_is_waited_for_and_then_given_up(run: Run) -
 @pytest.mark.parametrize(
     ("when", "reason"),
     [
-        (3.0, "nan"),
+        (3.0, r"nan\]? at t ="),
         (4.0, "is missing"),
         (3.5, "from when the next one"),
         (0.5, "time went back"),
@@ -183,6 +184,6 @@ def test_a_sample_that_cannot_be_used_keeps_the_input_and_ends_the_run(
     controller = run.controller()
     for k in range(3):
         controller.update(k * run.period, run.y[k])
-    before, y = controller.u, run.y[3] * (math.nan if reason == "nan" else 1.0)
+    before, y = controller.u, run.y[3] * (math.nan if when == 3.0 else 1.0)
     np.testing.assert_array_equal(controller.update(when * run.period, y), before)
-    assert reason in controller.ended
+    assert re.search(reason, controller.ended)
