@@ -233,17 +233,18 @@ class Descent:
         return self.path(z) if self.inequalities else self.to_minimum(z)
 
     def path(self, z: FloatArray, *, barrier: Repulsion | None = None) -> Minimum:
-        """Follow the minimisers for μ → 0."""
+        """Follow the minimisers for μ → 0; the last that was reached, if one is not."""
         size = sum(inequality.order for inequality in self.inequalities)
         size += 0 if barrier is None else barrier.U.shape[1]
-        gap = INEQUALITY_GAP if barrier is None else GAP
+        gap, last = INEQUALITY_GAP if barrier is None else GAP, None
         mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
         while True:
             found = self.to_minimum(z, mu=mu, barrier=barrier)
-            z = _unknowns(found)
-            small = mu * size <= gap * found.point.J or self.perfect >= found.point.J
-            if small or not found.converged:
+            if not found.converged:
+                return found if last is None else replace(last, converged=False)
+            if mu * size <= gap * found.point.J or self.perfect >= found.point.J:
                 return found
+            z, last = _unknowns(found), found
             mu *= MU_FALL
 
     def to_minimum(
