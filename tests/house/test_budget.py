@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_872,
+    ("nlsid_core",): 17_795,
     ("bags",): 11_821,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_296,
+    ("tests",): 22_283,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
