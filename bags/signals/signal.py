@@ -81,20 +81,23 @@ class SignalPath:
         """Whether it leads through a named message of an array, so that it may be absent."""
         return any(step.key is not None for step in self.steps[:-1])
 
-    def check(self, msgtype: str, types: Typestore) -> None:
-        """BagError unless messages of `msgtype` have a number here; it names the nearest that are.
+    def check(self, msgtype: str, types: Typestore) -> tuple[tuple[str, str], ...]:
+        """Find the (message type, field) on the way to the number in messages of `msgtype`.
 
-        The length of a dynamic array is only known message by message: see `value`.
+        BagError if there is no number here; it names the nearest that are. The length of a dynamic
+        array is only known message by message: see `value`.
         """
         current: FieldDesc = (Nodetype.NAME, msgtype)
+        way: list[tuple[str, str]] = []
         for step in self.steps:
             if current[0] != Nodetype.NAME:
                 raise BagError(f"{self}: {_describe(current)} has no field '{step.field}'")
             owner = str(current[1])
+            way.append((owner, step.field))
             if owner == QUATERNION and step is self.steps[-1] and step.field in ANGLES:
                 if step.picks:
                     raise BagError(f"{self}: '{step.field}' is an angle, not an array")
-                return
+                return tuple(way)
             fields = fields_of(owner, types)
             if step.field not in fields:
                 near = did_you_mean(
@@ -112,6 +115,7 @@ class SignalPath:
             )
         if current[1][0] in ("string", "wstring"):
             raise BagError(f"{self} is {_describe(current)}, not a number")
+        return tuple(way)
 
     def expand(self, message: Any) -> list["SignalPath"]:
         """The signals that `[*]` stands for in a decoded message; each holds on to that length."""
@@ -127,7 +131,8 @@ class SignalPath:
 
     def targets(self, msgtype: str, types: Typestore) -> list[tuple[Step, ...]]:
         """The numbers in a message that `combine` makes this signal's value of."""
-        if not self._is_angle(msgtype, types):
+        owner, field = self.check(msgtype, types)[-1]
+        if owner != QUATERNION or field not in ANGLES:
             return [self.steps]
         return [(*self.steps[:-1], Step(letter)) for letter in "xyzw"]
 
@@ -174,16 +179,6 @@ class SignalPath:
                 array = array.copy()  # a decoded message's array is a view of its bytes
                 setattr(message, attribute(last.field), array)
             array[self._place(last, message, array)] = value
-
-    def _is_angle(self, msgtype: str, types: Typestore) -> bool:
-        if self.steps[-1].field not in ANGLES:
-            return False
-        owner: FieldDesc = (Nodetype.NAME, msgtype)
-        for step in self.steps[:-1]:
-            owner = fields_of(str(owner[1]), types)[step.field]
-            if owner[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-                owner = owner[1][0]
-        return owner == (Nodetype.NAME, QUATERNION)
 
     def _place(self, step: Step, owner: Any, array: Any) -> int:
         """The index that `step` names in `array`, a field of `owner`; -1 if no element has it."""

@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_034,
-    ("bags",): 11_821,
+    ("bags",): 11_749,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_323,
+    ("tests",): 22_320,
     ("benchmarks", "examples"): 3_796,
 }
 ARGUMENTS, FIELDS = 6, 8
