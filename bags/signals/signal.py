@@ -131,8 +131,7 @@ class SignalPath:
 
     def targets(self, msgtype: str, types: Typestore) -> list[tuple[Step, ...]]:
         """The numbers in a message that `combine` makes this signal's value of."""
-        owner, field = self.check(msgtype, types)[-1]
-        if owner != QUATERNION or field not in ANGLES:
+        if not self._is_angle(msgtype, types):
             return [self.steps]
         return [(*self.steps[:-1], Step(letter)) for letter in "xyzw"]
 
@@ -179,6 +178,16 @@ class SignalPath:
                 array = array.copy()  # a decoded message's array is a view of its bytes
                 setattr(message, attribute(last.field), array)
             array[self._place(last, message, array)] = value
+
+    def _is_angle(self, msgtype: str, types: Typestore) -> bool:
+        if self.steps[-1].field not in ANGLES:
+            return False
+        owner: FieldDesc = (Nodetype.NAME, msgtype)
+        for step in self.steps[:-1]:
+            owner = fields_of(str(owner[1]), types)[step.field]
+            if owner[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                owner = owner[1][0]
+        return owner == (Nodetype.NAME, QUATERNION)
 
     def _place(self, step: Step, owner: Any, array: Any) -> int:
         """The index that `step` names in `array`, a field of `owner`; -1 if no element has it."""

@@ -13,7 +13,7 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_034,
-    ("bags",): 11_749,
+    ("bags",): 11_757,
     ("nlsid_ros",): 2_659,
     ("tests",): 22_320,
     ("benchmarks", "examples"): 3_796,
