@@ -374,8 +374,8 @@ class McapWriter:
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=len(content),
         )
-        self._content, self._entries = bytearray(), {}
         self._put(chunk, entries)
+        self._content, self._entries = bytearray(), {}  # where it cannot be written it is kept
 
     def copy_chunk(self, whole: Whole) -> None:
         """Append a whole chunk of another file, whose channels have the same numbers here."""
