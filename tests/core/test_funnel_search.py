@@ -10,7 +10,6 @@ from benchmarks.thesis.alternation import exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import Simulation
 from nlsid import ContinuousTracking, Design, Nominal, VectorField, check, integrate_nominal
-from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
@@ -21,7 +20,7 @@ from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values
-from tests.funnel_problem import hanging
+from tests.funnel_problem import hanging, hung
 
 GOAL = 20 * np.eye(2)
 WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}
@@ -74,9 +73,8 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
 def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> None:
     with pytest.raises(Infeasible, match=r"no funnel at t = 1\.5 s"):
         sample_funnel(ContinuousTracking(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1))), samples=3)
-    problem = ContinuousTracking(*hanging(), goal=GOAL)
-    sampled, proved = sample_funnel(problem), design_funnel(problem)
-    assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
+    sampled = sample_funnel(ContinuousTracking(*hanging(), goal=GOAL))
+    assert 0.999 <= sampled.volumes[0] / volume_of(hung()) < 1.01
 
 
 def test_a_sample_at_one_end_only_is_refused() -> None:
@@ -92,11 +90,9 @@ def setting() -> Setting:
     return prepare(ContinuousTracking(*hanging(), goal=GOAL, **DEFAULTS))
 
 
-@pytest.mark.slow
 def test_v_steps_grow_the_funnel_and_it_is_proved() -> None:
-    rho = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    found = design_funnel(ContinuousTracking(*hanging(), goal=GOAL, shape="P"))
-    assert found.funnel.volume_integral() > 1.05 * rho.funnel.volume_integral()
+    found = hung("P")
+    assert volume_of(found) > 1.05 * volume_of(hung())
     assert np.min(found.found.proved.margins) > 0
     volumes = [volume for _, volume in found.found.history[1:]]
     assert (np.diff(volumes) > 0).all()
@@ -104,6 +100,14 @@ def test_v_steps_grow_the_funnel_and_it_is_proved() -> None:
 
 def volume_of(design: FunnelDesign) -> float:
     return design.funnel.volume_integral()
+
+
+def no_start_leaves(design: FunnelDesign) -> bool:
+    """Pushed at every step as is worst."""
+    run = Simulation(design.model, design.policy, design.funnel).boundary(
+        starts=500, rng=np.random.default_rng(4), adversary=True
+    )
+    return run.violations == 0 and run.max_v > 0.9
 
 
 def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_further(
@@ -141,7 +145,7 @@ def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     )
     assert design.model.is_pushed
     assert volume_of(design) > 1.25 * volume_of(rho)
-    stays_inside(design, pushed=0.01)
+    assert no_start_leaves(design)
 
 
 @pytest.mark.slow
@@ -151,7 +155,10 @@ def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
         for s in ("rho", "P")
     )
     assert volume_of(design) > 1.1 * volume_of(rho)
-    assert stays_inside(design) > 100
+    assert no_start_leaves(design)
+    edge = design.funnel.outline(0.0, (0, 1))
+    asked = (edge - design.policy.x(0.0)) @ design.policy.K(0.0).T
+    assert np.abs(asked).max() > 0.4, "more than there is"
 
 
 @pytest.mark.slow
@@ -174,32 +181,6 @@ def test_p_stays_where_a_taylor_polynomial_is_valid() -> None:
                 assert widths[entry] <= box[entry][1]
 
 
-def stays_inside(design: FunnelDesign, pushed: float = 0.0) -> int:
-    """Follow 200 starts on the boundary, pushed anew at every step; how many inputs clipped."""
-    rng, steps, clipped = np.random.default_rng(4), 400, 0
-    funnel, policy, field = design.funnel, design.policy, design.model
-    times, h = np.linspace(funnel.t[0], funnel.t[-1], steps + 1, retstep=True)
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    x = 0.9999 * np.linalg.solve(np.linalg.cholesky(funnel.shape(times[0])).T, circle).T
-    for t in times[:-1].tolist():
-        w = pushed * rng.choice([-1.0, 1.0], size=len(field.uncertain))
-
-        def rate(x: FloatArray, t: float = t, w: FloatArray = w) -> FloatArray:
-            return field(t, x, policy(t, x), w)
-
-        if len(policy.limits):
-            clipped += int((np.abs(policy(t, x)) >= policy.limits[:, 2]).sum())
-        a = rate(x)
-        b = rate(x + h / 2 * a)
-        c = rate(x + h / 2 * b)
-        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
-        P = funnel.shape(t + h)
-        assert np.einsum("bi,ij,bj->b", x, P, x).max() <= 1.0
-    return clipped
-
-
 def test_a_design_knows_how_it_was_found() -> None:
-    design = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    assert set(design.found.seconds) == {"policy", "rho", "proof"}
-    assert design.found.history[0] == ("rho", design.funnel.volume_integral())
+    assert set(hung().found.seconds) == {"policy", "rho", "proof"}
+    assert hung().found.history[0] == ("rho", volume_of(hung()))

@@ -1,6 +1,5 @@
 """Funnels of policies whose inputs saturate: proved mode by mode, simulated, and forged."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import pytest
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core import proofs
 from nlsid_core.design import (
     ContinuousTracking,
     FunnelDesign,
@@ -19,17 +18,13 @@ from nlsid_core.design import (
     design_funnel,
     integrate_nominal,
 )
-from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
-from nlsid_core.design.continuous.graded import Graded, monomials_of
 from nlsid_core.dynamics import Nominal, VectorField, constant_on
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.core.kernel import refusals
-from tests.decided import decided
-from tests.funnel_files import Files, forged_by, saved, write
+from tests.edits import Edit, changed, put, scaled
+from tests.funnel_files import POLICY, PROOF, Files, bind, files_of, forged_by
 from tests.verbs import nlsid
 
 LIMIT = 9.0
@@ -54,9 +49,9 @@ def design() -> FunnelDesign:
 
 
 @pytest.fixture(scope="module")
-def files(design: FunnelDesign, tmp_path_factory: pytest.TempPathFactory) -> Files:
+def files(design: FunnelDesign) -> Files:
     """Its four documents."""
-    return saved(design, tmp_path_factory.mktemp("saturated"))
+    return files_of(design)
 
 
 def demand(found: FunnelDesign, t: float) -> float:
@@ -71,7 +66,7 @@ def test_a_funnel_in_which_the_input_saturates_is_proved_and_says_so(
 ) -> None:
     assert demand(design, 0.0) > 1.2 * LIMIT
     proof = design.save(tmp_path)[-1]
-    exact = check(proof)
+    exact = proofs.check(proof)
     assert "u0 clipped to [-9, 9]" in exact.assumptions[0]
     assert "without" not in exact.assumptions[0]
     assert exact.margin > 0
@@ -93,131 +88,48 @@ def test_no_start_leaves_with_the_true_sine_and_with_less_torque_some_do(
     assert Simulation(truth, weaker, design.funnel).boundary(starts=500, rng=rng).violations > 0
 
 
-def test_what_is_proved_in_a_mode_is_what_the_clipped_loop_does(design: FunnelDesign) -> None:
-    """c + Στq = dρ/ds - dW/ds where ρ = W, with V̇ of the simulated dynamics in that mode."""
-    rng = np.random.default_rng(5)
-    pieces, seen = design.found.proved.pieces, set()
-    for i in rng.permutation(len(pieces))[:60].tolist():
-        piece = pieces.select(np.array([i]))
-        s = float(rng.uniform())
-        share = (float(piece.index[0]) + s) / 2.0 ** float(piece.level[0])
-        k = int(piece.interval[0])
-        t, h = design.funnel.t[k], design.funnel.t[k + 1] - design.funnel.t[k]
-        when = float(t + share * h)
-        X = design.funnel.boundary(when, unit(rng, 40))
-        x_bar = X - design.funnel.nominal(when)
-        asked = design.policy.u(when) - x_bar @ design.policy.K(when).T
-        side = np.where(asked > LIMIT, 1, np.where(asked < -LIMIT, -1, 0))[:, 0]
-        here = side == piece.mode[0, 0]
-        if not here.any():
-            continue
-        seen.add(int(piece.mode[0, 0]))
-        w = design.model.vertices()[int(piece.vertex[0])]
-        rate = design.model(when, X, design.policy(when, X), w) - design.policy.x.derivative()(when)
-        P = (1 - share) * design.funnel.P[k] + share * design.funnel.P[k + 1]
-        P_rate = design.funnel.P[k + 1] - design.funnel.P[k]
-        growth = design.funnel.rho[k + 1] - design.funnel.rho[k]
-        W_rate = 2 * h * np.einsum("ni,ij,nj->n", x_bar, P, rate)
-        W_rate += np.einsum("ni,ij,nj->n", x_bar, P_rate, x_bar)
-        z = np.linalg.solve(piece.T[0], x_bar.T).T
-        c = value(design, piece, z, s)
-        bare = value(design, replace(piece, tau=0 * piece.tau), z, s)
-        assert bare[here] == pytest.approx((growth - W_rate)[here], rel=1e-6, abs=1e-9)
-        assert (c[here] <= bare[here] + 1e-9).all()  # τq ≥ 0 in the mode
-        assert (c > 0).all()  # and everywhere on the boundary c is what the proof says it is
-    assert seen == {-1, 0, 1}
-
-
-def value(design: FunnelDesign, piece: Pieces, z: FloatArray, s: float) -> FloatArray:
-    """c(s, z) of one piece, from the search's own expansion."""
-    return sum_of(closed_loop_polynomial(design.model, design.policy, design.funnel, piece), z, s)
-
-
-def sum_of(c: Graded, z: FloatArray, s: float) -> FloatArray:
-    total = np.zeros(len(z))
-    for q, part in c.items():
-        S = part.shape[1] - 1
-        weights = np.array([s**k * (1 - s) ** (S - k) for k in range(S + 1)])
-        rows: IntArray = monomials_of(z.shape[1], q)
-        total += monomial_values(rows, z) @ (weights @ part[0])
-    return total
-
-
-def unit(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points of the unit circle."""
-    angle = rng.uniform(0, 2 * np.pi, count)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
 # -- forgeries -------------------------------------------------------------------------------
 
 
-def pieces_of(files: Files) -> list[Any]:
-    """The proof's pieces."""
-    return list(files["funnel.proof.json"]["proof"]["pieces"])
+def piece_of(mode: int, edit: Edit) -> Edit:
+    """Changes the first piece of a mode."""
+
+    def forge(files: Files) -> None:
+        pieces = files[PROOF]["proof"]["pieces"]
+        edit(next(piece for piece in pieces if piece["mode"] == [mode]))
+
+    return forge
 
 
-def limits_widened(files: Files) -> None:
-    """By 1 %, after the fact."""
-    files["policy.json"]["limits"] = [[0, -1.01 * LIMIT, 1.01 * LIMIT]]
+PIECES = f"{PROOF} proof pieces"
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "limits wider": (scaled(f"{POLICY} limits", 1.01), "not_positive"),
+    "no limits": (put(f"{POLICY} limits", []), "malformed"),
+    "nothing for the high limit": (
+        changed(PIECES, lambda pieces: [each for each in pieces if each["mode"] != [1]]),
+        "not_covered",
+    ),
+    "a free piece called high": (piece_of(0, put("mode", [1])), "not_covered"),
+    "no such mode": (put(f"{PIECES} 0 mode", [2]), "not_covered"),
+    "weights, for which format 2 had a place": (
+        piece_of(1, put("tau 0 squares weights", [-1, -1])),
+        "left",
+    ),
+    "a multiplier four times as large": (
+        piece_of(-1, changed("tau 0 squares unit", lambda unit: unit - 1)),
+        "not_positive",
+    ),
+}
 
 
-def limits_dropped(files: Files) -> None:
-    """As if the motor could do anything."""
-    files["policy.json"]["limits"] = []
+@pytest.mark.parametrize(("forge", "reason"), FORGERIES.values(), ids=FORGERIES)
+def test_a_forged_saturated_funnel_is_refused(files: Files, forge: Edit, reason: str) -> None:
+    refusals.refused_with_fresh_digests(forged_by(forge, files), reason)
 
 
-def mode_missing(files: Files) -> None:
-    """Nothing is shown for the high limit."""
-    kept = [piece for piece in pieces_of(files) if piece["mode"] != [1]]
-    files["funnel.proof.json"]["proof"]["pieces"] = kept
-
-
-def mode_renamed(files: Files) -> None:
-    """The free mode's piece, called high."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [0])
-    piece["mode"] = [1]
-
-
-def mode_unknown(files: Files) -> None:
-    """There is no mode 2."""
-    pieces_of(files)[0]["mode"] = [2]
-
-
-def multiplier_flipped(files: Files) -> None:
-    """τ ≤ 0 would allow V to grow in its mode; format 2 had a place for it."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [1])
-    squares = piece["tau"][0]["squares"]
-    squares["weights"] = [-1] * max(map(len, squares["factors"]))
-
-
-def multiplier_changed(files: Files) -> None:
-    """Four times as large: another polynomial than its factors stand for."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [-1])
-    piece["tau"][0]["squares"]["unit"] -= 1
-
-
-FORGERIES: list[tuple[Callable[[Files], None], str]] = [
-    (limits_widened, "not_positive"),
-    (limits_dropped, "malformed"),
-    (mode_missing, "not_covered"),
-    (mode_renamed, "not_covered"),
-    (mode_unknown, "not_covered"),
-    (multiplier_flipped, "left"),
-    (multiplier_changed, "not_positive"),
-]
-
-
-@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
-def test_a_forged_saturated_funnel_is_refused(
-    files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
-) -> None:
-    with refusals.refused(reason):
-        decided(write(forged_by(forge, files), tmp_path, rebind=True))
-
-
-def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> None:
-    assert decided(write(files, tmp_path, rebind=True)).margin > 0
+def test_the_same_files_bound_again_are_proved(files: Files) -> None:
+    bind(files)
+    assert proofs.decide(files[PROOF], files).margin > 0
 
 
 # -- more inputs, bad input --------------------------------------------------------------------
@@ -251,7 +163,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     edge = found.funnel.outline(0.0, (0, 1))
     asked = -(edge - found.policy.x(0.0)) @ found.policy.K(0.0).T
     assert (np.abs(asked).max(axis=0) > [0.9, 0.8]).all()
-    assert check(found.save(tmp_path)[-1]).margin > 0
+    assert proofs.check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(7)
     assert (
         Simulation(field, found.policy, found.funnel).boundary(starts=3000, rng=rng).violations == 0
@@ -271,7 +183,7 @@ def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
     found = design_funnel(ContinuousTracking(field, **options, policy=policy))
     assert found.found.proved.pieces.kappa is not None
     assert demand(found, 0.0) > 0.6
-    assert check(found.save(tmp_path)[-1]).margin > 0
+    assert proofs.check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(10)
     run = Simulation(field, found.policy, found.funnel).boundary(
         starts=2000, rng=rng, adversary=True

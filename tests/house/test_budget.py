@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 17_795,
-    ("bags",): 11_821,
+    ("bags",): 11_757,
     ("nlsid_ros",): 2_659,
-    ("tests",): 22_283,
+    ("tests",): 21_303,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
