@@ -18,6 +18,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
+from math import prod
 
 from . import text
 from .exact import Matrix, at_most, combined, definite, unit
@@ -99,14 +100,14 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
     own = " of its own observer" if several else ""
-    shown: dict[tuple[bool, int, int], dict[str, str]] = {}
+    shown: list[tuple[Any, ...]] = []  # the plainest first, by what is before the words
     for i, tube in enumerate(tubes, 1):
         label = f"tube {i}" if len(tubes) > 1 else ""
-        plainness = (bool(tube["follows"]), tube["assumption"]["samples"] or 0, i)
-        shown[plainness] = _shown(model, tube, label)
+        lasts, size = tube["assumption"]["samples"] or 0, prod(tube["half_widths"])
+        shown.append((bool(tube["follows"]), lasts, size, i, _shown(model, tube, label)))
         which = f"{label}: " if label else ""
         assumptions.append(f"{which}innovation energy{own}: {_energy(model, tube)}")
-    first, *others = (shown[plainness] for plainness in sorted(shown))
+    first, *others = (words for *_, words in sorted(shown))
     stay = " stays" if len(model.y) == 1 else " stay"
     said = text.say(
         SENTENCE,
