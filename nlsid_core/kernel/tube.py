@@ -100,14 +100,15 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
     own = " of its own observer" if several else ""
-    shown: list[tuple[Any, ...]] = []  # the plainest first, by what is before the words
+    shown: list[Members] = []
     for i, tube in enumerate(tubes, 1):
         label = f"tube {i}" if len(tubes) > 1 else ""
         lasts, size = tube["assumption"]["samples"] or 0, prod(tube["half_widths"])
-        shown.append((bool(tube["follows"]), lasts, size, i, _shown(model, tube, label)))
+        plainness = (bool(tube["follows"]), lasts, size, i)
+        shown.append({**_shown(model, tube, label), "plainness": plainness})
         which = f"{label}: " if label else ""
         assumptions.append(f"{which}innovation energy{own}: {_energy(model, tube)}")
-    first, *others = (words for *_, words in sorted(shown))
+    first, *others = sorted(shown, key=lambda words: words["plainness"])
     stay = " stays" if len(model.y) == 1 else " stay"
     said = text.say(
         SENTENCE,
