@@ -1,11 +1,6 @@
 """Bags that are written: split, compressed, with quality of service, as every reader reads them."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -32,9 +27,8 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.message_types import decode
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
 from bags.recordings.writer import BagWriter
-from bags.signals.recording import Arrival, Recent
 from bags.tools.copies import Into
-from bags.tools.recover import recover, repair
+from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import (
     CMD,
@@ -152,36 +146,6 @@ def test_a_closed_chunk_is_on_disk(tmp_path: Path) -> None:
     assert _stamps_on_disk(bag.path) == [1]
     bag.close()
     assert _stamps_on_disk(bag.path) == [1, 2]
-
-
-def test_a_killed_writer_loses_at_most_the_last_chunk(tmp_path: Path) -> None:
-    script = (
-        "import sys, time\n"
-        "from bags.recordings.writer import BagWriter\n"
-        "bag = BagWriter(sys.argv[1], in_place=True)\n"
-        "while True:\n"
-        "    now = time.time_ns()\n"
-        f"    bag.write('{CMD}', '{CMD_TYPE}', b'\\0\\1\\0\\0' + bytes(64), log_time_ns=now,"
-        " publish_time_ns=now)\n"
-        "    if bag.counts[sys.argv[2]] % 20 == 0:\n        bag.close_chunk()\n"
-        "    print(now, flush=True)\n"
-        "    time.sleep(0.001)\n"
-    )
-    root = Path(__file__).parents[2]
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path / "trial"), CMD],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=root,
-    )
-    assert process.stdout is not None
-    first = process.stdout.readline()
-    time.sleep(0.7)
-    os.kill(process.pid, signal.SIGKILL)
-    written = [int(line) for line in (first + process.communicate()[0]).split()]
-    kept = _stamps_on_disk(tmp_path / "trial")
-    assert kept == written[: len(kept)]
-    assert len(written) - len(kept) <= 20
 
 
 def _stamps_on_disk(bag: Path) -> list[int]:
@@ -415,28 +379,6 @@ def test_a_latched_topic_of_ros_1_is_latched_in_ros_2(tmp_path: Path) -> None:
     recover(tmp_path / "old.bag", tmp_path / "new")
     assert profiles_in(tmp_path / "new") == {MAP: [LATCHED.document()], CHATTER: []}
     assert counts_by_rosbags(tmp_path / "new") == {MAP: 1, CHATTER: 1}
-
-
-def test_a_repaired_recording_keeps_what_its_recorder_knew(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "run", in_place=True)
-    bag.add_topic(MAP, STRING, offered=(LATCHED,))
-    types = get_typestore(Stores.ROS2_JAZZY)
-    data = bytes(types.serialize_cdr(types.types[STRING]("a"), STRING))
-    bag.write(MAP, STRING, data, log_time_ns=5, publish_time_ns=5)
-    bag.close_chunk()
-    bag.abandon()
-    assert repair(tmp_path / "run") == 1
-    assert profiles_in(tmp_path / "run") == {MAP: [LATCHED.document()]}
-    assert counts_by_rosbags(tmp_path / "run") == {MAP: 1}
-
-
-def test_a_snapshot_keeps_what_was_offered(tmp_path: Path) -> None:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    data = bytes(types.serialize_cdr(types.types[STRING]("a"), STRING))
-    recent = Recent(10.0)
-    recent.add(Arrival(MAP, STRING, data, 5, 5))
-    recent.save(tmp_path / "snapshot", offered={MAP: (LATCHED,)})
-    assert profiles_in(tmp_path / "snapshot") == {MAP: [LATCHED.document()]}
 
 
 def test_profiles_are_read_as_rosbags_reads_them_and_written_as_it_does() -> None:

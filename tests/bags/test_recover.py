@@ -23,6 +23,7 @@ from bags.monitoring.replay import replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import definitions_from
 from bags.recordings.mcap_file import McapFile
+from bags.recordings.quality import LATCHED
 from bags.recordings.writer import BagWriter, Output
 from bags.signals.reader import bag_origin, read_signals
 from bags.signals.recording import Arrival, Recording
@@ -238,7 +239,7 @@ def test_before_its_repair_mcap_reads_the_complete_chunks_and_rosbags_nothing(
 def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) -> None:
     definition = definitions_from({"my_robot/msg/Arm": "float64 x\n"})["my_robot/msg/Arm"]
     bag = BagWriter(tmp_path / "run", in_place=True, custom={"robot": "arm"})
-    bag.add_topic("/arm", definition.msgtype, definition=definition)
+    bag.add_topic("/arm", definition.msgtype, definition=definition, offered=(LATCHED,))
     for k in range(25):
         data = b"\0\1\0\0" + struct.pack("<d", float(k))
         bag.write("/arm", definition.msgtype, data, log_time_ns=k, publish_time_ns=k)
@@ -247,6 +248,7 @@ def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) 
     assert repair(tmp_path / "run") == 25
     with Bag(tmp_path / "run") as source:
         assert source.custom == {"robot": "arm"}
+        assert source.offered("/arm") == (LATCHED,)
     [values] = read_signals(tmp_path / "run", ["/arm:x"]).values()
     assert values.values.tolist() == list(range(25))
     with AnyReader([tmp_path / "run"]) as reader:
