@@ -242,7 +242,7 @@ def test_topics_of_other_systems_are_exported(tmp_path: Path) -> None:
 
 
 def test_an_unfinished_recording_is_called_unfinished(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "live", in_place=True)
+    bag = BagWriter(tmp_path / "live")
     bag.write(ODOM, ODOM_TYPE, odometry(1, 0.5), log_time_ns=1, publish_time_ns=1)
     bag.close_chunk()
     assert "truncated or unfinished" in refused(tmp_path / "live")

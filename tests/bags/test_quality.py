@@ -92,33 +92,15 @@ def test_a_topic_without_messages_is_listed(tmp_path: Path) -> None:
 
 def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
     (tmp_path / "trial").mkdir()
-    for in_place in (False, True):
-        with pytest.raises(BagError, match="trial exists already"):
-            BagWriter(tmp_path / "trial", in_place=in_place)
+    with pytest.raises(BagError, match="trial exists already"):
+        BagWriter(tmp_path / "trial")
     assert list(tmp_path.rglob("*")) == [tmp_path / "trial"]
 
 
-@pytest.mark.parametrize("in_place", [False, True])
-def test_after_an_exception_only_a_bag_in_place_keeps_what_was_written(
-    tmp_path: Path, in_place: bool
-) -> None:
-    with (
-        pytest.raises(BagError, match="is not known"),
-        BagWriter(tmp_path / "trial", in_place=in_place) as bag,
-    ):
-        write_until_it_fails(bag)
-    assert [path.name for path in tmp_path.iterdir()] == ["trial"] * in_place
-    if in_place:
-        with Reader(tmp_path / "trial") as reader:
-            assert reader.message_count == 1
-
-
-def test_a_folder_that_appears_while_writing_is_not_replaced(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "trial")
-    (tmp_path / "trial").mkdir()
-    with pytest.raises(BagError, match="appeared while"):
-        bag.close()
-    assert list(tmp_path.iterdir()) == [tmp_path / "trial"]
+def test_an_exception_leaves_nothing_of_a_bag(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="is not known"), BagWriter(tmp_path / "trial") as bag:
+        bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_second_type_on_a_topic_is_refused(tmp_path: Path) -> None:
@@ -137,7 +119,7 @@ def test_an_unknown_type_and_a_negative_time_are_refused(tmp_path: Path) -> None
 
 
 def test_a_closed_chunk_is_on_disk(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "trial", in_place=True)
+    bag = BagWriter(tmp_path / "trial")
     bag.write(CMD, CMD_TYPE, command(1, 0.5), log_time_ns=1, publish_time_ns=1)
     assert _stamps_on_disk(bag.path) == []
     bag.close_chunk()
@@ -161,11 +143,6 @@ def _stamps_on_disk(bag: Path) -> list[int]:
         except EndOfFile:
             return stamps
     return stamps
-
-
-def write_until_it_fails(bag: BagWriter) -> None:
-    bag.write(CMD, CMD_TYPE, command(0, 0.5), log_time_ns=0, publish_time_ns=0)
-    bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
 
 
 # -- Bags in several files, compressed or not, of custom types: as we, rosbags and mcap read them

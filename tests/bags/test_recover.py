@@ -185,7 +185,7 @@ COUNT = 300
 def killed_bag(path: Path, *, cut: int) -> Path:
     """A bag of 300 commands in three chunks whose file stops `cut` bytes early."""
     written = path.parent / "whole" / path.name
-    with BagWriter(written, in_place=True) as bag:
+    with BagWriter(written) as bag:
         for k in range(COUNT):
             stamp = START_NS + k * PERIOD_NS
             put(bag, stamp, CMD, CMD_TYPE, command(stamp, float(k)))
@@ -238,7 +238,7 @@ def test_before_its_repair_mcap_reads_the_complete_chunks_and_rosbags_nothing(
 
 def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) -> None:
     definition = definitions_from({"my_robot/msg/Arm": "float64 x\n"})["my_robot/msg/Arm"]
-    bag = BagWriter(tmp_path / "run", in_place=True, custom={"robot": "arm"})
+    bag = BagWriter(tmp_path / "run", custom={"robot": "arm"})
     bag.add_topic("/arm", definition.msgtype, definition=definition, offered=(LATCHED,))
     for k in range(25):
         data = b"\0\1\0\0" + struct.pack("<d", float(k))
@@ -256,7 +256,7 @@ def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) 
 
 
 def test_a_bag_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "live", in_place=True) as bag:
+    with BagWriter(tmp_path / "live") as bag:
         bag.add_topic(ODOM, "nav_msgs/msg/Odometry")
         assert unfinished_bags(tmp_path) == []
         with pytest.raises(BagError, match="it is being written"):
@@ -274,7 +274,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, Recording
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
-recording = Recording(BagWriter(sys.argv[1], in_place=True), least_free=0.0)
+recording = Recording(BagWriter(sys.argv[1]), least_free=0.0)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT}, {LIMIT}))
 recording.add_topic(CMD, standard_definition(CMD_TYPE))
 for k in range(2000):
@@ -331,7 +331,7 @@ def test_a_write_that_fails_leaves_nothing_of_itself_behind(
 
 
 def test_it_ends_while_there_is_room_left_and_says_so(tmp_path: Path) -> None:
-    recording = Recording(BagWriter(tmp_path / "run", in_place=True), least_free=1e12)
+    recording = Recording(BagWriter(tmp_path / "run"), least_free=1e12)
     recording.expect(CMD)
     first = Arrival(CMD, CMD_TYPE, command(START_NS, 0.0), START_NS, START_NS)
     recording.add(first)
