@@ -397,7 +397,7 @@ def test_a_type_that_changed_is_read_as_the_release_defines_it(
 
     message, signal = zero(kind), "/x:range"
     if kind.endswith("Range"):
-        message.range = wanted
+        message.header.stamp.sec, message.range = 5, wanted
     else:
         signal = "/x:markers[0].scale.y"
         message.markers.append(zero("visualization_msgs/msg/Marker"))
