@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 17_872,
-    ("bags",): 11_734,
+    ("bags",): 11_730,
     ("nlsid_ros",): 2_659,
-    ("tests",): 21_473,
+    ("tests",): 21_449,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -39,12 +39,12 @@ def held_against(funnel: Path, bags: Mapping[str, Path]) -> FleetVerdict:
     """The bags of a fleet, judged in this process."""
     design = documents.load(funnel)
     read = read_rows(JudgeBag(design, Centre.COMMAND, {}), bags, workers=Workers())
-    return FleetVerdict(read.rows, frozenset(design.made_with))
+    return FleetVerdict(read, frozenset(design.made_with))
 
 
 def checked(bags: Mapping[str, Path]) -> tuple[Row, ...]:
     """Whether the bags are fit for F1TENTH's configuration."""
-    return read_rows(CheckBag(load_config(CONFIG)), bags, workers=Workers()).rows
+    return read_rows(CheckBag(load_config(CONFIG)), bags, workers=Workers())
 
 
 def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(funnel: Path) -> None:
@@ -221,7 +221,7 @@ def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
     bags, config = named_bags([spoiled / "*" / "*" / "*.mcap"]), load_config(CONFIG)
     split = config.split.model_copy(update={"test": ["r0/*"], "calibration": []})
     config = config.model_copy(update={"split": split})
-    rows = read_rows(CheckBag(config), bags, workers=Workers()).rows
+    rows = read_rows(CheckBag(config), bags, workers=Workers())
     listed = {row.bag: row.reason for row in rows if row.verdict in ("not read", "bad", "copy")}
     left_out = read_fleet(bags, config, tmp_path, workers=Workers()).left_out
     assert listed.keys() == left_out.keys()
