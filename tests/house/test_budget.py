@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 17_872,
     ("bags",): 11_730,
     ("nlsid_ros",): 2_659,
-    ("tests",): 21_449,
+    ("tests",): 21_163,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
