@@ -12,8 +12,6 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
 from tests.conftest import PERIOD
 
-ROUNDING = 1e-9  # relative: the monitor evaluates in floating point
-
 
 def make_monitor(design: OutputTubeDesign, centre: Centre = Centre.COMMAND) -> Monitor:
     return design.monitor(centre=centre)

@@ -132,18 +132,6 @@ def test_a_start_at_the_plans_and_played_inputs_are_said_in_those_words(
     assert verdict.statement.endswith("with those inputs played (no feedback)")
 
 
-def trials(*digests: str) -> list[Json]:
-    """Of recordings that are named by a letter, before a window if there is one."""
-    return [
-        {"name": f"trial {i}", "digest": f"sha256:{64 * digest[0]}{digest[1:]}"}
-        for i, digest in enumerate(digests)
-    ]
-
-
-def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
-    return bound(documents | {"model": documents["model"] | {"bags": trials(*digests)}})
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
