@@ -309,10 +309,6 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
             best = pairs[0]
             before = f"{y.why}; " if y.why else ""
             proposal.why[y.path] = f"{before}follows {best.command.text}: {best}"
-            if abs(best.correlation) < RELATED:
-                proposal.walls.append(
-                    f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
-                )
             washed = "|washout" in y.path
             if best.response.is_position and not best.command.is_position and not washed:
                 proposal.walls.append(

@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_872,
-    ("bags",): 11_757,
+    ("nlsid_core",): 17_884,
+    ("bags",): 11_777,
     ("nlsid_ros",): 2_659,
-    ("tests",): 21_316,
+    ("tests",): 21_321,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
