@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_884,
+    ("nlsid_core",): 17_807,
     ("bags",): 11_777,
     ("nlsid_ros",): 2_659,
-    ("tests",): 21_321,
+    ("tests",): 21_298,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
