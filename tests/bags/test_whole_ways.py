@@ -11,10 +11,10 @@ from scipy.signal import lfilter
 
 from bags.chain.config import load_config
 from bags.chain.joint_bags import write_joint_bag
-from bags.chain.plants import ARM, PENDULUM, PERIOD, Plant
+from bags.chain.plants import PERIOD, Plant
 from bags.chain.simulation import record_repeats
 from bags.chain.steps import read_signals_of
-from bags.chain.tracking_config import load_tracking_config
+from bags.chain.tracking_config import SimulationConfig, load_tracking_config
 from bags.chain.tracking_steps import what_breaks, widest_start
 from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.monitoring.catching import OF_STATES, breaking
@@ -178,7 +178,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_pendulum_swings_at_the_period_of_small_oscillations_and_comes_to_rest() -> None:
-    plant = Plant(PENDULUM, np.random.default_rng(0))
+    plant = Plant("pendulum", np.random.default_rng(0))
     plant.reset([0.1, 0.0])
     angles = []
     for _ in range(3000):
@@ -193,7 +193,7 @@ def test_a_pendulum_swings_at_the_period_of_small_oscillations_and_comes_to_rest
 
 def test_sensor_noise_has_the_stated_size_and_runs_repeat_with_their_seed() -> None:
     def recorded(seed: int) -> np.ndarray:
-        plant = Plant(ARM, np.random.default_rng(seed))
+        plant = Plant("arm", np.random.default_rng(seed))
         return np.array([plant.measure() for _ in range(4000)])
 
     np.testing.assert_allclose(recorded(1).std(axis=0), [1e-3, 1e-3, 1e-2, 1e-2], rtol=0.06)
@@ -204,14 +204,15 @@ def test_sensor_noise_has_the_stated_size_and_runs_repeat_with_their_seed() -> N
 def test_drives_do_not_give_more_than_their_limit() -> None:
     states = []
     for torque in (20.0, 1000.0):
-        plant = Plant(PENDULUM, np.random.default_rng(0))
+        plant = Plant("pendulum", np.random.default_rng(0))
         plant.step([torque])
         states.append(plant.state)
     np.testing.assert_array_equal(states[0], states[1])
 
 
 def test_bags_of_a_simulated_robot_read_back_bit_for_bit_as_repeats(tmp_path: Path) -> None:
-    data = record_repeats(ARM, peak=np.array([4.0, 2.0]), groups=1, repeats=2, seconds=1.0, seed=0)
+    options = SimulationConfig(robot="arm", peak=(4.0, 2.0), groups=1, repeats=2, seconds=1.0)
+    data = list(record_repeats(options))
     bags = [write_joint_bag(tmp_path, trial) for trial in data]
     again = read_signals_of(bags, load_tracking_config(ROOT / "config" / "arm.yaml"))
     for trial, read in zip(data, again, strict=True):
@@ -226,7 +227,7 @@ def test_an_unknown_simulated_robot_is_an_error(tmp_path: Path) -> None:
     text = (ROOT / "config" / "pendulum.yaml").read_text()
     config.write_text(text.replace("  robot: pendulum\n", "  robot: pendulums\n"))
     said = nlsid("demo", "--robot", config, "--out", tmp_path, status=None)
-    assert "there are: pendulum, arm" in said
+    assert "there are: arm, pendulum" in said
     assert "is not this demo's" in nlsid("demo", "--out", tmp_path, status=None)  # nothing is lost
 
 

@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_034,
-    ("bags",): 11_918,
-    ("nlsid_ros",): 2_659,
-    ("tests",): 22_334,
+    ("bags",): 11_735,
+    ("nlsid_ros",): 2_608,
+    ("tests",): 22_259,
     ("benchmarks", "examples"): 3_796,
 }
 ARGUMENTS, FIELDS = 6, 8
