@@ -35,6 +35,7 @@ from nlsid_ros.subscribing import Received, Subscriptions, Wanted
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
+LATE = 1.0  # s since an excitation began, after which its beginning is lost
 MOST_TOPICS = 12  # that a status names: with the rest it has at most 20 values
 SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
 EXPERIMENT = "experiment"  # and the custom datum that holds it
@@ -49,7 +50,12 @@ class TrajectoryRecorder(ManagedNode):
     parameters = (
         Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
         Parameter("bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"),
-        Parameter("at_once", True, "begin a bag when activated; false: wait for ~/start"),
+        Parameter(
+            "at_once",
+            True,
+            "begin a bag when activated; false: wait for ~/start or an excitation, each repeat of "
+            "which then gets a bag of its own",
+        ),
         Parameter("chunk_period", 0.5, "s of messages a kill may lose", (0.05, 0.9)),
         Parameter("least_free", 200.0, "MB left on the disk at which recording stops", (0.0, 1e12)),
         Parameter("snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", (0.0, 600.0)),
@@ -193,22 +199,31 @@ class TrajectoryRecorder(ManagedNode):
             self._recording.add(arrival)
 
     def _on_experiment(self, message: String) -> None:
-        """Keep what an excitation says it does; how one ended is for the bag it was in."""
+        """Keep what an excitation says it does; how one ended is for the bag it was in.
+
+        Of one that began before this recorder a part would be recorded, which is no repeat.
+        """
         try:
             said = files.parse_document(message.data)
-        except NlsidError as error:
-            self.get_logger().warning(f"{SAID_BY} is not in the bag's metadata: {error}")
-            return
-        ended = "ended" in said
-        if ended and not self._experiment:  # latched, of an experiment before this recorder
-            return
-        group = said.get("repeat_group")
-        now = {EXPERIMENT: message.data}
-        if isinstance(group, str):
-            now["repeat_group"] = group
-        if self._recording is not None:
-            self._recording.annotate(now)
-        self._experiment = {} if ended else now
+            begun_ns = files.member(said, "start_ns", int, source=SAID_BY)
+            ended, now_ns = "ended" in said, self.get_clock().now().nanoseconds
+            began_before = not self._experiment if ended else now_ns - begun_ns > LATE * 1e9
+            if began_before:
+                return
+            group = said.get("repeat_group")
+            now = {EXPERIMENT: message.data}
+            if isinstance(group, str):
+                now["repeat_group"] = group
+            if not (ended or self.values.at_once):
+                self._on_stop()
+                self._on_start()
+            if self._recording is not None:
+                self._recording.annotate(now)
+            self._experiment = {} if ended else now
+            if ended and not self.values.at_once:
+                self._on_stop()
+        except (NlsidError, OSError) as error:
+            self.get_logger().error(f"no bag of what {SAID_BY} says: {error}")
 
     def _keep_up(self) -> None:
         if self._recording is None:

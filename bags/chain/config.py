@@ -205,7 +205,7 @@ class FunnelConfig(Section):
 
 
 class MonitorConfig(Section):
-    """What the monitor compares with, and how long it waits."""
+    """What the monitor compares with."""
 
     nominal: Annotated[
         Literal["command", "profile"],
@@ -215,18 +215,6 @@ class MonitorConfig(Section):
             example="command",
         ),
     ] = "command"
-    stale_after: Annotated[
-        Positive | None,
-        Key(
-            "without a response after which the state is unknown (none: 4 periods, at least 0.1 s)",
-            unit="s",
-            example=0.1,
-        ),
-    ] = None
-    command_wait: Annotated[
-        NonNegative,
-        Key("for which a response waits for a command with its stamp", unit="s", example=0.02),
-    ] = 0.02
 
     @property
     def nominal_source(self) -> Centre:
@@ -327,13 +315,6 @@ def _time_refusals(config: Config) -> Iterator[str]:
         yield (
             f"grid.max_gap: {max_gap:g} s is shorter than the period, {period:g} s, so that every "
             "sample would be in a gap; give at least 1.5 periods"
-        )
-    stale = config.monitor.stale_after
-    if stale is not None and stale <= period:
-        yield (
-            f"monitor.stale_after: {stale:g} s is not longer than the period, "
-            f"{period:g} s, so that the live monitor would call every response stale; give at "
-            "least 2 periods"
         )
     horizon = None if config.funnel is None else config.funnel.horizon
     if horizon is not None and round(horizon / period) < 1:

@@ -149,7 +149,6 @@ def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path
     from bags.chain.problems import load_problem, measured
     from bags.commands import show
     from bags.designs import documents
-    from bags.pictures import tables
     from nlsid_core import files
     from nlsid_core.design import design
 
@@ -162,14 +161,13 @@ def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path
         )
     if wiring is not None:
         field: Any = problem.dynamics
-        push, broken = measured(
+        push = measured(
             field,
             bags,
             wiring,
             seconds=given.seconds or None,
             safety_factor=given.safety_factor,
         )
-        out.print(tables.breaking_table(broken))
         problem = replace(problem, dynamics=field.pushed(push.box))
 
     with progress_bar("designing") as progress:

@@ -109,37 +109,6 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
 OF_SENSORS = frozenset(name for name, _ in SABOTAGES[:5])  # put into one output at a time
 
 
-def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
-    """What a robot records that does the same although 0.8 of its command arrives."""
-    return Copy(trial.t, trial.y, trial.u / 0.8)
-
-
-# Of recorded states: none needs a model, and the recording itself says what the robot did.
-OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _commanded_more))
-
-
-@dataclass(frozen=True)
-class Breaking:
-    """Counts by fault: in how many of the trials a copy with it breaks the assumption."""
-
-    trials: int
-    counts: dict[str, int]
-
-
-def breaking(trials: Dataset, used: Callable[[Trajectory], float]) -> Breaking:
-    """What an assumption about recordings of states (y) and inputs would tell from a sound robot.
-
-    used: the largest part of the assumption that a recording shows; above 1 it is broken. Every
-    copy is what a robot with that fault records under the same inputs at its actuators.
-    """
-    ranges = np.ptp(np.vstack([trial.y for trial in trials]), axis=0)
-    counts = {}
-    for name, fault in OF_STATES:
-        copies = [(trial, fault(trial, ranges, None)) for trial in trials]
-        counts[name] = sum(used(replace(trial, y=c.y, u=c.u)) > 1.0 for trial, c in copies)
-    return Breaking(len(trials), counts)
-
-
 @dataclass(frozen=True)
 class Caught:
     """In how many of the trials, by which status, and s from the fault to the alarm (median).

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from bags.monitoring.catching import Breaking, Catching, Caught
+from bags.monitoring.catching import Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import counted, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
@@ -148,13 +148,3 @@ def say_catching(console: Console, catching: Catching) -> None:
         )
     for line in (*catching.beyond, *catching.still, *catching.restarts, *catching.warnings()):
         warn(console, line)
-
-
-def breaking_table(found: Breaking) -> Table:
-    """List by fault how many copies of trials break the assumption of a proof."""
-    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
-    table.add_column("fault")
-    table.add_column("broken", justify="right")
-    for fault, count in found.counts.items():
-        table.add_row(fault, f"{count} of {found.trials}")
-    return table

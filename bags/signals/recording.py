@@ -222,7 +222,7 @@ class Recording:
         ]
 
     def _lost_on(self, topic: str) -> int:
-        """By the publisher's count."""
+        """How many are missing in the publisher's count."""
         sequence = self._sequence[topic]
         return 0 if sequence.mixed else sequence.missing
 

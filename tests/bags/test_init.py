@@ -630,7 +630,6 @@ def test_a_slow_robot_is_set_up_by_the_names_of_its_topics(tmp_path: Path) -> No
     said = nlsid("init", config.parent, bags, *SLOW)
     settings = load_config(config)
     assert settings.grid.period == 1.0
-    assert settings.monitor.stale_after is None, "the nodes take it from the period"
     signals = (*settings.signals.excitation, *settings.signals.response)
     assert [signal.name for signal in signals] == ["power", "temperature"]
     assert "another unit" not in said

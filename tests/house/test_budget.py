@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_034,
-    ("bags",): 11_735,
-    ("nlsid_ros",): 2_608,
-    ("tests",): 22_259,
+    ("nlsid_core",): 18_027,
+    ("bags",): 11_696,
+    ("nlsid_ros",): 2_559,
+    ("tests",): 22_223,
     ("benchmarks", "examples"): 3_796,
 }
 ARGUMENTS, FIELDS = 6, 8
