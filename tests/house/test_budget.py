@@ -13,8 +13,8 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 18_027,
-    ("bags",): 11_696,
-    ("nlsid_ros",): 2_559,
+    ("bags",): 11_678,
+    ("nlsid_ros",): 2_550,
     ("tests",): 22_223,
     ("benchmarks", "examples"): 3_796,
 }
