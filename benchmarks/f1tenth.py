@@ -9,6 +9,7 @@ least squares 11.7 %, simulation-error minimum about 8.5 %.
 import statistics
 import tempfile
 import time
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -24,11 +25,8 @@ from benchmarks.recorded import is_proved
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.identification import Model, Polynomial, simulation_percent
 from nlsid_core.identification.methods.rse import robust_simulation_error
-from nlsid_core.identification.polynomial.moment_rie import (
-    identify_from_repeats,
-    minimise_moment_rie,
-)
-from nlsid_core.identification.polynomial.moments import offsets_of, plain_moments
+from nlsid_core.identification.polynomial.implicit_rie import minimise_implicit_rie
+from nlsid_core.identification.polynomial.moments import rows_without_bias
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from nlsid_core.identification.repeats import compare_repeats
 from nlsid_core.progress import silent
@@ -89,10 +87,12 @@ def bias_removed(train: Dataset, test: Dataset, lags: int) -> dict[str, float | 
     groups = list(train.repeats().values())
     repeated = Dataset(tuple(trial for group in groups for trial in group))
     model_class = Polynomial(lags, set="3.8")
-    unbiased = identify_from_repeats(repeated, model_class, accept_untested_repeats=True)
-    offsets = offsets_of(repeated.trajectories)
-    plain = plain_moments(repeated.trajectories, model_class, offsets)
-    naive = minimise_moment_rie(plain, model_class, repeated, offsets)
+    alone = [replace(trial, group=trial.name) for trial in repeated]
+    biased = Dataset(tuple(trial for trial in alone for _ in range(2)))  # repeats of themselves
+    unbiased, naive = (
+        minimise_implicit_rie(rows_without_bias(data, model_class, accept_untested_repeats=True))
+        for data in (repeated, biased)
+    )
     pairs = [compare_repeats(*pair) for group in groups for pair in combinations(group, 2)]
     return {
         "rie_moments": simulation_percent(unbiased.model, test),

@@ -208,8 +208,8 @@ def alone(reader: Callable[[str], Alone], pattern: str) -> Alone:
 
 
 def _ours(pattern: str) -> Alone:
-    bags = named_bags([Path(pattern)])
-    read(dict(islice(bags.items(), 1)), 0)  # so that imports do not count
+    read(dict(islice(named_bags([Path(pattern)]).items(), 1)), 0)  # so that imports do not count
+    bags: dict[str, Any] = {**named_bags([Path(pattern)])}
     started = time.process_time()
     found = read(bags, 0)
     cpu = time.process_time() - started
@@ -217,8 +217,8 @@ def _ours(pattern: str) -> Alone:
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         1e3 * cpu / len(bags),
         found.digest,
-        sum(answer.requests for answer in found.answers),
-        sum(answer.fetched for answer in found.answers),
+        sum(bag.requests + 1 for bag in bags.values()),  # and whether it has changed
+        sum(bag.fetched for bag in bags.values()),
         found.sent,
     )
 

@@ -24,18 +24,18 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Degrees, Polynomial
 from nlsid_core.identification.polynomial.implicit_descent import minimise_equation
 from nlsid_core.identification.polynomial.implicit_rie import (
+    ImplicitFit,
     least_squares_coefficients,
+    minimise_implicit_rie,
 )
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
-from nlsid_core.identification.polynomial.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.polynomial.moments import Offsets, plain_moments, repeated_moments
+from nlsid_core.identification.polynomial.moments import rows_without_bias
 from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.models import MonotoneEquation, Signal
 
 ORDERS, LENGTHS, TEST = (1, 8, 15, 22), (500, 5_000, 50_000), 50_000
 NOISE = 0.05
 STEPS = 100  # of simulation error minimisation
-OFFSETS = Offsets(0.0, np.zeros(1))
 METHODS = (
     "proposed",
     "least_squares",
@@ -94,21 +94,20 @@ def repeats(w: FloatArray, rng: np.random.Generator, noise: float) -> list[Traje
     return runs
 
 
-def identify(runs: list[Trajectory], n: int) -> tuple[MomentFit, float]:
+def identify(runs: list[Trajectory], n: int) -> tuple[ImplicitFit, float]:
     """The proposed method and the processor time [s] of moments, program and exact proof."""
     started = time.process_time()
     model_class = Polynomial(n, (0,), Degrees(left=3), set="3.8")
-    moments = repeated_moments([runs], model_class, OFFSETS)
-    fit = minimise_moment_rie(moments, model_class, Dataset(tuple(runs)), OFFSETS)
+    data = Dataset(tuple(runs))
+    fit = minimise_implicit_rie(rows_without_bias(data, model_class, accept_untested_repeats=True))
     return fit, time.process_time() - started
 
 
 def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str, MonotoneEquation]:
     """What the comparators find."""
     model_class, data = Polynomial(n, (0,), Degrees(left=3), set="3.8"), Dataset(tuple(runs))
-    plain = plain_moments(runs, model_class, OFFSETS)
-    exact = plain_moments(clean, model_class, OFFSETS)
     rows = build_implicit_rows(data, model_class)
+    exact = build_implicit_rows(Dataset(tuple(clean)), model_class)
     e, f = squares = least_squares_coefficients(rows)
     starts = {"zero": (np.array([[1.0], [0.0], [1.0]]), 0.0 * f), "least_squares": squares}
     minima = {
@@ -120,8 +119,8 @@ def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str,
         "least_squares": rows.equation(e, f),
         "sem": min(minima.values(), key=lambda model: simulation_percent(model, data)),
         **minima,
-        "naive": minimise_moment_rie(plain, model_class, data, OFFSETS).model,
-        "noiseless": minimise_moment_rie(exact, model_class, data, OFFSETS).model,
+        "naive": minimise_implicit_rie(rows).model,
+        "noiseless": minimise_implicit_rie(exact).model,
     }
 
 

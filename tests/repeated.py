@@ -4,16 +4,16 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from nlsid import Degrees, Trajectory
+from nlsid import Dataset, Degrees, Trajectory
 from nlsid import Polynomial as Equation
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.polynomial.moments import Offsets
+from nlsid_core.identification.polynomial.implicit_rie import ImplicitFit, minimise_implicit_rie
+from nlsid_core.identification.polynomial.moments import rows_without_bias
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.polynomial import Polynomial, constant
 
 NOISE = 0.05
 CLASS = Equation(2, (0,), Degrees(left=3), set="3.8")
-OFFSETS = Offsets(0.0, np.zeros(1))
 
 
 def truth() -> MonotoneEquation:
@@ -48,6 +48,11 @@ def total(parts: Iterable[Polynomial]) -> Polynomial:
 def pair(samples: int, seed: int, noise: float = NOISE) -> tuple[Trajectory, Trajectory]:
     w = np.random.default_rng(seed).uniform(-2.0, 2.0, samples)
     return run(w, noise, 1000 + seed, f"g{seed}"), run(w, noise, 2000 + seed, f"g{seed}")
+
+
+def without_bias(*trials: Trajectory) -> ImplicitFit:
+    """What `Rie` finds of repeats."""
+    return minimise_implicit_rie(rows_without_bias(Dataset(trials), CLASS))
 
 
 def percent(model: MonotoneEquation, *, seed: int = 99) -> float:

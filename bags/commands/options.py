@@ -157,7 +157,7 @@ PatienceOption = Annotated[
     typer.Option(
         "--patience",
         min=1.0,
-        help="Seconds that a bag may lose with failing requests before it is left out.",
+        help="Seconds for which a failing request is repeated before its bag is left out.",
     ),
 ]
 

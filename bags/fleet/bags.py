@@ -18,8 +18,8 @@ def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[
 
     A name is what follows the given folder, or the folders of a pattern before its first `*`, less
     the file's ending: `robot_3/drive_01` of `s3://fleet/*/drive_*.mcap`. It stays when others come.
-    patience: s, of each bag, that may be lost with requests that fail. Raises BagError if there is
-    none, DataError if two have one name.
+    patience: s for which a failing request is repeated. Raises BagError if there is none, DataError
+    if two have one name.
     """
     found: dict[str, Path] = {}
     for path in (place(path, patience=patience) for path in given):

@@ -41,7 +41,7 @@ class Answer:
     """The answer for one bag: content, or the reason why there is none.
 
     was_read: the reason is what the bag holds, not that it cannot be read. kept: it was in the
-    manifest. requests, fetched (bytes): what reading it took.
+    manifest.
     """
 
     bag: Path
@@ -50,8 +50,6 @@ class Answer:
     reason: str = ""
     was_read: bool = False
     kept: bool = False
-    requests: int = 0
-    fetched: int = 0
 
 
 def ask(
@@ -168,27 +166,15 @@ def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
             content, reason = b"", "it changed while it was read; start the command again"
     except Exception as error:  # bags are untrusted: whatever one of them causes is about it alone
         reason, was_read = _said(error, bag, name), is_of_content(error)
-    requests, fetched = map(sum, zip(_traffic(bag), _traffic(again), strict=True))
     if isinstance(bag, RemotePath):
         bag.forget()
-    return Answer(bag, name, content, reason, was_read, False, requests, fetched)
+    return Answer(bag, name, content, reason, was_read)
 
 
 def is_of_content(error: BaseException) -> bool:
     """Whether a bag was read, and what it holds cannot be used; of others nothing can be said."""
     of_bag = isinstance(error, BagError) and not isinstance(error, SamplesError)
     return isinstance(error, DataError) and not of_bag
-
-
-def _traffic(bag: Path) -> tuple[int, int]:
-    """Requests and bytes of a bag and of the files in it."""
-    if not isinstance(bag, RemotePath):
-        return 0, 0
-    inside = [_traffic(child) for child in bag.known]
-    return (
-        bag.requests + sum(requests for requests, _ in inside),
-        bag.fetched + sum(fetched for _, fetched in inside),
-    )
 
 
 def _error(future: "Future[Answer]") -> BaseException | None:

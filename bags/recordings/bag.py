@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -40,7 +40,6 @@ from bags.recordings.storage import (
     open_file,
     packed,
     reading,
-    runs,
     type_name,
     unpacked,
 )
@@ -339,22 +338,17 @@ class Bag:
         """
         keys = self._keys_on(topics)
         total, done = max(sum(self.channels[key].count for key in keys), 1), 0
-        later: dict[tuple[int, int], int] = {}
-        earliest = NEVER
-        for n in reversed(range(len(self._data))):
-            for block in reversed(self._data[n].contents.blocks):
-                later[n, block.offset] = earliest
-                earliest = min(earliest, block.start_ns)
-        for n, file in enumerate(self._data):
-            wanted = self._wanted(n, keys)
+        blocks = [(n, block) for n, file in enumerate(self._data) for block in file.contents.blocks]
+        starts = [block.start_ns for _, block in blocks]
+        later = [*accumulate(reversed(starts), min, initial=NEVER)][::-1]
+        for (n, block), earliest in zip(blocks, later, strict=False):
+            file, wanted = self._data[n], self._wanted(n, keys)
             with reading(file.path):
-                for block, batches in runs(file, wanted):
-                    for number, batch in batches:
-                        channel = self.channels[wanted[number]]
-                        yield channel, self._plain(channel.key, batch), earliest
-                        done += len(batch)
-                        progress("reading", done / total)
-                    earliest = later[n, block.offset]
+                for number, batch in file.block_batches(block, wanted):
+                    channel = self.channels[wanted[number]]
+                    yield channel, self._plain(channel.key, batch), earliest
+                    done += len(batch)
+                    progress("reading", done / total)
 
     def log_times(self, topics: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
         """(topic, log times in ns) part by part; of MCAP from its indexes, without a message."""
@@ -365,8 +359,8 @@ class Bag:
                 if isinstance(file, McapFile):
                     times = file.log_times(wanted)
                 else:
-                    read = (found for _, batches in runs(file, wanted) for found in batches)
-                    times = ((number, batch.log_ns) for number, batch in read)
+                    batches = (file.block_batches(block, wanted) for block in file.contents.blocks)
+                    times = ((number, batch.log_ns) for found in batches for number, batch in found)
                 yield from ((self.channels[wanted[c]].topic, log_ns) for c, log_ns in times)
 
     def log_order(self, topics: Sequence[str]) -> LogOrder:

@@ -15,7 +15,7 @@ import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -34,7 +34,7 @@ from mcap.records import (
     Statistics,
 )
 
-from bags.recordings.batch import Batch
+from bags.recordings.batch import Batch, Buffer
 from bags.recordings.mcap_fetch import Fetching
 from bags.recordings.mcap_records import (
     CHUNK_FIXED,
@@ -169,43 +169,27 @@ class McapFile:
             )
         self.path.fetch([(0, self._size)])
 
-    def runs(
-        self, channels: Collection[int]
-    ) -> Iterator[tuple[Block, Iterator[tuple[int, Batch]]]]:
-        """(last block, messages by channel id) in the order of the file, block by block; of a file
-        that is not on this machine, several blocks together.
-
-        Raises BagError if a block is damaged or not what its index says.
-        """
-        alone = ([block] for block in self.contents.blocks if block.has(channels))
-        groups = alone if self._fetching is None else self._fetching.groups(channels)
-        for blocks in groups:
-            yield blocks[-1], self._batches(blocks, channels)
-
     def block_batches(self, block: Block, channels: Collection[int]) -> Batches:
-        """The messages of one block, one batch per channel that has any."""
-        return self._batches([block] if block.has(channels) else [], channels)
+        """The messages of one block, one batch per channel that has any.
 
-    def _batches(self, blocks: Sequence[Block], channels: Collection[int]) -> Batches:
-        if not blocks:
+        Raises BagError if it is damaged or not what its index says.
+        """
+        if not block.has(channels):
             return
-        first, edges = blocks[0], None
-        where = f"the message index of the chunk at byte {first.offset}"
-        if len(blocks) > 1:
-            where += f", or of one up to byte {blocks[-1].offset},"
-        if self._fetching is not None:
-            self._fetching.hold(first, channels)
-        if self._fetching is not None and not first.compression:
-            buffer, offsets, edges = self._fetching.messages(blocks)
+        where = f"the message index of the chunk at byte {block.offset}"
+        buffer: Buffer
+        edges = None
+        plan = None if self._fetching is None else self._fetching.hold(block, channels)
+        if self._fetching is not None and plan is not None:
+            buffer, offsets, edges = self._fetching.content(block, plan), plan.offsets, plan.edges
         else:
-            buffer = self.content(first)
-            offsets = self._offsets(first, buffer, channels)
+            buffer = self.content(block)
+            offsets = self._offsets(block, buffer, channels)
         for channel in channels:
             found = offsets.get(channel)
             if found is not None and len(found):
                 batch = messages_at(buffer, found, channel, where, edges)
-                if batch.log_ns.min() < min(block.start_ns for block in blocks):
-                    # they would come out of order
+                if batch.log_ns.min() < block.start_ns:  # they would come out of order
                     raise BagError(f"{where} points at messages before the time it states")
                 yield channel, batch
 
@@ -229,7 +213,7 @@ class McapFile:
             self.path.fetch((block.end, block.last) for block in blocks if block.index is not None)
         for block in blocks:
             if block.index is None:
-                yield from ((c, batch.log_ns) for c, batch in self._batches([block], channels))
+                yield from ((c, batch.log_ns) for c, batch in self.block_batches(block, channels))
                 continue
             where = f"the message index of the chunk at byte {block.offset}"
             indexes = self._read(block.end, block.last - block.end)
@@ -245,7 +229,7 @@ class McapFile:
         """
         if block.index is None or self._fetching is not None:
             return None
-        messages = dict(self._batches([block], block.index))
+        messages = dict(self.block_batches(block, block.index))
         listed = sum(len(b) * MESSAGE.itemsize + int(b.size.sum()) for b in messages.values())
         last_ns = max((int(b.log_ns.max()) for b in messages.values()), default=NEVER)
         if listed != block.uncompressed_size or last_ns > block.end_ns:

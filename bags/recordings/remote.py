@@ -2,21 +2,20 @@
 
 A RemotePath is a Path for whoever names, lists and opens bags. What is opened delivers the bytes
 that are asked for and no others: ranges that lie close together are one request, several requests
-run beside each other, and a request that fails is repeated for a stated time. obstore knows the
-protocols; credentials are those of the environment or of a profile, and are never part of a name.
+run beside each other. obstore knows the protocols, and repeats a request that fails for a stated
+time; credentials are those of the environment or of a profile, and are never part of a name.
 """
 
 import os
-import random
 import re
 import stat
-import time
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import timedelta
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path, PosixPath
 from typing import Any, Final, TypeVar
 
@@ -27,11 +26,13 @@ HELD_BYTES: Final = 64 * 2**20  # of a file that stay in memory for who opens it
 TAIL_BYTES: Final = 16 * 2**10  # the first request: footer, most summaries and the last index
 MARK_BYTES: Final = 8 * 2**10  # at the end, of which digests are made (docs/decisions/0027)
 TOGETHER: Final = 16  # requests that run beside each other, and fail or succeed together
-PATIENCE: Final = 60.0  # s that may be lost with failing requests, of each bag
-FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before each next
-LONGEST_WAIT: Final = 10.0
-REFUSED: Final = re.compile(r"status code: (4\d\d)")  # what asking again does not change,
-MAY_PASS: Final = ("408", "425", "429")  # but for these
+PATIENCE: Final = 60.0  # s that a request may fail
+MOST_REPEATED: Final = 10_000  # the patience ends before
+WAITS: Final = {  # before a request is repeated: the first, and the longest
+    "init_backoff": timedelta(seconds=0.2),
+    "max_backoff": timedelta(seconds=10),
+    "base": 2,
+}
 WEB: Final = ("http:", "https:")  # where nothing can be listed
 SHORTEST_SECRET: Final = 6  # letters
 
@@ -60,10 +61,39 @@ class Entry:
     tag: str
 
 
+class Parts:
+    """Parts of a file, of which the oldest leave when there are more than HELD_BYTES."""
+
+    def __init__(self) -> None:
+        self._content: dict[int, bytes] = {}  # by their first bytes, the oldest first
+        self._starts: list[int] = []
+
+    def find(self, start: int, end: int) -> bytes | None:
+        """These bytes, if they are in one part."""
+        at = bisect_right(self._starts, start) - 1
+        if at < 0:
+            return None
+        first = self._starts[at]
+        found = self._content[first][start - first : end - first]
+        return found if len(found) == end - start else None
+
+    def hold(self, start: int, content: bytes) -> None:
+        """Keep a part, in the place of those that begin in it."""
+        inside = slice(*(bisect_left(self._starts, at) for at in (start, start + len(content))))
+        for begun in self._starts[inside]:
+            del self._content[begun]
+        self._starts[inside] = [start]
+        self._content[start] = content
+        while len(self._starts) > 1 and sum(map(len, self._content.values())) > HELD_BYTES:
+            oldest = next(iter(self._content))
+            del self._content[oldest]
+            self._starts.remove(oldest)
+
+
 class RemotePath(PosixPath):
     """A file or a folder in storage; the parts of its URL are the parts of the path.
 
-    patience: s that may be lost with failing requests. Instances keep what they fetched, at most
+    patience: s for which a failing request is repeated. Instances keep what they fetched, at most
     HELD_BYTES a file; `requests` and `fetched` (bytes) count what was asked of storage, but for
     listings. A copy in another process knows the entry, and has fetched nothing.
     """
@@ -72,7 +102,6 @@ class RemotePath(PosixPath):
     requests: int = 0
     fetched: int = 0
     _entry: Entry | None = None
-    _lost: float = 0.0  # s
 
     def __str__(self) -> str:
         protocol, *rest = self.parts
@@ -82,22 +111,24 @@ class RemotePath(PosixPath):
         return _rebuilt, (str(self), self.patience, self._entry)
 
     def __truediv__(self, name: Any) -> "RemotePath":
-        known: dict[str, RemotePath] = self.__dict__.setdefault("_children", {})
-        if str(name) not in known:
-            child = known[str(name)] = super().__truediv__(name)
+        if str(name) not in self._below:
+            child = self._below[str(name)] = super().__truediv__(name)
             child.patience = self.patience
-        return known[str(name)]
+        return self._below[str(name)]
 
-    @property
-    def known(self) -> tuple["RemotePath", ...]:
+    @cached_property
+    def _below(self) -> dict[str, "RemotePath"]:
         """The paths below it that were asked for."""
-        return tuple(self.__dict__.get("_children", {}).values())
+        return {}
+
+    @cached_property
+    def _held(self) -> Parts:
+        return Parts()
 
     def forget(self) -> None:
-        """Forget its entry, and those below it."""
-        for key in ("_parts_held", "_order_held"):
-            self.__dict__.pop(key, None)
-        for child in self.known:
+        """Drop all that was fetched, here and below."""
+        self.__dict__.pop("_held", None)
+        for child in self._below.values():
             child.forget()
 
     @property
@@ -136,10 +167,8 @@ class RemotePath(PosixPath):
         return _opened(root, self.patience, os.environ.get("AWS_ENDPOINT_URL", ""))
 
     def anew(self) -> "RemotePath":
-        """The same place, of which nothing is known yet; what is lost is lost for it, too."""
-        again = _rebuilt(str(self), self.patience, None)
-        again._lost = self._lost
-        return again
+        """The same place, of which nothing is known yet."""
+        return _rebuilt(str(self), self.patience, None)
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002 - as Path has it
         """Whether storage has it."""
@@ -180,11 +209,9 @@ class RemotePath(PosixPath):
         """The bytes from `start` to `end`, fetched unless they are held."""
         if end <= start:
             return b""
-        found = self.held(start, end)
-        if found is None:
-            self.fetch([(start, end)])
-            found = self.held(start, end)
-            assert found is not None
+        self.fetch([(start, end)])
+        found = self._held.find(start, end)
+        assert found is not None
         return found
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
@@ -192,9 +219,8 @@ class RemotePath(PosixPath):
 
         Raises FileNotFoundError if the file is gone, BagError if storage does not deliver.
         """
-        missing = {self._not_held(*r) for r in ranges if self.held(*r) is None}
         merged: list[list[int]] = []
-        for start, end in sorted(missing):
+        for start, end in sorted(r for r in ranges if self._held.find(*r) is None):
             if merged and start <= merged[-1][1] + GAP_BYTES:
                 merged[-1][1] = max(merged[-1][1], end)
             else:
@@ -202,25 +228,23 @@ class RemotePath(PosixPath):
         if merged and merged[-1][1] > self.entry.size:
             raise BagError(f"{self} has {self.entry.size} bytes and says to read {merged[-1][1]}")
         for first in range(0, len(merged), TOGETHER):
-            self._fetch_all(merged[first : first + TOGETHER])
-
-    def _fetch_all(self, spans: Sequence[Sequence[int]]) -> None:
-        starts, ends = ([span[k] for span in spans] for k in (0, 1))
-
-        def ask() -> list[bytes]:
+            starts, ends = zip(*merged[first : first + TOGETHER], strict=True)
             self.requests += len(starts)
-            ranges = obstore().get_ranges(
+            for start, end, part in zip(starts, ends, self._ranges(starts, ends), strict=True):
+                if len(part) != end - start:
+                    raise StorageError(
+                        f"{self}: storage did not deliver: {len(part)} bytes came of the "
+                        f"{end - start} from {start} on"
+                    )
+                self.fetched += len(part)
+                self._held.hold(start, bytes(part))
+
+    def _ranges(self, starts: Iterable[int], ends: Iterable[int]) -> Any:
+        return self._asked(
+            lambda: obstore().get_ranges(
                 self._store, self._key, starts=starts, ends=ends, coalesce=0
             )
-            parts = [bytes(part) for part in ranges]
-            for part, start, end in zip(parts, starts, ends, strict=True):
-                if len(part) != end - start:
-                    raise OSError(f"{len(part)} bytes came of the {end - start} from {start} on")
-            return parts
-
-        parts = self._asked(ask)
-        self.fetched += sum(map(len, parts))
-        self._hold(zip(starts, parts, strict=True))
+        )
 
     def identity(self) -> bytes:
         """What tells the file from others without reading it: its entry, its last bytes and, but
@@ -233,72 +257,22 @@ class RemotePath(PosixPath):
         url = "" if str(self).startswith("s3://") else f" {self}"
         return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}{url}\n".encode()
 
-    def held(self, start: int, end: int) -> bytes | None:
-        """These bytes, if they were fetched and are held."""
-        found, at = [], start
-        while at < end:
-            part = self._part_at(at)
-            if part is None:
-                return None
-            first, content = part
-            found.append(content[at - first : end - first])
-            at += len(found[-1])
-        return found[0] if len(found) == 1 else b"".join(found)
-
-    def _not_held(self, start: int, end: int) -> tuple[int, int]:
-        """The range without what is held at its two ends."""
-        while (part := self._part_at(start)) is not None:
-            start = part[0] + len(part[1])
-        while (part := self._part_at(end - 1)) is not None:
-            end = part[0]
-        return start, end
-
-    def _part_at(self, byte: int) -> tuple[int, bytes] | None:
-        held: list[tuple[int, bytes]] = self.__dict__.get("_parts_held", [])
-        at = bisect_right(held, byte, key=lambda part: part[0]) - 1
-        return held[at] if at >= 0 and byte < held[at][0] + len(held[at][1]) else None
-
-    def _hold(self, parts: Iterable[tuple[int, bytes]]) -> None:
-        """Keep parts in the place of those inside them; the oldest leave when there is too much."""
-        order: list[tuple[int, bytes]] = self.__dict__.setdefault("_order_held", [])
-        for start, content in parts:
-            end = start + len(content)
-            order[:] = [p for p in order if p[0] < start or p[0] + len(p[1]) > end]
-            order.append((start, content))
-        held = sum(len(content) for _, content in order)
-        while len(order) > 1 and held > HELD_BYTES:
-            held -= len(order.pop(0)[1])
-        self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
-
     def _asked(self, ask: Callable[[], T]) -> T:
-        """The answer of storage, asked again with growing waits while the patience lasts."""
-        wait = FIRST_WAIT
-        while True:
-            started = time.monotonic()
-            try:
-                return ask()
-            except FileNotFoundError as error:
-                raise FileNotFoundError(f"{self} is not there") from error
-            except BagError:
-                raise
-            except Exception as error:  # obstore raises its own
-                status = REFUSED.search(str(error))
-                if status is not None and status[1] not in MAY_PASS:
-                    raise StorageError(f"{self}: storage refuses it: {_short(error)}") from error
-                self._lost += time.monotonic() - started + wait
-                if self._lost > self.patience:
-                    raise StorageError(
-                        f"{self}: storage did not deliver; {self.patience:g} s were lost with "
-                        f"failing requests: {_short(error)}"
-                    ) from error
-                time.sleep(wait * random.uniform(0.5, 1.0))
-                wait = min(2.0 * wait, LONGEST_WAIT)
+        """The answer of storage; obstore raises errors of its own."""
+        try:
+            return ask()
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{self} is not there") from error
+        except BagError:
+            raise
+        except Exception as error:
+            raise StorageError(f"{self}: storage did not deliver: {_short(error)}") from error
 
 
 def place(given: Path | str, *, patience: float | None = None) -> Path:
     """The path that is meant: a RemotePath for a URL, of this machine otherwise.
 
-    patience: s that may be lost with failing requests (None: PATIENCE, or as it is). A Path that
+    patience: s for which a failing request is repeated (None: PATIENCE, or as it is). A Path that
     was made of a URL, `s3:/bucket/...`, is taken for it. Raises BagError for a URL that carries a
     password, a token or a query: names of bags are written into files.
     """
@@ -382,7 +356,11 @@ def _opened(root: str, patience: float, endpoint: str) -> Any:  # noqa: ARG001 -
     return obstore().store.from_url(
         root,
         client_options={"allow_http": True, "timeout": f"{patience:g}s"},
-        retry_config={"max_retries": 0},  # RemotePath repeats, and counts what it loses
+        retry_config={
+            "max_retries": MOST_REPEATED,
+            "retry_timeout": timedelta(seconds=patience),
+            "backoff": WAITS,
+        },
         **options,
     )
 
@@ -395,7 +373,7 @@ def _entry(described: Mapping[str, Any]) -> Entry:
 
 def _short(error: BaseException) -> str:
     """The first line of an error, without secrets that a redirection or a server told."""
-    line = str(error).partition("\n")[0][:200]
+    line = str(error).partition("\n")[0][:400]
     for name, value in os.environ.items():
         if len(value) >= SHORTEST_SECRET and re.search("KEY|SECRET|TOKEN|PASSWORD", name):
             line = line.replace(value, "...")

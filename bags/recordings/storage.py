@@ -5,7 +5,7 @@ those of ROS 1 are translated, those that rosbag2 compressed one by one are unpa
 """
 
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -19,7 +19,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from bags.recordings.batch import Batch
 from bags.recordings.definitions import Definition
-from bags.recordings.mcap_file import Batches, McapFile
+from bags.recordings.mcap_file import McapFile
 from bags.recordings.mcap_records import MAGIC, MAX_CHUNK_BYTES, NEVER, Block
 from bags.recordings.message_types import JAZZY, ros2_definition, standard_types, types_in_bag
 from bags.recordings.quality import Profile
@@ -191,14 +191,6 @@ def in_cdr(channel: Channel) -> tuple[Channel, Translate | None]:
 
     schema = "ros2msg", definition.data.encode()
     return replace(channel, encoding="cdr", schema=schema), translate
-
-
-def runs(file: DataFile, channels: Collection[int]) -> Iterator[tuple[Block, Batches]]:
-    """(last block, messages by channel), of blocks that are read together."""
-    if isinstance(file, McapFile):
-        yield from file.runs(channels)
-        return
-    yield from ((block, file.block_batches(block, channels)) for block in file.contents.blocks)
 
 
 def packed(batch: Batch) -> Any:

@@ -15,7 +15,7 @@ ROOMS = (
     "models.",
     "design.",
     "dynamics.",
-    "identification.polynomial.moment_rie.",
+    "identification.polynomial.monotone_rie.",
 )
 
 

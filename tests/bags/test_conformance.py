@@ -86,8 +86,8 @@ def test_every_file_of_the_suite_holds_what_its_description_states(folder: str) 
                     str(batch.publish_ns[i]),
                     batch.data(i),
                 )
-                for _, batches in file.runs(list(found.declared.channels))
-                for c, batch in batches
+                for block in found.blocks
+                for c, batch in file.block_batches(block, list(found.declared.channels))
                 for i in range(len(batch))
             ]
             assert messages == [

@@ -17,11 +17,10 @@ from bags.signals.timing import clock_relation, delay, seconds
 from nlsid import Dataset, Degrees, Grid, Polynomial, Trajectory, read_bags
 from nlsid_core.data.repeats import same_excitation
 from nlsid_core.errors import BagError, DataError, ShapeError
-from nlsid_core.identification.polynomial.moment_rie import identify_from_repeats
-from nlsid_core.identification.polynomial.moments import offsets_of, repeated_moments
+from nlsid_core.identification.polynomial.moments import repeated_moments, rows_without_bias
 from nlsid_core.identification.repeats import compare_repeats
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
-from tests.repeated import CLASS, OFFSETS, pair
+from tests.repeated import CLASS, pair
 
 MS = 1_000_000
 
@@ -362,7 +361,7 @@ def test_repeats_pass_and_what_is_not_a_repeat_is_named() -> None:
         assert reason in compare_repeats(first, stranger)
         data = Dataset((first, replace(stranger, group=first.group)))
         with pytest.raises(DataError, match="are not repeats"):
-            identify_from_repeats(data, CLASS)
+            rows_without_bias(data, CLASS)
 
 
 def test_true_repeats_are_hardly_ever_refused() -> None:
@@ -384,16 +383,18 @@ def test_unusable_repeats_say_what_is_wrong() -> None:
     first, second = pair(400, 1)
     alone = Dataset((replace(first, group=""), replace(second, group="")))
     with pytest.raises(DataError, match="share a `group`"):
-        identify_from_repeats(alone, CLASS)
-    with pytest.raises(DataError, match="two repeats"):
-        repeated_moments([[first]], CLASS, OFFSETS)
+        rows_without_bias(alone, CLASS)
     with pytest.raises(DataError, match="common samples"):
         compare_repeats(*pair(50, 1))
     short = pair(2, 1)
     with pytest.raises(DataError, match="needed"):
-        repeated_moments([short], CLASS, OFFSETS)
+        repeated_moments([short], CLASS)
+    two = [
+        replace(t, y=np.hstack([t.y, -t.y]), y_names=(), y_units=(), y_paths=())
+        for t in (first, second)
+    ]
     with pytest.raises(ShapeError, match="one output"):
-        offsets_of([replace(first, y=np.zeros((400, 2)), y_names=(), y_units=(), y_paths=())])
+        rows_without_bias(Dataset(tuple(two)), CLASS)
     with pytest.raises(DataError, match="left is 2"):
         Polynomial(1, (0,), Degrees(left=2), set="3.8")
 

@@ -9,15 +9,15 @@ import pytest
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification import LeastSquares, Polynomial, identify, prove_stability
-from nlsid_core.identification.polynomial.moment_rie import MomentFit, identify_from_repeats
+from nlsid_core.identification.polynomial.implicit_rie import ImplicitFit
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.monotone_equation import is_increasing, solve_increasing
-from tests.repeated import CLASS, pair, percent, truth
+from tests.repeated import pair, percent, truth, without_bias
 
 
 @pytest.fixture(scope="module")
-def fit() -> MomentFit:
-    return identify_from_repeats(Dataset(pair(4000, 1)), CLASS)
+def fit() -> ImplicitFit:
+    return without_bias(*pair(4000, 1))
 
 
 @pytest.mark.parametrize("e", [(1.0, 0.0, 0.0), (3.0, 1.0, 1.0), (0.1, 0.0, 5.0), (1.0, -1.7, 1.0)])
@@ -58,12 +58,12 @@ def test_simulation_solves_the_equation_and_documents_round_trip() -> None:
     np.testing.assert_array_equal(again.simulate(u), model.simulate(u))
 
 
-def test_the_truth_is_found_and_proved(fit: MomentFit) -> None:
+def test_the_truth_is_found_and_proved(fit: ImplicitFit) -> None:
     assert percent(fit.model) < 2.0
     assert 0.0 < fit.proof.rate < 1.0
 
 
-def test_the_proof_holds_on_pairs_of_solutions(fit: MomentFit) -> None:
+def test_the_proof_holds_on_pairs_of_solutions(fit: ImplicitFit) -> None:
     rng, P = np.random.default_rng(0), fit.proof.P
     for _ in range(20):
         u = rng.uniform(-20.0, 20.0, 40)

@@ -12,14 +12,14 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 18_027,
-    ("bags",): 11_678,
+    ("nlsid_core",): 17_913,
+    ("bags",): 11_579,
     ("nlsid_ros",): 2_550,
-    ("tests",): 22_223,
-    ("benchmarks", "examples"): 3_796,
+    ("tests",): 22_198,
+    ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 1, 12  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 1, 11  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

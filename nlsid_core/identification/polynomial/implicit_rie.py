@@ -15,6 +15,7 @@ other terms of f, least squares gives the best.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from nlsid_core.identification.polynomial.implicit_rows import (
     SLOW,
     ImplicitRows,
 )
+from nlsid_core.identification.polynomial.monotone_rie import least_monotone
 from nlsid_core.identification.proofs import conditions
 from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.sets import Names
@@ -68,11 +70,12 @@ Proof = ImplicitProof | StabilityProof
 class ImplicitFit:
     """The model, its exact proof, and the bound: the mean of |x - x̂|²_Q, in squared spreads.
 
-    e, f: its coefficients (m, n_v) for scaled signals.
+    model, proof: a `MonotoneEquation` and a `StabilityProof` of set 3.8, else an `ImplicitModel`
+    and an `ImplicitProof`. e, f: the coefficients (m, n_v) for scaled signals.
     """
 
-    model: Model
-    proof: Proof
+    model: Any
+    proof: Any
     bound: float
     e: FloatArray
     f: FloatArray
@@ -86,14 +89,16 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
     Raises Infeasible if there is none in the set or it has no exact proof, SolverError as the
     solver does.
     """
-    n_v, names = len(rows.y_scale[0]), rows.names
-    e, f = unknowns(rows)
-    S = symmetric_template("S", n_v)
-    parts = set_constraints(rows, e, f, S, slowest)
-    found, bound = _interior([*parts, *_weighted(rows, S)], names)
-    lowest = float(np.linalg.eigvalsh(_values(found, S))[0])
-    best = coefficients(found, rows)
-    model = kept_in_set(rows, *best, lowest)
+    if rows.model_class.form == "3.8":
+        best, bound = least_monotone(rows, slowest)
+        model: Model = rows.equation(*best)
+    else:
+        e, f = unknowns(rows)
+        S = symmetric_template("S", len(e))
+        parts = set_constraints(rows, e, f, S, slowest)
+        found, bound = _interior([*parts, *_weighted(rows, S)], rows.names)
+        best = coefficients(found, rows)
+        model = kept_in_set(rows, *best, float(np.linalg.eigvalsh(_values(found, S))[0]))
     proof = prove_kept(model, rows)
     if proof is None:
         raise Infeasible(

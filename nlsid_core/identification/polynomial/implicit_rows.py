@@ -7,6 +7,7 @@ search costs the same for any number of samples.
 Source: thesis (2.4), (2.7).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
@@ -15,10 +16,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from nlsid_core.arrays import BoolArray, FloatArray, IntArray
-from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError
-from nlsid_core.identification.polynomial.moment_rie import equation
-from nlsid_core.identification.polynomial.moments import Offsets
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification.polynomial.options import Polynomial as Options
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
@@ -122,13 +121,24 @@ class ImplicitRows:
 
     def equation(self, e: FloatArray, f: FloatArray) -> MonotoneEquation:
         """e(v) = f(x, w) of set 3.8, of scaled e (m_e, 1) and f (m_f, 1)."""
-        mean, spread = self.y_scale
-        powers = spread[0] ** np.arange(1, len(e) + 1)
+        first, (mean, spread) = self.dataset.trajectories[0], self.y_scale
+        powers = np.zeros(3)
+        powers[: len(e)] = e[:, 0] / spread[0] ** np.arange(1, len(e) + 1)
         constant = f[~self.right.any(axis=1)].sum()
         slopes = self.right.T @ f[:, 0] / self.units[1]  # every other term is one state or input
-        c = np.concatenate([e[:, 0] / powers, [-constant], -slopes])
-        offsets = Offsets(float(mean[0]), self.u_scale[0])
-        return equation(c / c[0], self.model_class, self.dataset, offsets)
+        return MonotoneEquation(
+            e=powers / powers[0],  # the scale of both sides is free
+            a=slopes[: self.states] / powers[0],
+            b=slopes[self.states :] / powers[0],
+            c=float(constant / powers[0]),
+            window=self.model_class.window(len(self.u_scale[0])),
+            y_offset=float(mean[0]),
+            u_offset=self.u_scale[0],
+            period=self.dataset.period,
+            y=signals_of(first, "y")[0],
+            u=signals_of(first, "u"),
+            bags=self.dataset.bags,
+        )
 
     def model(
         self, e: FloatArray, f: FloatArray, monotonicity: float
@@ -182,12 +192,18 @@ class ImplicitRows:
         return with_signals(model, self.dataset, window)
 
 
-def build_implicit_rows(dataset: Dataset, model_class: Options) -> ImplicitRows:
-    """The rows t = h … of every trial. Raises DataError on too little or too poor data."""
+def build_implicit_rows(
+    dataset: Dataset, model_class: Options, factor: Callable[[Dataset], FloatArray] | None = None
+) -> ImplicitRows:
+    """The rows t = h … of every trial.
+
+    factor: makes R of the scaled trials (None: that of the monomials as they are measured).
+    Raises DataError on too little or too poor data, ShapeError if the set is not for its outputs.
+    """
     y_scale, u_scale = signal_scale(dataset, "y"), signal_scale(dataset, "u")
-    n_v, window = len(y_scale[0]), model_class.window(len(u_scale[0]))
-    n = n_v * model_class.lags
-    history = model_class.history
+    n_v, history = len(y_scale[0]), model_class.history
+    if model_class.form == "3.8" and n_v > 1:
+        raise ShapeError(f"set 3.8 is for one output, the data have {n_v}; 2.11 is for several")
     for trial in dataset:
         if history >= len(trial):
             raise DataError(
@@ -195,20 +211,32 @@ def build_implicit_rows(dataset: Dataset, model_class: Options) -> ImplicitRows:
             )
     refuse_large(model_class, n_v, len(u_scale[0]))
     left = monomials(n_v, range(1, model_class.degrees.left + 1))
-    right = right_basis(model_class, n, len(window))
-    rows = []
-    for trial in dataset:
-        N = len(trial)
-        y, u = (trial.y - y_scale[0]) / y_scale[1], (trial.u - u_scale[0]) / u_scale[1]
-        past = [y[history - k : N - k] for k in range(1, model_class.lags + 1)]
-        known = np.hstack([*past, *(u[history - d : N - d, [i]] for i, d in window)])
-        rows.append(np.hstack([monomial_values(left, y[history:]), monomial_values(right, known)]))
-    stacked = np.concatenate(rows)
-    refuse_poor(stacked[:, len(left) :])
-    R = np.linalg.qr(stacked, mode="r") / np.sqrt(len(stacked))
+    window = model_class.window(len(u_scale[0]))
+    right = right_basis(model_class, n_v * model_class.lags, len(window))
+    scaled = tuple(
+        replace(t, y=(t.y - y_scale[0]) / y_scale[1], u=(t.u - u_scale[0]) / u_scale[1])
+        for t in dataset
+    )
+    if factor is not None:
+        R = factor(Dataset(scaled))
+    else:
+        stacked = np.concatenate([_monomials(t, model_class, left, right) for t in scaled])
+        refuse_poor(stacked[:, len(left) :])
+        R = np.linalg.qr(stacked, mode="r") / np.sqrt(len(stacked))
     made = ImplicitRows(R, left, right, y_scale, u_scale, model_class, dataset)
     _refuse_data_outside(made)
     return made
+
+
+def _monomials(
+    trial: Trajectory, model_class: Options, left: IntArray, right: IntArray
+) -> FloatArray:
+    """[φ_e(y(t)), φ_f(x, w)] of every row of a scaled trial."""
+    N, history, (y, u) = len(trial), model_class.history, (trial.y, trial.u)
+    past = [y[history - k : N - k] for k in range(1, model_class.lags + 1)]
+    delayed = [u[history - d : N - d, [i]] for i, d in model_class.window(u.shape[1])]
+    known = np.hstack([*past, *delayed])
+    return np.hstack([monomial_values(left, y[history:]), monomial_values(right, known)])
 
 
 def right_basis(model_class: Options, states: int, inputs: int) -> IntArray:

@@ -18,9 +18,13 @@ from operator import add
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Trajectory
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError
+from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, build_implicit_rows
 from nlsid_core.identification.polynomial.options import Polynomial
+from nlsid_core.identification.repeats import refuse_false_repeats
+
+POWER_FLOOR = 1e-3  # of an estimated mean square in spreads: less is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,74 +92,69 @@ class Moments:
         return mu, nu
 
 
-@dataclass(frozen=True, eq=False)
-class Offsets:
-    """What is subtracted from y (a number) and from u (n_u,) before moments are taken."""
-
-    y: float
-    u: FloatArray
-
-
-def offsets_of(trials: Sequence[Trajectory]) -> Offsets:
-    """Means over all samples of all trials. Raises ShapeError for several outputs."""
-    if not trials:
-        raise DataError("no trials to take moments of")
-    if any(t.y.shape[1] != 1 for t in trials):
-        raise ShapeError("moments are taken of one output")
-    return Offsets(
-        float(np.mean(np.concatenate([t.y[:, 0] for t in trials]))),
-        np.mean(np.concatenate([t.u for t in trials]), axis=0),
-    )
-
-
-def repeated_moments(
-    groups: Sequence[Sequence[Trajectory]],
+def rows_without_bias(
+    data: Dataset,
     model_class: Polynomial,
-    offsets: Offsets,
-) -> Moments:
+    *,
+    transient: int = 0,
+    accept_untested_repeats: bool = False,
+) -> ImplicitRows:
+    """The rows of the dataset's groups of repeats, R of the moments without the bias of noise.
+
+    Trajectories without a repeat are not used. transient: samples at the start of each that the
+    test of the repeats leaves out. accept_untested_repeats: skip that test; the bias of noise is
+    then removed only if the trials repeat one excitation all the same.
+    Raises DataError if there are no repeats, they are not repeats or have nothing in common.
+    """
+    groups = tuple(data.repeats().values())
+    if not groups:
+        raise DataError(
+            "no two trajectories share a `group`: bias removal needs repeated experiments; without "
+            "them use another method"
+        )
+    if not accept_untested_repeats:
+        refuse_false_repeats(data, transient=transient)
+    used = Dataset(tuple(trial for group in groups for trial in group))
+    return build_implicit_rows(used, model_class, lambda scaled: _factor(scaled, model_class))
+
+
+def _factor(scaled: Dataset, model_class: Polynomial) -> FloatArray:
+    """R with R'R the nearest moments that are those of a signal; M̂ is indefinite at much noise."""
+    M = repeated_moments(list(scaled.repeats().values()), model_class).matrix()
+    if not M[0, 0] > 0.0:
+        raise DataError(
+            f"the responses have nothing in common: their estimated mean square is {M[0, 0]:g} of "
+            "the measured one; are they repeats, and is the noise smaller than the response?"
+        )
+    sizes = np.sqrt(np.maximum(np.diag(M), POWER_FLOOR))
+    values, vectors = np.linalg.eigh(M / np.outer(sizes, sizes))
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * sizes)
+
+
+def repeated_moments(groups: Sequence[Sequence[Trajectory]], model_class: Polynomial) -> Moments:
     """Moments without the bias of noise, from groups of repeats: every pair, in both roles.
 
-    Raises DataError if a group has fewer than two trials or trials are too short.
+    Raises DataError if trials are too short.
     """
-    pairs = []
-    for group in groups:
-        if len(group) < 2:
-            name = group[0].name if group else ""
-            raise DataError(f"group of '{name}': bias removal needs two repeats or more")
-        pairs += list(combinations(group, 2))
-    if not pairs:
-        raise DataError("no repeated experiments; bias removal needs a pair")
-    return reduce(add, (_pair(one, other, model_class, offsets) for one, other in pairs))
+    pairs = [pair for group in groups for pair in combinations(group, 2)]
+    return reduce(add, (_pair(one, other, model_class) for one, other in pairs))
 
 
-def plain_moments(
-    trials: Sequence[Trajectory],
-    model_class: Polynomial,
-    offsets: Offsets,
-) -> Moments:
-    """Moments of the signals as measured: right without noise, biased with it."""
-    return reduce(add, (_pair(trial, trial, model_class, offsets) for trial in trials))
-
-
-def _pair(
-    first: Trajectory, second: Trajectory, model_class: Polynomial, offsets: Offsets
-) -> Moments:
+def _pair(first: Trajectory, second: Trajectory, model_class: Polynomial) -> Moments:
     N = min(len(first), len(second))
     if model_class.history >= N:
         raise DataError(
             f"{first.name} and {second.name}: {N} common samples; {model_class.history + 1} needed"
         )
-    one, other = (_rows(trial, N, model_class, offsets) for trial in (first, second))
-    if first is second:
-        return _sums(one, one, model_class.degrees.left)
+    one, other = (_rows(trial, N, model_class) for trial in (first, second))
     return _sums(one, other, model_class.degrees.left) + _sums(other, one, model_class.degrees.left)
 
 
 def _rows(
-    trial: Trajectory, samples: int, model_class: Polynomial, offsets: Offsets
+    trial: Trajectory, samples: int, model_class: Polynomial
 ) -> tuple[FloatArray, FloatArray]:
     """Powers y⁰ … (orders, T), and χ (m, T), of the first `samples` samples."""
-    y, u = trial.y[:samples, 0] - offsets.y, trial.u[:samples] - offsets.u
+    y, u = trial.y[:samples, 0], trial.u[:samples]
     h = model_class.history
     now = y[h:]
     powers = np.ones((max(2 * model_class.degrees.left, 3), len(now)))

@@ -25,7 +25,7 @@ from nlsid_core.identification.polynomial.implicit_rie import (
     refuse_large_program,
 )
 from nlsid_core.identification.polynomial.implicit_rows import ImplicitRows, build_implicit_rows
-from nlsid_core.identification.polynomial.moment_rie import identify_from_repeats
+from nlsid_core.identification.polynomial.moments import rows_without_bias
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.starts import as_implicit, linear_start
 from nlsid_core.identification.trail import NOTHING, Task, Trail, by_error, least_error, tried
@@ -52,18 +52,12 @@ def _implicit(train: Dataset, model_class: Polynomial, task: Task) -> Trail[Mode
     )
 
     def bounded(method: Rie) -> tuple[Model, Proof]:
-        repeated = bool(train.repeats()) or method.accept_untested_repeats
-        if model_class.form == "3.8" and repeated:
-            without_bias = identify_from_repeats(
-                train,
-                model_class,
-                transient=task.transient,
-                accept_untested_repeats=method.accept_untested_repeats,
-                slowest=task.searched_rate,
+        untested, used = method.accept_untested_repeats, rows
+        if model_class.form == "3.8" and (train.repeats() or untested):
+            used = rows_without_bias(
+                train, model_class, transient=task.transient, accept_untested_repeats=untested
             )
-            trail.solved(method, without_bias.bound / float(rows.y_scale[1][0]) ** 2)
-            return without_bias.model, without_bias.proof
-        found = minimise_implicit_rie(rows, slowest=task.searched_rate)
+        found = minimise_implicit_rie(used, slowest=task.searched_rate)
         trail.solved(method, found.bound)
         return found.model, found.proof
 

@@ -105,7 +105,8 @@ def web_server(
 ) -> Iterator[str]:
     """The files of a folder over HTTP with ranges and ETags; yields the URL.
 
-    fault: what a GET is answered with instead. Status 200 to it means: half of the bytes.
+    fault: what a GET is answered with instead. Status 200 to it means: half of the bytes, and no
+    connection any more.
     bytes_per_s: of an answer, by path; others are sent at once. moved: where status 302 points.
     """
     count: dict[str, int] = {}
@@ -138,10 +139,10 @@ def web_server(
             with file.open("rb") as stream:
                 stream.seek(start)
                 content = stream.read(end - start) if body else b""
-            if status == 200:
-                content = content[: len(content) // 2]
-            tag = f'"{size}-{file.stat().st_mtime_ns}"'
             length = len(content) if body else size
+            if status == 200:
+                content, self.close_connection = content[: len(content) // 2], True
+            tag = f'"{size}-{file.stat().st_mtime_ns}"'
             self._send(code, content, length=length, tag=tag, span=span)
 
         def _send(

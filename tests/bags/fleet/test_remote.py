@@ -157,7 +157,7 @@ def test_an_error_tells_no_secret_of_a_redirection_or_of_the_environment(
         place_of = f"{there}/d.mcap?X-Amz-Signature=abcdef&key=hidden-in-the-environment"
         with (
             web_server(tmp_path, lambda *_: 302, moved=place_of) as url,
-            pytest.raises(BagError, match=r"storage refuses it: .*403") as refusal,
+            pytest.raises(BagError, match=r"storage did not deliver: .*403") as refusal,
         ):
             remote(f"{url}/d.mcap").read_range(0, 10)
     for secret in ("abcdef", "hidden-in", "pass-word"):
@@ -183,7 +183,7 @@ def test_a_server_that_never_answers_is_given_up_after_the_patience(
             lambda: remote(f"{begin}/d.mcap", patience=1.0).entry,
             lambda: expand_bags([remote(f"{begin}/folder/*.mcap", patience=1.0)]),
         ):
-            with pytest.raises(BagError, match=r"did not deliver; 1 s were lost|does not list"):
+            with pytest.raises(BagError, match=r"did not deliver|does not list"):
                 ask()
 
 
@@ -206,8 +206,8 @@ def test_credentials_of_a_profile_do_as_those_of_the_environment(
     [
         ((503, 503), ""),
         ((200,), ""),  # half an answer
-        ((503,) * 99, r"did not deliver; 1 s were lost .*503"),
-        ((403,), "storage refuses it: .*403"),
+        ((503,) * 99, "storage did not deliver: .*503"),
+        ((403,), "storage did not deliver: .*403"),
         ((404,), "bucket/d.mcap is not there"),
     ],
 )
