@@ -130,15 +130,15 @@ def test_copies_are_what_their_names_say(design: OutputTubeDesign, held_back: Da
     trial, faults = held_back.trajectories[0], dict(SABOTAGES)
     made = {name: fault(trial, np.array([2.0]), design.model) for name, fault in faults.items()}
     y = trial.y
-    np.testing.assert_array_equal(made["stuck at first value"].y, np.full_like(y, y[0, 0]))
-    np.testing.assert_array_equal(made["sensor x 0.6"].y, 0.6 * y)
-    np.testing.assert_array_equal(made["bias, 10 % of range"].y, y + 0.2)
-    late = made[f"late by {DELAY} samples"].y
+    np.testing.assert_array_equal(made["stuck at first value"], np.full_like(y, y[0, 0]))
+    np.testing.assert_array_equal(made["sensor x 0.6"], 0.6 * y)
+    np.testing.assert_array_equal(made["bias, 10 % of range"], y + 0.2)
+    late = made[f"late by {DELAY} samples"]
     np.testing.assert_array_equal(late[DELAY:], y[:-DELAY])
     np.testing.assert_array_equal(late[:DELAY], np.full((DELAY, 1), y[0, 0]))
-    lost = made[f"{LOST} samples lost"]
-    assert lost.lost == frozenset(range(len(y) // 2, len(y) // 2 + LOST))
-    assert all(np.array_equal(copy.u, trial.u) for copy in made.values()), "what was commanded"
+    kept = y.copy()
+    kept[len(y) // 2 : len(y) // 2 + LOST] = np.nan
+    np.testing.assert_array_equal(made[f"{LOST} samples lost"], kept)
 
 
 def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTubeDesign) -> None:
@@ -147,7 +147,7 @@ def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTub
     full, weak = (_simulated(design, gain * u, u) for gain in (1.0, 0.8))
     trial = Trajectory(t=PERIOD * np.arange(len(u)), y=full, u=u)
     copy = dict(SABOTAGES)["actuator x 0.8"](trial, np.ones(1), design.model)
-    np.testing.assert_allclose(copy.y[:, 0], weak, atol=1e-12)
+    np.testing.assert_allclose(copy[:, 0], weak, atol=1e-12)
 
 
 def _simulated(design: OutputTubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
