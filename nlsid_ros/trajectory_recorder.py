@@ -35,7 +35,7 @@ from nlsid_ros.subscribing import Received, Subscriptions, Wanted
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
-LATE = 1.0  # s since an excitation began, after which its beginning is lost
+LATE = 1.0  # s since a repeat began, or its pause at rest, after which its beginning is lost
 MOST_TOPICS = 12  # that a status names: with the rest it has at most 20 values
 SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
 EXPERIMENT = "experiment"  # and the custom datum that holds it
@@ -206,8 +206,9 @@ class TrajectoryRecorder(ManagedNode):
         try:
             said = files.parse_document(message.data)
             begun_ns = files.member(said, "start_ns", int, source=SAID_BY)
-            ended, now_ns = "ended" in said, self.get_clock().now().nanoseconds
-            began_before = not self._experiment if ended else now_ns - begun_ns > LATE * 1e9
+            rest = max(LATE, files.number(said, "pause", source=SAID_BY))
+            ended, late_ns = "ended" in said, self.get_clock().now().nanoseconds - begun_ns
+            began_before = not self._experiment if ended else late_ns > rest * 1e9
             if began_before:
                 return
             group = said.get("repeat_group")
