@@ -24,6 +24,7 @@ from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, LogClock, Recent, Recording
+from bags.signals.timing import seconds
 from bags.tools.recover import repair, unfinished_bags
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -205,16 +206,14 @@ class TrajectoryRecorder(ManagedNode):
         """
         try:
             said = files.parse_document(message.data)
-            begun_ns = files.member(said, "start_ns", int, source=SAID_BY)
-            rest = max(LATE, files.number(said, "pause", source=SAID_BY))
-            ended, late_ns = "ended" in said, self.get_clock().now().nanoseconds - begun_ns
-            began_before = not self._experiment if ended else late_ns > rest * 1e9
-            if began_before:
+            ended, now_ns = "ended" in said, self.get_clock().now().nanoseconds
+            late = seconds(now_ns, files.member(said, "start_ns", int, source=SAID_BY))
+            is_late = late > max(LATE, files.number(said, "pause", source=SAID_BY))
+            is_of_before = not self._experiment if ended else is_late
+            if is_of_before:
                 return
-            group = said.get("repeat_group")
-            now = {EXPERIMENT: message.data}
-            if isinstance(group, str):
-                now["repeat_group"] = group
+            group = files.member(said, "repeat_group", str, source=SAID_BY)
+            now = {EXPERIMENT: message.data, "repeat_group": group}
             if not (ended or self.values.at_once):
                 self._on_stop()
                 self._on_start()

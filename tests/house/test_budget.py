@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 17_913,
-    ("bags",): 11_579,
+    ("bags",): 11_559,
     ("nlsid_ros",): 2_550,
-    ("tests",): 22_198,
+    ("tests",): 22_195,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
