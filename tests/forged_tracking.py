@@ -1,132 +1,78 @@
-"""Designs of sampled funnels with one thing made better than it is, and all digests made to fit."""
+"""Files of a sampled funnel with one thing made better than it is, and why it is refused."""
 
-import copy
-from dataclasses import replace
+import math
 
-import numpy as np
+from tests.edits import Edit, both, changed, exchanged, put, scaled, without
+from tests.funnel_files import FUNNEL, MODEL, POLICY, PROOF, Files
+from tests.tracked import designed, pendulum
 
-from nlsid_core.design.sampled.design import TrackingDesign
-from tests.tracked import designed, resigned
+STEPS = f"{PROOF} proof steps"
+STEP = f"{STEPS} 5"
+LATER = changed(f"{FUNNEL} tube", lambda tube: [tube[0], *(0.98 * r for r in tube[1:])])
 
 
-def forged(design: TrackingDesign, what: str) -> TrackingDesign:
-    """The design with one thing made better than it is, and all digests made to fit."""
-    funnel = design.funnel
-    if what == "tube cut by 2 %":
-        tube = funnel.tube.copy()
-        tube[1:] *= 0.98
-        return resigned(design, funnel=replace(funnel, tube=tube))
-    if what == "one level of the tube cut by 2 %":
-        tube = funnel.tube.copy()
-        tube[7] *= 0.98
-        return resigned(design, funnel=replace(funnel, tube=tube))
-    if what == "goal 2 % below what is reached":
-        inlet = funnel.inlet.copy()
-        inlet[-1] = 0.98 * design.proof["steps"][-1]["inlet"]["reach"]
-        return resigned(design, funnel=replace(funnel, inlet=inlet))
-    if what == "inlet raised by 2 %":
-        return resigned(design, funnel=replace(funnel, inlet=1.02 * funnel.inlet))
-    if what == "levels and reaches cut by 2 %":
-        proof = copy.deepcopy(design.proof)
-        for entry in proof["steps"]:
-            for chain in ("tube", "inlet"):
-                entry[chain]["reach"] *= 0.98
-        tube = funnel.tube * np.r_[1.0, np.full(len(funnel.tube) - 1, 0.98)]
-        forged = replace(design, certificate=design.certificate | {"proof": proof})
-        return resigned(forged, funnel=replace(funnel, tube=tube))
-    if what == "assumption made smaller":
-        smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
-        return resigned(design, funnel=replace(funnel, assumption=smaller))
-    if what == "safety factor below one":
-        smaller = replace(funnel.assumption, safety_factor=0.5)
-        return resigned(design, funnel=replace(funnel, assumption=smaller))
-    if what == "commissioning runs are the fitting bags":
-        borrowed = replace(funnel.assumption, measured_on=design.model.bags)
-        return resigned(design, funnel=replace(funnel, assumption=borrowed))
-    if what == "no commissioning runs":
-        unmeasured = replace(funnel.assumption, measured_on=())
-        return resigned(design, funnel=replace(funnel, assumption=unmeasured))
-    if what == "half-widths cut by a millionth":
-        return resigned(design, funnel=replace(funnel, half_widths=funnel.half_widths / 1.000001))
-    if what == "half-widths cut by an ulp at the end":
-        widths = funnel.half_widths.copy()
-        widths[-1, 1] = np.nextafter(widths[-1, 1], 0.0)
-        return resigned(design, funnel=replace(funnel, half_widths=widths))
-    if what == "another nominal":
-        return resigned(design, policy=designed(goal=0.3).policy)
-    if what == "gain 3 % smaller":
-        return resigned(design, policy=replace(design.policy, K=0.97 * design.policy.K))
-    if what == "another model":
-        heavier = replace(design.model, coefficients=1.002 * design.model.coefficients)
-        return resigned(design, model=heavier)
-    if what == "narrower data box":
-        return resigned(design, model=replace(design.model, x_range=0.5 * design.model.x_range))
-    if what == "weaker drive":
-        return resigned(design, model=replace(design.model, u_range=0.5 * design.model.u_range))
-    proof = copy.deepcopy(design.proof)
-    taken = proof["steps"][5]
-    if what == "a factor's entry changed":
-        taken["tube"]["squares"]["factors"][0][0][0] *= 2
-    elif what == "a multiplier left out":
-        taken["tube"]["ball"]["squares"]["factors"] = [[]]
-    elif what == "a multiplier twice as large":
-        taken["tube"]["ball"]["squares"]["unit"] -= 1
-    elif what == "T shrunk":
-        taken["T"] = (0.5 * np.array(taken["T"])).tolist()
-    elif what == "T with a zero on its diagonal":
-        taken["T"][1][1] = 0.0
-    elif what == "curvature made smaller":
-        taken["curvature"][2] *= 0.999
-    elif what == "curvature left out":
-        taken["curvature"].pop()
-    elif what == "curvature negative":
-        taken["curvature"][2] *= -1.0
-    elif what == "kappa below one":
-        taken["kappa"] = 0.999
-    elif what == "two steps exchanged":
-        proof["steps"][5], proof["steps"][6] = proof["steps"][6], proof["steps"][5]
-    elif what == "the chains exchanged":
-        taken["tube"], taken["inlet"] = taken["inlet"], taken["tube"]
-    elif what == "reach negative":
-        taken["tube"]["reach"] *= -1.0
-    elif what == "a member more":
-        taken["more"] = 1
-    else:
-        raise ValueError(what)
-    return replace(design, certificate=design.certificate | {"proof": proof})
+def _another_nominal(files: Files) -> None:
+    files[POLICY] = designed(goal=0.3).policy.document()
+
+
+def _goal_below_what_is_reached(files: Files) -> None:
+    reach = files[PROOF]["proof"]["steps"][-1]["inlet"]["reach"]
+    files[FUNNEL]["inlet"][-1] = 0.98 * reach
 
 
 # What contradicts what was measured: true claims, under assumptions that nobody should make.
-CONTRADICTIONS = [
-    "assumption made smaller",
-    "safety factor below one",
-    "commissioning runs are the fitting bags",
-    "no commissioning runs",
-]
-FORGERIES = [
-    "tube cut by 2 %",
-    "one level of the tube cut by 2 %",
-    "goal 2 % below what is reached",
-    "inlet raised by 2 %",
-    "levels and reaches cut by 2 %",
-    "another nominal",
-    "gain 3 % smaller",
-    "another model",
-    "narrower data box",
-    "weaker drive",
-    "a factor's entry changed",
-    "a multiplier left out",
-    "a multiplier twice as large",
-    "T shrunk",
-    "T with a zero on its diagonal",
-    "curvature made smaller",
-    "curvature left out",
-    "curvature negative",
-    "kappa below one",
-    "two steps exchanged",
-    "the chains exchanged",
-    "reach negative",
-    "a member more",
-    "half-widths cut by a millionth",
-    "half-widths cut by an ulp at the end",
-]
+CONTRADICTIONS: dict[str, Edit] = {
+    "assumption made smaller": scaled(f"{FUNNEL} assumption bound", 0.9),
+    "safety factor below one": put(f"{FUNNEL} assumption safety_factor", 0.5),
+    "commissioning runs are the fitting bags": put(
+        f"{FUNNEL} assumption measured_on", pendulum().document()["bags"]
+    ),
+    "no commissioning runs": put(f"{FUNNEL} assumption measured_on", []),
+}
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "tube cut by 2 %": (LATER, "not_below"),
+    "one level of the tube cut by 2 %": (scaled(f"{FUNNEL} tube 7", 0.98), "not_below"),
+    "goal 2 % below what is reached": (_goal_below_what_is_reached, "not_below"),
+    "inlet raised by 2 %": (scaled(f"{FUNNEL} inlet", 1.02), "not_valid"),
+    "levels and reaches cut by 2 %": (
+        both(
+            scaled(f"{STEPS} * tube reach", 0.98),
+            scaled(f"{STEPS} * inlet reach", 0.98),
+            LATER,
+        ),
+        "not_below",
+    ),
+    "another nominal": (_another_nominal, "not_definite"),
+    "gain 3 % smaller": (scaled(f"{POLICY} K", 0.97), "not_definite"),
+    "another model": (scaled(f"{MODEL} coefficients", 1.002), "not_definite"),
+    "narrower data box": (scaled(f"{MODEL} x_range", 0.5), "not_valid"),
+    "weaker drive": (scaled(f"{MODEL} u_range", 0.5), "not_valid"),
+    "a factor's entry changed": (scaled(f"{STEP} tube squares factors 0 0 0", 2), "not_positive"),
+    "a multiplier left out": (put(f"{STEP} tube ball squares factors", [[]]), "not_positive"),
+    "a multiplier twice as large": (
+        changed(f"{STEP} tube ball squares unit", lambda n: n - 1),
+        "not_positive",
+    ),
+    "T shrunk": (scaled(f"{STEP} T", 0.5), "not_definite"),
+    "T with a zero on its diagonal": (put(f"{STEP} T 1 1", 0.0), "malformed"),
+    "curvature made smaller": (scaled(f"{STEP} curvature 2", 0.999), "not_definite"),
+    "curvature left out": (without(f"{STEP} curvature -1"), "not_covered"),
+    "curvature negative": (scaled(f"{STEP} curvature 2", -1.0), "not_below"),
+    "kappa below one": (put(f"{STEP} kappa", 0.999), "not_definite"),
+    "two steps exchanged": (exchanged(STEP, f"{STEPS} 6"), "not_definite"),
+    "the chains exchanged": (exchanged(f"{STEP} tube", f"{STEP} inlet"), "not_below"),
+    "reach negative": (scaled(f"{STEP} tube reach", -1.0), "not_below"),
+    "no box of the data's states": (without(f"{MODEL} x_range"), "malformed"),
+    "no box of the data's inputs": (without(f"{MODEL} u_range"), "malformed"),
+    "a power that nobody would live to see": (
+        put(f"{MODEL} exponents -1", [15, 15, 15]),
+        "too_large",
+    ),
+    "a step less": (without(f"{STEPS} 3"), "malformed"),
+    "a member more": (put(f"{STEP} more", 1), "malformed"),
+    "half-widths cut by a millionth": (scaled(f"{FUNNEL} half_widths", 1 / 1.000001), "not_valid"),
+    "half-widths cut by an ulp at the end": (
+        changed(f"{FUNNEL} half_widths -1 1", lambda width: math.nextafter(width, 0.0)),
+        "not_valid",
+    ),
+}

@@ -1,17 +1,18 @@
-"""The four files of a continuous funnel, changed as a forger would."""
+"""The files of a design, changed as a forger would."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from nlsid_core import files as documents
 from nlsid_core import proofs
 from nlsid_core.arrays import Json
-from nlsid_core.design import FunnelDesign
+from nlsid_core.designs import AnyDesign
+from tests.edits import Edit
 
 Files = dict[str, Any]
-FIELD, POLICY, FUNNEL, PROOF = (
+MODEL, FIELD, POLICY, FUNNEL, PROOF = (
+    "model.json",
     "vector_field.json",
     "policy.json",
     "funnel.json",
@@ -20,9 +21,9 @@ FIELD, POLICY, FUNNEL, PROOF = (
 ROLES = {"vector_field": FIELD, "policy": POLICY, "funnel": FUNNEL}
 
 
-def saved(design: FunnelDesign, folder: Path) -> Files:
-    """The documents of a design, by file name."""
-    return {path.name: json.loads(path.read_text()) for path in design.save(folder)}
+def files_of(design: AnyDesign) -> Files:
+    """The documents of a design by file name, to be changed."""
+    return copy_of(design.documents())
 
 
 def copy_of(files: Files) -> Files:
@@ -30,7 +31,12 @@ def copy_of(files: Files) -> Files:
     return dict(json.loads(json.dumps(files)))
 
 
-def forged_by(forge: Callable[[Files], None], files: Files) -> Files:
+def read(folder: Path) -> Files:
+    """The documents of a folder by file name."""
+    return {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
+
+
+def forged_by(forge: Edit, files: Files) -> Files:
     """The same documents, changed."""
     forged = copy_of(files)
     forge(forged)
@@ -39,11 +45,13 @@ def forged_by(forge: Callable[[Files], None], files: Files) -> Files:
 
 def bind(files: Files) -> None:
     """Make every digest fit the documents as they are now."""
-    field = documents.digest(files[FIELD])
-    files[POLICY]["vector_field"] = files[FUNNEL]["vector_field"] = field
-    files[FUNNEL]["policy"] = documents.digest(files[POLICY])
-    for role, name in ROLES.items():
-        files[PROOF]["claim"]["about"][role]["digest"] = documents.digest(files[name])
+    bases = {"model": MODEL, "vector_field": FIELD}
+    for name, roles in ((POLICY, bases), (FUNNEL, bases | {"policy": POLICY})):
+        for role in files.get(name, {}).keys() & roles.keys():
+            files[name][role] = documents.digest(files[roles[role]])
+    for document in files.values():
+        for binding in document.get("claim", {}).get("about", {}).values():
+            binding["digest"] = documents.digest(files[binding["file"]])
 
 
 def stated(field: Json, policy: Json, funnel: Json, proof: Json, **claim: Any) -> Files:
@@ -63,4 +71,4 @@ def write(files: Files, folder: Path, *, rebind: bool = True) -> Path:
         bind(files)
     for name, document in files.items():
         (folder / name).write_bytes(documents.encode(document))
-    return folder / PROOF
+    return next(folder / name for name in files if name.endswith(".proof.json"))

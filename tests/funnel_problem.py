@@ -1,12 +1,16 @@
 """Problems of funnels as files have them (docs/howto-funnels.md)."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from nlsid import Goal, Nominal, VectorField, integrate_nominal
+from examples import satellite_funnel
+from nlsid import ContinuousTracking, Goal, Nominal, VectorField, integrate_nominal
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.design import FunnelDesign, design_funnel
+from nlsid_core.design.continuous.problem import Shape
 
 
 def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
@@ -18,6 +22,20 @@ def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
     field = VectorField.from_function(pendulum, 2, 1)
     t = np.linspace(0, 2, knots)
     return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+
+
+@cache
+def hung(shape: Shape = "rho") -> FunnelDesign:
+    """The funnel around it, with 9 knots."""
+    return design_funnel(ContinuousTracking(*hanging(), goal=20 * np.eye(2), shape=shape))
+
+
+@cache
+def satellite() -> FunnelDesign:
+    """The example's, with half of its knots."""
+    field, nominal, weights = satellite_funnel.problem(25)
+    goal = satellite_funnel.goal_matrix()
+    return design_funnel(ContinuousTracking(field, nominal, goal=goal, **weights))
 
 
 def document(field: VectorField, nominal: Nominal, goal: Goal, **options: Any) -> Json:

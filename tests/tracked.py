@@ -1,13 +1,11 @@
 """A pendulum known exactly, with a cubic in the place of the sine, and a short motion of it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
 from nlsid import SampledTracking, Trajectory
-from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
@@ -77,19 +75,6 @@ def designed(goal: float = 0.4) -> TrackingDesign:
     return design_state_funnel(
         SampledTracking(base.model, base.policy, base.feedback, assumption=assumption())
     )
-
-
-def write(design: TrackingDesign, folder: Path) -> Path:
-    """Model, policy, funnel and proof as files; the proof's path."""
-    return design.save(folder)[-1]
-
-
-def resigned(design: TrackingDesign, **changes: object) -> TrackingDesign:
-    """The design with another funnel, policy or model and every digest made to fit again."""
-    design = replace(design, **changes)  # type: ignore[arg-type]
-    policy = replace(design.policy, model=files.digest(design.model.document()))
-    funnel = replace(design.funnel, model=policy.model, policy=files.digest(policy.document()))
-    return replace(design, policy=policy, funnel=funnel)
 
 
 def step(design: TrackingDesign, k: int, x: FloatArray) -> FloatArray:

@@ -30,11 +30,12 @@ from bags.commands.options import (
 from nlsid_core.errors import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from bags.chain.config import Config
     from bags.fleet.monitor import FleetVerdict
     from bags.fleet.rows import Row, Rows
+    from bags.fleet.run import Task
     from bags.fleet.trials import FleetTrials
 
 LISTED = 20  # bags of a kind, by name
@@ -51,13 +52,30 @@ fleet_app = typer.Typer(
 
 @dataclass(frozen=True)
 class Fleet(Sharing):
-    """Who reads the bags, how patiently, and what is kept of them."""
+    """Who reads the bags, how patiently, and what is kept and written of them."""
 
     patience: PatienceOption = 60.0
     manifest: Annotated[
         Path | None,
         typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
     ] = None
+    table: Annotated[
+        Path | None,
+        typer.Option("--out", help="A .parquet file with a row for every bag, and all findings."),
+    ] = None
+
+    def read(self, task: Task, bags: Mapping[str, Path], doing: str) -> Rows:
+        """A row of each bag; they are written, if they are to be."""
+        from bags.fleet.rows import read_rows, write_parquet
+
+        with progress_bar(doing) as progress:
+            found = read_rows(
+                task, bags, workers=self.workers(), manifest=self.manifest, progress=progress
+            )
+        if self.table is not None:
+            write_parquet(found.rows, self.table)
+            out.print(f"wrote {self.table}", soft_wrap=True)
+        return found
 
 
 @fleet_app.command()
@@ -67,9 +85,6 @@ def check(
     bags: BagsArgument,
     fleet: Fleet,
     config: ConfigOption = None,
-    table: Annotated[
-        Path | None, typer.Option("--out", help="A .parquet file for all rows and findings.")
-    ] = None,
 ) -> None:
     """Say of every bag what its fitness, its clocks and its losses are, as one table.
 
@@ -79,26 +94,27 @@ def check(
     from bags.chain.config import load_config
     from bags.fleet.bags import UNREAD, named_bags
     from bags.fleet.check import BAD, GOOD, LOOK, SERIOUS, CheckBag
-    from bags.fleet.rows import read_rows, write_parquet
 
     settings = load_config(config_of(folder, config))
     named = named_bags(bags, patience=fleet.patience)
     _say_misspelt(named, settings)
-    with progress_bar("checking") as progress:
-        found = read_rows(
-            CheckBag(settings),
-            named,
-            workers=fleet.workers(),
-            manifest=fleet.manifest,
-            progress=progress,
-        )
-    if table is not None:
-        write_parquet(found.rows, table)
+    found = fleet.read(CheckBag(settings), named, "checking")
     counts = Counter(row.verdict for row in found.rows)
     _say_counts(found, fleet.manifest, [(counts[v], v) for v in SERIOUS])
     wrong = [row for verdict in SERIOUS[:-1] for row in found.rows if row.verdict == verdict]
     if wrong:
-        out.print(_checked_table(wrong[:ROWS]))
+        lost = {"lost": lambda row: _number(row, "lost", ".0f")}
+        out.print(
+            _table(
+                wrong[:ROWS],
+                {
+                    "verdict": lambda row: row.verdict,
+                    "start (UTC)": _when,
+                    **(lost if any("lost" in row.numbers for row in wrong) else {}),
+                    "what to look at": lambda row: _plain(row.reason),
+                },
+            )
+        )
     if more := wrong[ROWS:]:
         left = Counter(row.verdict for row in more)
         said = ", ".join(f"{count} {verdict}" for verdict, count in left.items())
@@ -109,8 +125,6 @@ def check(
             "no command moves in any bag that can be used: there is little to identify from",
             soft_wrap=True,
         )
-    if table is not None:
-        out.print(f"wrote {table}", soft_wrap=True)
     if counts[BAD] or counts[UNREAD]:
         raise typer.Exit(1 if counts[BAD] else 2)
 
@@ -124,22 +138,6 @@ def _say_misspelt(names: Iterable[str], settings: Config) -> None:
             out.print(f"mind: {line}", soft_wrap=True, markup=False, style="dark_orange3")
 
 
-def _checked_table(rows: Sequence[Row]) -> Table:
-    shown = _table(rows)
-    shown.add_column("verdict", no_wrap=True)
-    shown.add_column("start (UTC)", min_width=10)
-    is_counted = any("lost" in row.numbers for row in rows)
-    if is_counted:
-        shown.add_column("lost", justify="right")
-    shown.add_column("what to look at", overflow="fold", ratio=1)
-    for row in rows:
-        cells = [_plain(row.bag), row.verdict, _when(row.start)]
-        if is_counted:
-            cells.append(_number(row, "lost", ".0f"))
-        shown.add_row(*cells, _plain(row.reason))
-    return shown
-
-
 @fleet_app.command()
 @flat
 def monitor(
@@ -147,9 +145,6 @@ def monitor(
     bags: BagsArgument,
     fleet: Fleet,
     config: ConfigOption = None,
-    table: Annotated[
-        Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
-    ] = None,
 ) -> None:
     """Hold every bag against one proved design: which are inside, and what they spend.
 
@@ -161,7 +156,6 @@ def monitor(
     from bags.designs import documents
     from bags.fleet.bags import COPY, named_bags
     from bags.fleet.monitor import FleetVerdict, JudgeBag
-    from bags.fleet.rows import read_rows, write_parquet
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
 
@@ -172,13 +166,8 @@ def monitor(
     named = named_bags(bags, patience=fleet.patience)
     if settings is not None:
         _say_misspelt(named, settings)
-    with progress_bar("judging") as progress:
-        read = read_rows(
-            task, named, workers=fleet.workers(), manifest=fleet.manifest, progress=progress
-        )
+    read = fleet.read(task, named, "judging")
     found = FleetVerdict(read.rows, frozenset(design.made_with))
-    if table is not None:
-        write_parquet(found.rows, table)
     counts = Counter(row.verdict for row in found.rows)
     _say_counts(read, fleet.manifest, [(counts[v], v) for v in _VERDICTS if counts[v]])
     _say_verdicts(found)
@@ -191,8 +180,6 @@ def monitor(
             markup=False,
             highlight=False,
         )
-    if table is not None:
-        out.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows} - {COPY}
     if verdicts & {*BROKEN} or any("alarm" in row.said for row in found.rows):
         raise typer.Exit(1)
@@ -246,27 +233,19 @@ def _say_worst(worst: Sequence[Row]) -> None:
 
     count = f"the {len(worst)} bags that" if len(worst) > 1 else "the bag that"
     out.print(f"{count} spent the most, and when:")
-    shown = _table(worst)
-    for column, justify in (
-        ("spent", "right"),
-        ("at", "right"),
-        ("start (UTC)", "left"),
-        ("verdict", "left"),
-        ("bad from", "right"),
-        ("margin", "right"),
-    ):
-        shown.add_column(column, justify=justify, min_width=10 if "UTC" in column else None)  # type: ignore[arg-type]
-    for row in worst:
-        shown.add_row(
-            _plain(row.bag),
-            in_percent(row.numbers["spent"]),
-            _number(row, "spent_at", ".3f", " s"),
-            _when(row.start),
-            _VERDICTS[row.verdict],
-            _number(row, "bad_at", ".3f", " s"),
-            _number(row, "margin", ".3f"),
+    out.print(
+        _table(
+            worst,
+            {
+                "spent": lambda row: in_percent(row.numbers["spent"]),
+                "at": lambda row: _number(row, "spent_at", ".3f", " s"),
+                "start (UTC)": _when,
+                "verdict": lambda row: _VERDICTS[row.verdict],
+                "bad from": lambda row: _number(row, "bad_at", ".3f", " s"),
+                "margin": lambda row: _number(row, "margin", ".3f"),
+            },
         )
-    out.print(shown)
+    )
 
 
 def _number(row: Row, name: str, form: str, unit: str = "") -> str:
@@ -274,17 +253,27 @@ def _number(row: Row, name: str, form: str, unit: str = "") -> str:
     return f"{row.numbers[name]:{form}}{unit}" if name in row.numbers else "-"
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[Row], columns: Mapping[str, Callable[[Row], str]]) -> Table:
     """A table that begins with the bags' names, whole ones if they are not long."""
     shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
     longest = max(len(row.bag) for row in rows)
     shown.add_column("bag", overflow="fold", no_wrap=longest <= WHOLE, max_width=WHOLE)
+    for name in columns:
+        numbers = name in ("spent", "at", "bad from", "margin", "lost")
+        shown.add_column(
+            name,
+            justify="right" if numbers else "left",
+            overflow="fold",
+            min_width=10 if "UTC" in name else None,
+        )
+    for row in rows:
+        shown.add_row(_plain(row.bag), *(cell(row) for cell in columns.values()))
     return shown
 
 
-def _when(moment: str) -> str:
-    """A time of ISO 8601 to the minute, as people write it."""
-    return moment[:16].replace("T", " ")
+def _when(row: Row) -> str:
+    """When it was recorded, to the minute, as people write it."""
+    return row.start[:16].replace("T", " ")
 
 
 def _since(row: Row) -> str:
@@ -311,20 +300,14 @@ def _say_counts(read: Rows, manifest: Path | None, counts: Sequence[tuple[int, s
 def say_read(found: FleetTrials, manifest: Path) -> None:
     """How many bags are used, and which are not and why."""
     count, left_out = len(found.answers), len(found.left_out)
+    known = sum(answer.kept for answer in found.answers)
     out.print(
-        f"{counted(count, 'bag')}: {count - left_out} used, {len(found.unread)} not read, "
-        f"{len(found.unusable)} not usable, {len(found.copies)} copies; "
-        f"{sum(answer.kept for answer in found.answers)} of them known from {manifest}",
+        f"{counted(count, 'bag')}: {count - left_out} used; {known} of them known from {manifest}",
         soft_wrap=True,
         markup=False,
         highlight=False,
     )
-    for title, bags in (
-        ("left out, not read", found.unread),
-        ("left out, not usable as configured", found.unusable),
-        ("left out, copies", found.copies),
-    ):
-        _say_bags(title, bags)
+    _say_bags("left out", found.left_out)
 
 
 def _plain(text: str) -> str:

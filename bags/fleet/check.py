@@ -10,14 +10,14 @@ from bags.chain.config import Config
 from bags.chain.steps import read_signals_of
 from bags.fleet.bags import COPY, UNREAD
 from bags.fleet.rows import Row, iso
-from bags.fleet.run import is_of_content, without_name
+from bags.fleet.run import without_name
 from bags.fleet.trials import samples_digest
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions, texts_of
-from bags.signals.reader import bag_origin
+from bags.signals.reader import SamplesError, bag_origin
 from bags.tools.fitness import Finding, Level, check_fitness
 from bags.tools.info import LOST
-from nlsid_core.errors import DataError
+from nlsid_core.errors import BagError, DataError
 
 BAD, LOOK, GOOD = (level.name.lower() for level in (Level.BAD, Level.LOOK, Level.GOOD))
 SERIOUS: Final = (UNREAD, BAD, COPY, LOOK, GOOD)  # the most serious first
@@ -54,8 +54,8 @@ class CheckBag:
         try:
             own = read_signals_of({name: bag}, self.config).trajectories
         except DataError as error:
-            if not is_of_content(error):
-                raise
+            if isinstance(error, BagError) and not isinstance(error, SamplesError):
+                raise  # it was not read: nothing can be said of what it holds
             refused = f"`nlsid identify` leaves it out: {without_name(str(error), bag, name)}"
         else:
             marks += samples_digest(own)

@@ -18,7 +18,6 @@ from typing import Final, Protocol
 from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
-from bags.signals.reader import SamplesError
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
 
@@ -40,15 +39,13 @@ class Task(Protocol):
 class Answer:
     """The answer for one bag: content, or the reason why there is none.
 
-    was_read: the reason is what the bag holds, not that it cannot be read. kept: it was in the
-    manifest.
+    kept: it was in the manifest.
     """
 
     bag: Path
     name: str
     content: bytes = b""
     reason: str = ""
-    was_read: bool = False
     kept: bool = False
 
 
@@ -158,23 +155,17 @@ def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
     key: of the bag as it was listed. If it is another afterwards there is no answer: ranges of two
     files would be taken for one recording.
     """
-    content, reason, was_read = b"", "", False
+    content, reason = b"", ""
     again = bag.anew() if isinstance(bag, RemotePath) else bag
     try:
         content = task(bag, name)
         if key_of(again, name, task.asked) != key:
             content, reason = b"", "it changed while it was read; start the command again"
     except Exception as error:  # bags are untrusted: whatever one of them causes is about it alone
-        reason, was_read = _said(error, bag, name), is_of_content(error)
+        reason = _said(error, bag, name)
     if isinstance(bag, RemotePath):
         bag.forget()
-    return Answer(bag, name, content, reason, was_read)
-
-
-def is_of_content(error: BaseException) -> bool:
-    """Whether a bag was read, and what it holds cannot be used; of others nothing can be said."""
-    of_bag = isinstance(error, BagError) and not isinstance(error, SamplesError)
-    return isinstance(error, DataError) and not of_bag
+    return Answer(bag, name, content, reason)
 
 
 def _error(future: "Future[Answer]") -> BaseException | None:

@@ -51,20 +51,13 @@ class ReadTrials:
 @dataclass(frozen=True, eq=False)
 class FleetTrials:
     """What was read of every bag, without what it says; the trials of all that can be used; and who
-    is left out, by name with the reason: not read, not usable as configured, or a copy.
+    is left out, by name with the reason.
     """
 
     config: Config
     answers: tuple[Answer, ...]
     read: tuple[Trajectory, ...]
-    unread: Mapping[str, str]
-    unusable: Mapping[str, str]
-    copies: Mapping[str, str]
-
-    @property
-    def left_out(self) -> dict[str, str]:
-        """All that are, by name."""
-        return dict(sorted({**self.unread, **self.unusable, **self.copies}.items()))
+    left_out: Mapping[str, str]
 
     @cached_property
     def trials(self) -> Trials:
@@ -102,28 +95,26 @@ def usable_trials(given: Iterable[Answer], config: Config) -> FleetTrials:
     """
     answers: list[Answer] = []
     trials: list[Trajectory] = []
-    unread: dict[str, str] = {}
-    unusable: dict[str, str] = {}
-    copies: dict[str, str] = {}
+    left_out: dict[str, str] = {}
     recordings = Recordings()
     for answer in given:
         name = answer.name
         answers.append(replace(answer, content=b""))
         if answer.reason:
-            (unusable if answer.was_read else unread)[name] = answer.reason
+            left_out[name] = answer.reason
             continue
         own = decoded(answer.content, source=f"{name}: not trials")[""].trajectories
         first = recordings.first(name, [own[0].digest, *samples_digest(own)])
         if first != name:
-            copies[name] = same_as(first)
+            left_out[name] = same_as(first)
             continue
         try:
             Dataset((*trials[:1], *own))
         except NlsidError as error:
-            unusable[name] = without_name(str(error), answer.bag, name)
+            left_out[name] = without_name(str(error), answer.bag, name)
             continue
         trials += own
-    return FleetTrials(config, tuple(answers), tuple(trials), unread, unusable, copies)
+    return FleetTrials(config, tuple(answers), tuple(trials), left_out)
 
 
 def samples_digest(trials: Sequence[Trajectory]) -> list[str]:

@@ -7,7 +7,6 @@ all.
 Source: the MCAP specification, https://mcap.dev/spec.
 """
 
-import errno
 import fcntl
 import os
 import shutil
@@ -47,8 +46,6 @@ from bags.recordings.storage import Channel
 from nlsid_core.errors import BagError
 from nlsid_core.files import write_atomically
 
-RESERVE_BYTES: Final = 8 * 2**20  # a chunk, the summary of hours, and metadata.yaml
-FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 CHUNK_BYTES: Final = 2**20
 PACKING: Final = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "none": bytes}
 _HEAD: Final = struct.Struct("<BQHIQQ")  # of a message's record, as MESSAGE
@@ -56,7 +53,6 @@ _FOOTER: Final = struct.Struct("<BQQQ")  # what the summary's checksum has of th
 
 MOST_CHANNELS: Final = 2**16
 MAX_COUNT: Final = 2**32  # an MCAP file counts the messages of a topic in 32 bits
-RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
 
 
 def refuse_existing(path: Path) -> None:
@@ -65,42 +61,15 @@ def refuse_existing(path: Path) -> None:
         raise BagError(f"{path} exists already; take another name or move it away")
 
 
-class Reserve:
-    """Disk space held by a file, so that a bag can still be closed once the disk is full.
-
-    Raises OSError if there is not even that much.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.spent = ""
-        with path.open("xb") as stream:
-            try:
-                os.posix_fallocate(stream.fileno(), 0, RESERVE_BYTES)
-            except OSError as error:
-                path.unlink()
-                raise OSError(error.errno, error.strerror, str(path)) from error
-
-    def spend(self, why: str) -> None:
-        """Give the space back because of `why`."""
-        self.spent = why
-        self.release()
-
-    def release(self) -> None:
-        """Give the space back."""
-        self.path.unlink(missing_ok=True)
-
-
 class Output:
     """A new file that other processes see locked while it is open. `size`: bytes written.
 
-    A write that fails leaves nothing of itself behind. On a full disk it spends the reserve and is
-    tried again; whoever writes should then look at `reserve.spent` and come to an end.
+    A write that fails leaves nothing of itself behind.
     """
 
-    def __init__(self, path: Path, reserve: Reserve | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.size = 0
-        self._path, self._reserve = path, reserve
+        self._path = path
         self._stream = path.open("xb", buffering=0)
         fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
 
@@ -109,18 +78,8 @@ class Output:
         """Whether `close` was called."""
         return self._stream.closed
 
-    def write(self, data: bytes) -> int:
-        """Append `data`; OSError if there is no room and no reserve."""
-        try:
-            self._append(data)
-        except OSError as error:
-            if self._reserve is None or self._reserve.spent or error.errno not in FULL:
-                raise
-            self._reserve.spend(str(error))
-            self._append(data)
-        return len(data)
-
-    def _append(self, data: bytes) -> None:
+    def write(self, data: bytes) -> None:
+        """Append `data`; OSError if there is no room."""
         rest = memoryview(data)
         try:
             while rest:
@@ -152,10 +111,9 @@ class BagWriter:
 
     Normally everything is written to a temporary folder beside `path`, which gets its name when
     the bag is closed; leaving a `with` block by an exception removes it. With `in_place=True` the
-    bag grows under its own name and whatever happens stays readable: a recorder that is killed
-    loses only the messages after the last closed chunk (it has no metadata.yaml then), and one
-    whose disk is full spends the room that was kept for the bag's end and says so in `full`. A
-    killed process loses nothing of a closed chunk; a power cut may.
+    bag grows under its own name and whatever happens stays readable: a recorder that is killed, or
+    whose disk is full, loses only the messages after the last closed chunk (it has no metadata.yaml
+    then). A killed process loses nothing of a closed chunk; a power cut may.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
     from a timer, limits what a kill loses. `mcap` takes what is copied as it is.
@@ -191,8 +149,7 @@ class BagWriter:
             )
             self._folder.chmod(0o755)
         try:
-            self._reserve = Reserve(self._folder / RESERVE) if in_place else None
-            self._output = Output(self._folder / f"{self.path.name}.mcap", self._reserve)
+            self._output = Output(self._folder / f"{self.path.name}.mcap")
             self.mcap = McapWriter(self._output, compression)
             self.annotate(custom or {})
         except BaseException:
@@ -211,11 +168,6 @@ class BagWriter:
         for number, channel in self._topics.items():
             found[channel.topic] = found.get(channel.topic, 0) + self.mcap.counts[number]
         return found
-
-    @property
-    def full(self) -> str:
-        """Why the bag should be closed now, if the disk is full; otherwise empty."""
-        return "" if self._reserve is None else self._reserve.spent
 
     def add_topic(
         self,
@@ -312,14 +264,12 @@ class BagWriter:
     def close(self) -> None:
         """Finish the file, write metadata.yaml, give the folder its name; once.
 
-        Where that fails (a full disk without a reserve), a bag in place stays what a killed
+        Where that fails (a full disk), a bag in place stays what a killed
         recorder leaves: unfinished, all its closed chunks readable.
         """
         if self._output.closed:
             return
         try:
-            if self._reserve is not None:
-                self._reserve.release()
             self.mcap.finish()
             self._output.sync()
             self._output.close()
@@ -424,8 +374,8 @@ class McapWriter:
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=len(content),
         )
-        self._content, self._entries = bytearray(), {}
         self._put(chunk, entries)
+        self._content, self._entries = bytearray(), {}  # where it cannot be written it is kept
 
     def copy_chunk(self, whole: Whole) -> None:
         """Append a whole chunk of another file, whose channels have the same numbers here."""

@@ -34,7 +34,7 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.names import did_you_mean
-from bags.signals.signal import ANGLES, QUATERNION, SignalPath, numeric_paths
+from bags.signals.signal import SignalPath
 from bags.signals.units import UNITS, conversion, implied_unit, per_second
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
@@ -142,7 +142,7 @@ class Expression:
 
         The path must fit `msgtype` (`SignalPath.check`).
         """
-        return self.unit_of(_path_unit(self.path, msgtype, types))
+        return self.unit_of(self.recorded_unit(msgtype, types))
 
     def unit_of(self, unit: str) -> str:
         """The unit of the result of numbers recorded in `unit`; BagError as `unit`."""
@@ -184,7 +184,7 @@ class Expression:
 
     def recorded_unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the number at the path, before any operation."""
-        return _path_unit(self.path, msgtype, types)
+        return implied_unit(self.path.check(msgtype, types))
 
     def _conversion(self, of: str, to: str) -> tuple[float, float]:
         try:
@@ -395,12 +395,3 @@ def _operation(part: str, text: str) -> Operation:
     if not argument:
         raise BagError(f"'{part}' in '{text}': state the unit, e.g. unit(rad)")
     return Operation(name, unit=argument)
-
-
-@lru_cache(maxsize=256)
-def _path_unit(path: SignalPath, msgtype: str, types: Typestore) -> str:
-    wanted = ".".join(step.field + ("[*]" if step.picks else "") for step in path.steps)
-    paths = {found: owners for found, _, owners in numeric_paths(msgtype, types)}
-    if wanted not in paths and path.steps[-1].field in ANGLES:
-        return implied_unit([(QUATERNION, path.steps[-1].field)])
-    return implied_unit(paths.get(wanted, ()))

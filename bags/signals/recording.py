@@ -160,7 +160,7 @@ class Recording:
             self.bag.annotate(custom)
 
     def keep_up(self) -> None:
-        """Close the chunk, and the bag if it was taken away or the disk is (nearly) full; to be
+        """Close the chunk, and the bag if it was taken away or the disk is nearly full; to be
         called regularly.
         """
         if self._closed:
@@ -168,9 +168,7 @@ class Recording:
         with self._ending():
             self.bag.close_chunk()
             free = shutil.disk_usage(self.bag.path).free / 1e6
-            if self.bag.full:
-                self._end(self.bag.full)
-            elif free < self._least_free:
+            if free < self._least_free:
                 self._end(f"{free:.0f} MB left, {self._least_free:g} are to stay free")
 
     def close(self) -> None:

@@ -81,20 +81,23 @@ class SignalPath:
         """Whether it leads through a named message of an array, so that it may be absent."""
         return any(step.key is not None for step in self.steps[:-1])
 
-    def check(self, msgtype: str, types: Typestore) -> None:
-        """BagError unless messages of `msgtype` have a number here; it names the nearest that are.
+    def check(self, msgtype: str, types: Typestore) -> tuple[tuple[str, str], ...]:
+        """Find the (message type, field) on the way to the number in messages of `msgtype`.
 
-        The length of a dynamic array is only known message by message: see `value`.
+        BagError if there is no number here; it names the nearest that are. The length of a dynamic
+        array is only known message by message: see `value`.
         """
         current: FieldDesc = (Nodetype.NAME, msgtype)
+        way: list[tuple[str, str]] = []
         for step in self.steps:
             if current[0] != Nodetype.NAME:
                 raise BagError(f"{self}: {_describe(current)} has no field '{step.field}'")
             owner = str(current[1])
+            way.append((owner, step.field))
             if owner == QUATERNION and step is self.steps[-1] and step.field in ANGLES:
                 if step.picks:
                     raise BagError(f"{self}: '{step.field}' is an angle, not an array")
-                return
+                return tuple(way)
             fields = fields_of(owner, types)
             if step.field not in fields:
                 near = did_you_mean(
@@ -112,6 +115,7 @@ class SignalPath:
             )
         if current[1][0] in ("string", "wstring"):
             raise BagError(f"{self} is {_describe(current)}, not a number")
+        return tuple(way)
 
     def expand(self, message: Any) -> list["SignalPath"]:
         """The signals that `[*]` stands for in a decoded message; each holds on to that length."""

@@ -10,7 +10,6 @@ import numpy as np
 from bags.recordings.bag import Bag
 from bags.recordings.folders import METADATA
 from bags.recordings.message_types import decode
-from bags.recordings.writer import RESERVE
 from bags.signals.timing import missing
 from bags.tools.convert import convert
 from nlsid_core.arrays import IntArray
@@ -110,7 +109,6 @@ def repair(bag: Path) -> int:
             copied = convert([old], whole, nearly=True)
         for name in (f"{bag.name}.mcap", METADATA):  # without metadata.yaml it is still unfinished
             (whole / name).replace(bag / name)
-    (bag / RESERVE).unlink(missing_ok=True)
     return copied.messages
 
 

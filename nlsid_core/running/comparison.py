@@ -88,15 +88,15 @@ class PlanComparison:
         self,
         t: float,
         y: float,
-        u: float,
+        u: Any,
         *,
         needs_input: bool,  # noqa: ARG002
-    ) -> tuple[float, float, str]:
-        """Numbers as they are, and why they cannot be judged."""
+    ) -> tuple[float, Any, str]:
+        """Numbers as they are, and why they cannot be judged; u is None if no input came."""
         fault = ""
         if not abs(y) < np.inf:
             fault = f"{self.model.y.name} is {y} at t = {t:g} s"
-        elif not abs(u) < np.inf:
+        elif u is None or not abs(u) < np.inf:
             fault = f"no {self.model.u.name} at t = {t:g} s ({unsaid(u)})"
         return y, u, fault
 

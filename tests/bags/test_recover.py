@@ -244,9 +244,7 @@ def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) 
         bag.write("/arm", definition.msgtype, data, log_time_ns=k, publish_time_ns=k)
     bag.close_chunk()
     bag.abandon()
-    assert (tmp_path / "run" / ".reserve").stat().st_size > 0
     assert repair(tmp_path / "run") == 25
-    assert not (tmp_path / "run" / ".reserve").exists()
     with Bag(tmp_path / "run") as source:
         assert source.custom == {"robot": "arm"}
     [values] = read_signals(tmp_path / "run", ["/arm:x"]).values()
@@ -263,7 +261,7 @@ def test_a_bag_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
             repair(tmp_path / "live")
 
 
-# -- A recording whose disk is full: closed with the room that was kept, or else left readable
+# -- A recording whose disk is full: closed while there is room, or else left readable
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 30_000  # bytes a file may have
@@ -288,10 +286,10 @@ print(recording.ended)
 """
 
 
-def test_where_no_room_can_be_kept_the_bag_is_unfinished_and_can_be_repaired(
+def test_where_there_is_no_room_the_bag_is_unfinished_and_can_be_repaired(
     tmp_path: Path,
 ) -> None:
-    """A limit on the size of a file (EFBIG) stands in for a disk that the reserve does not help."""
+    """A limit on the size of a file (EFBIG) stands in for a full disk."""
     bag = tmp_path / "run"
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(bag)],

@@ -26,7 +26,7 @@ from nlsid import (
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.c_table import c_table, write_table
-from tests.core.kernel.tube_claims import design
+from tests.core.kernel.tube_claims import MODELS, design
 
 CORE = Path(__file__).parents[2] / "examples" / "rclcpp_monitor"
 COMPILER = shutil.which("cc") or shutil.which("gcc")
@@ -124,11 +124,17 @@ def test_the_program_of_the_page_reads_a_table_of_samples(
     ]
 
 
-@pytest.mark.parametrize("name", ["two_outputs", "cascade", "following"])
-def test_other_designs_have_no_table_and_it_says_why(name: str) -> None:
-    other = design(name)
-    with pytest.raises(DataError, match=r"linear model of one|level: constant"):
-        c_table(other.model, other.funnel)
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("two_outputs", "linear model of one"),
+        ("cascade", "linear model of one"),
+        ("following", "level: constant"),
+    ],
+)
+def test_other_designs_have_no_table_and_it_says_why(name: str, why: str) -> None:
+    with pytest.raises(DataError, match=why):
+        c_table(MODELS[name](), design("following").funnel)
 
 
 def test_a_name_cannot_end_the_comment(made: OutputTubeDesign) -> None:

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_lyapunov
-from scipy.stats import binomtest
 
 from bags.designs.provenance import of_funnel
 from nlsid import Dataset, Fit, Monitor, OutputTube, Status, Trajectory
@@ -14,7 +12,6 @@ from nlsid_core.data.calibration import calibration_trials, windows
 from nlsid_core.data.shared import shared_stretch
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.levels import candidates, followed
-from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.level import CHANGE, VALUE, CommandLevel, LevelMeter, Term
@@ -151,79 +148,6 @@ def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
     said = worth(cut)
     assert "by the scale of 2 distinct windows" in said
     assert "windows of one recording are hardly exchangeable" in said
-
-
-# -- how often the next trial exceeds the largest -----------------------------------------------
-
-REPEATS = 4000
-CONFIDENCE = 0.999  # of the interval around the frequency
-RATIOS = (1e-3, 1e-1, 1.0, 10.0, 1e3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scaling", [1, 4, 9])
-def test_exchangeable_trials_exceed_the_largest_as_often_as_stated(
-    fit: Fit[DifferenceEquation], scaling: int
-) -> None:
-    """The observer is chosen as the design does, on other trials: 1/(m + 1), neither more nor less.
-
-    The energies are continuous, so that the largest of m + 1 is the last with this probability.
-    """
-    rng, model = np.random.default_rng(scaling), fit.model
-    gains = np.array([kalman_gain(model, ratio) for ratio in RATIOS])
-    reach = np.array([1.0 + solve_discrete_lyapunov(model.A, np.outer(L, L))[0, 0] for L in gains])
-    found = energies(model, gains, rng, trials=REPEATS * (3 + scaling + 1))
-    designing, measured, after = np.split(found.reshape(REPEATS, -1, len(gains)), [3, -1], axis=1)
-    chosen = (designing.max(axis=1) * reach).argmin(axis=1)
-    assert len(set(chosen.tolist())) > 1  # the choice depends on the trials
-    row = np.arange(REPEATS)
-    exceeded = int((after[row, 0, chosen] > measured[row, :, chosen].max(axis=1)).sum())
-    low, high = binomtest(exceeded, REPEATS).proportion_ci(CONFIDENCE)
-    assert low <= 1.0 / (scaling + 1) <= high
-
-
-def test_trials_that_choose_the_observer_say_less_of_the_next_one(
-    fit: Fit[DifferenceEquation],
-) -> None:
-    """What calibration on the trials of the design does: the next one exceeds more often."""
-    rng, model, m = np.random.default_rng(0), fit.model, 2
-    gains = rng.normal(size=(60, len(model))) * 0.3  # many observers to choose from
-    gains = gains[
-        [np.abs(np.linalg.eigvals(model.A - np.outer(L, model.C[0]))).max() < 1 for L in gains]
-    ]
-    found = energies(model, gains, rng, trials=REPEATS * (m + 1)).reshape(REPEATS, m + 1, -1)
-    chosen = found[:, :m].max(axis=1).argmin(axis=1)
-    row = np.arange(REPEATS)
-    exceeded = int((found[row, m, chosen] > found[row, :m, chosen].max(axis=1)).sum())
-    low, _ = binomtest(exceeded, REPEATS).proportion_ci(CONFIDENCE)
-    assert low > 1.0 / (m + 1)
-
-
-def kalman_gain(model: DifferenceEquation, noise_ratio: float) -> FloatArray:
-    """L (n,) for noise_ratio, variance of a disturbance of the input over the measurement's."""
-    A, B, C = model.A, model.B, model.C
-    S = solve_riccati(A.T, C.T, noise_ratio * B @ B.T, np.eye(1))
-    return np.asarray((A @ S @ C.T)[:, 0] / (1.0 + (C @ S @ C.T)[0, 0]))
-
-
-def energies(
-    model: DifferenceEquation, gains: FloatArray, rng: np.random.Generator, *, trials: int
-) -> FloatArray:
-    """Σ e² (trials, gains) of exchangeable trials.
-
-    White noise in the equation and on the measurement, each of a random size.
-    """
-    n, samples = len(model), 30
-    sizes = np.exp(rng.standard_normal((2, trials)))
-    truth, x = np.zeros((trials, n)), np.zeros((trials, len(gains), n))
-    total = np.zeros((trials, len(gains)))
-    for _ in range(samples):
-        y = truth[:, 0] + sizes[0] * rng.standard_normal(trials)
-        e = y[:, None] - x[:, :, 0]
-        total += e**2
-        x = x @ model.A.T + gains * e[:, :, None]
-        truth = truth @ model.A.T + (sizes[1] * rng.standard_normal(trials))[:, None] * model.B.T
-    return total
 
 
 # -- Levels that follow the commands: g by its formula, narrower where it pays, exceeded rarely

@@ -1,7 +1,5 @@
 """The controller in the loop with simulated plants, without ROS."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -66,31 +64,6 @@ def test_a_push_beyond_the_budget_is_seen_as_one(moving: OutputTubeDesign) -> No
     worst = min(readings, key=lambda reading: reading.margin)
     assert worst.status is Status.OUTSIDE
     assert "above the level" in worst.reason
-
-
-def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
-    design: OutputTubeDesign,
-) -> None:
-    assert design.policy is not None
-    controller = design.controller(WIDE, 1.0)
-    for k in range(12):
-        assert controller.update(k * PERIOD, 3.0) == design.policy.u[0]
-    assert "not at the start of the plan after 1 s" in controller.ended
-
-
-@pytest.mark.parametrize(
-    ("t", "y", "reason"),
-    [(0.3, math.nan, "speed is nan"), (0.5, 0.0, "missing"), (0.05, 0.0, "time went back")],
-)
-def test_a_state_that_cannot_be_used_ends_the_run(
-    design: OutputTubeDesign, t: float, y: float, reason: str
-) -> None:
-    controller = design.controller(WIDE, 1.0)
-    for k in range(3):
-        controller.update(k * PERIOD, 3.0)
-    u = controller.u
-    assert controller.update(t, y) == u
-    assert reason in controller.ended
 
 
 def test_stopping_is_no_faster_than_allowed_and_arrives() -> None:

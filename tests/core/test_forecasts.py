@@ -181,7 +181,7 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
 
 
 def test_the_reach_of_a_linear_model_is_above_the_exact_one_and_close() -> None:
-    for name in ("linear", "implicit_linear"):
+    for name in ("linear", "two_outputs"):
         model, funnel = alone(name, peak=False)
         linear, tube = linear_form(model), funnel.tubes[0]
         assert linear is not None

@@ -1,7 +1,5 @@
 """Funnels that follow each other: one claim over their files, and what is refused."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +10,12 @@ from nlsid import ContinuousTracking, Goal, Nominal, VectorField, check, integra
 from nlsid_core import files as documents
 from nlsid_core.design import compose_funnels, design_funnel
 from nlsid_core.errors import CertificateMismatch, DataError, Infeasible
+from nlsid_core.proofs import decide
 from tests.core.kernel import refusals
-from tests.decided import decided
-from tests.funnel_files import forged_by
+from tests.edits import Edit, both, exchanged, put, scaled, without
+from tests.funnel_files import Files, copy_of, forged_by, read
 from tests.marks import slow_among
 from tests.verbs import nlsid
-
-Files = dict[str, Any]
 
 
 def motion(start: float, end: float, *, damping: float = 0.2) -> tuple[VectorField, Nominal]:
@@ -51,7 +48,7 @@ def files(proofs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Files
     """The composition's thirteen documents."""
     folder = tmp_path_factory.mktemp("whole")
     compose_funnels(proofs, folder)
-    return {path.name: json.loads(path.read_text()) for path in folder.iterdir()}
+    return read(folder)
 
 
 def test_three_stages_are_one_funnel_and_each_is_still_its_own(
@@ -108,109 +105,64 @@ def test_a_stage_that_ends_wider_than_the_next_starts_is_told_by_how_much(
         compose_funnels([wide, proofs[1]], tmp_path / "out")
 
 
-def swapped_order(files: Files) -> None:
-    """Stages 1 and 2, proofs and all."""
-    about = files["composition.proof.json"]["claim"]["about"]
-    about["stage1"], about["stage2"] = about["stage2"], about["stage1"]
+WHOLE = "composition.proof.json"
+ABOUT, MULTIPLIERS = f"{WHOLE} claim about", f"{WHOLE} proof multipliers"
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "stages 1 and 2 exchanged": (exchanged(f"{ABOUT} stage1", f"{ABOUT} stage2"), "not_covered"),
+    # Stage 1 no longer ends inside it.
+    "stage 2 starts narrower": (scaled("stage2.funnel.json rho 0", 0.99), "not_definite"),
+    "stage 2 has the third's funnel": (
+        exchanged("stage2.funnel.json", "stage3.funnel.json"),
+        "mismatch",
+    ),
+    "a multiplier less": (without(f"{MULTIPLIERS} -1"), "malformed"),
+    "from 1 to 2 s no funnel": (
+        both(
+            put(f"{ABOUT} stage2 file", "stage3.proof.json"),
+            without(f"{ABOUT} stage3"),
+            without(f"{MULTIPLIERS} -1"),
+        ),
+        "not_covered",
+    ),
+    # Past 1 the S-lemma gives nothing.
+    "a multiplier above 1": (put(f"{MULTIPLIERS} 0", 1.01), "not_definite"),
+    "stage 2's proof is stage 1's": (
+        put(f"{ABOUT} stage2 file", "stage1.proof.json"),
+        "not_covered",
+    ),
+    "the last goal smaller": (scaled("stage3.proof.json claim goal P", 1.02), "not_definite"),
+    "multipliers without end": (put(MULTIPLIERS, [0.5] * 100_000), "too_large"),
+}
 
 
-def start_shrunk(files: Files) -> None:
-    """Stage 2 starts 1 % narrower: stage 1 no longer ends inside it."""
-    files["stage2.funnel.json"]["rho"][0] *= 0.99
-
-
-def other_funnel(files: Files) -> None:
-    """Stage 2 has the third stage's funnel, whose proof is another."""
-    files["stage2.funnel.json"] = files["stage3.funnel.json"]
-
-
-def stage_missing(files: Files) -> None:
-    """A multiplier less: the claim is then about too many files."""
-    files["composition.proof.json"]["proof"]["multipliers"].pop()
-
-
-def stage_left_out(files: Files) -> None:
-    """From 1 to 2 s there is no funnel."""
-    whole = files["composition.proof.json"]
-    whole["claim"]["about"]["stage2"] = whole["claim"]["about"].pop("stage3")
-    whole["proof"]["multipliers"].pop()
-
-
-def multiplier_raised(files: Files) -> None:
-    """Past 1 the S-lemma gives nothing."""
-    files["composition.proof.json"]["proof"]["multipliers"][0] = 1.01
-
-
-def proof_exchanged(files: Files) -> None:
-    """Stage 2's proof is a copy of stage 1's."""
-    files["stage2.proof.json"] = files["stage1.proof.json"]
-
-
-def stages_without_end(files: Files) -> None:
-    """A hundred thousand multipliers for three stages."""
-    files["composition.proof.json"]["proof"]["multipliers"] = [0.5] * 100_000
-
-
-FORGERIES: list[tuple[Callable[[Files], None], str]] = [
-    (swapped_order, "not_covered"),
-    (start_shrunk, "not_definite"),
-    (other_funnel, "mismatch"),
-    (stage_missing, "malformed"),
-    (stage_left_out, "not_covered"),
-    (multiplier_raised, "not_definite"),
-    (proof_exchanged, "not_covered"),
-    (stages_without_end, "too_large"),
-]
-
-
-def rebound(files: Files, folder: Path) -> Path:
-    """Every digest made to fit again, as a forger would."""
-    for i in (1, 2, 3):
-        about = files[f"stage{i}.proof.json"]["claim"]["about"]
-        for binding in about.values():
+def rebound(files: Files) -> None:
+    """Every digest made to fit again, as a forger would; those inside of the stages as they are."""
+    for name in (*(f"stage{i}.proof.json" for i in (1, 2, 3)), WHOLE):
+        for binding in files[name]["claim"]["about"].values():
             binding["digest"] = documents.digest(files[binding["file"]])
-    for binding in files["composition.proof.json"]["claim"]["about"].values():
-        binding["digest"] = documents.digest(files[binding["file"]])
-    for name, document in files.items():
-        (folder / name).write_bytes(documents.encode(document))
-    return folder / "composition.proof.json"
 
 
-@pytest.mark.parametrize(
-    ("forge", "reason"),
-    slow_among(FORGERIES, {"stages_without_end"}),
-    ids=lambda f: getattr(f, "__name__", ""),
-)
-def test_a_forged_composition_is_refused_for_what_it_is(
-    files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
-) -> None:
+@pytest.mark.parametrize("what", slow_among(FORGERIES, {"multipliers without end"}))
+def test_a_forged_composition_is_refused_for_what_it_is(files: Files, what: str) -> None:
+    forge, reason = FORGERIES[what]
+    forged = forged_by(forge, files)
+    rebound(forged)
     with refusals.refused(reason):
-        decided(rebound(forged_by(forge, files), tmp_path))
+        decide(forged[WHOLE], forged)
 
 
-def test_binding_the_files_again_as_they_are_changes_nothing(files: Files, tmp_path: Path) -> None:
-    again = json.loads(json.dumps(files))
-    assert decided(rebound(again, tmp_path)).margin > 0
+def test_binding_the_files_again_as_they_are_changes_nothing(files: Files) -> None:
+    again = copy_of(files)
+    rebound(again)
+    assert again == files
+    assert decide(again[WHOLE], again).margin > 0
 
 
-def test_a_stage_goal_may_not_be_shrunk(files: Files, tmp_path: Path) -> None:
-    forged = json.loads(json.dumps(files))
-    goal = forged["stage3.proof.json"]["claim"]["goal"]
-    goal["P"] = (1.02 * np.array(goal["P"])).tolist()
-    with refusals.refused("not_definite"):
-        decided(rebound(forged, tmp_path))
-
-
-def test_another_file_in_a_stages_place_is_refused_by_its_digest(
-    files: Files, tmp_path: Path
-) -> None:
-    for name, document in files.items():
-        (tmp_path / name).write_bytes(documents.encode(document))
-    (tmp_path / "stage1.funnel.json").write_bytes(documents.encode(files["stage2.funnel.json"]))
-    with pytest.raises(
-        CertificateMismatch, match=r"stage1: stage1\.funnel\.json is not the funnel"
+def test_another_file_in_a_stages_place_is_refused_by_its_digest(files: Files) -> None:
+    for name, said in (
+        ("funnel", r"stage1: stage1\.funnel\.json is not the funnel"),
+        ("proof", r"stage1\.proof\.json is not the stage1"),
     ):
-        decided(tmp_path / "composition.proof.json")
-    (tmp_path / "stage1.proof.json").write_bytes(documents.encode(files["stage2.proof.json"]))
-    with pytest.raises(CertificateMismatch, match=r"stage1\.proof\.json is not the stage1"):
-        decided(tmp_path / "composition.proof.json")
+        forged = files | {f"stage1.{name}.json": files[f"stage2.{name}.json"]}
+        with pytest.raises(CertificateMismatch, match=said):
+            decide(forged[WHOLE], forged)

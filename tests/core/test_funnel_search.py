@@ -21,7 +21,7 @@ from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.polynomial.values import monomial_values
-from tests.funnel_problem import hanging
+from tests.funnel_problem import hanging, hung
 
 GOAL = 20 * np.eye(2)
 WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}
@@ -74,9 +74,8 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
 def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> None:
     with pytest.raises(Infeasible, match=r"no funnel at t = 1\.5 s"):
         sample_funnel(ContinuousTracking(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1))), samples=3)
-    problem = ContinuousTracking(*hanging(), goal=GOAL)
-    sampled, proved = sample_funnel(problem), design_funnel(problem)
-    assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
+    sampled = sample_funnel(ContinuousTracking(*hanging(), goal=GOAL))
+    assert 0.999 <= sampled.volumes[0] / volume_of(hung()) < 1.01
 
 
 def test_a_sample_at_one_end_only_is_refused() -> None:
@@ -92,11 +91,9 @@ def setting() -> Setting:
     return prepare(ContinuousTracking(*hanging(), goal=GOAL, **DEFAULTS))
 
 
-@pytest.mark.slow
 def test_v_steps_grow_the_funnel_and_it_is_proved() -> None:
-    rho = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    found = design_funnel(ContinuousTracking(*hanging(), goal=GOAL, shape="P"))
-    assert found.funnel.volume_integral() > 1.05 * rho.funnel.volume_integral()
+    found = hung("P")
+    assert volume_of(found) > 1.05 * volume_of(hung())
     assert np.min(found.found.proved.margins) > 0
     volumes = [volume for _, volume in found.found.history[1:]]
     assert (np.diff(volumes) > 0).all()
@@ -200,6 +197,5 @@ def stays_inside(design: FunnelDesign, pushed: float = 0.0) -> int:
 
 
 def test_a_design_knows_how_it_was_found() -> None:
-    design = design_funnel(ContinuousTracking(*hanging(), goal=GOAL))
-    assert set(design.found.seconds) == {"policy", "rho", "proof"}
-    assert design.found.history[0] == ("rho", design.funnel.volume_integral())
+    assert set(hung().found.seconds) == {"policy", "rho", "proof"}
+    assert hung().found.history[0] == ("rho", volume_of(hung()))

@@ -1,7 +1,6 @@
 """Funnels whose input is held between samples and whose state is measured wrong."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,8 @@ from nlsid_core.running.held import Held, slowest
 from nlsid_core.running.stage import Stage
 from tests.core.kernel import refusals
 from tests.falling_pendulum import tracking
-from tests.forged_held import HELD_FORGERIES, forged_held
-from tests.funnel_files import PROOF, Files, bind, saved
+from tests.forged_held import HELD_FORGERIES
+from tests.funnel_files import PROOF, Files, bind, files_of, forged_by
 from tests.marks import slow_among
 
 HOLD = 0.01  # s
@@ -39,9 +38,9 @@ def held() -> FunnelDesign:
 
 
 @pytest.fixture
-def files(held: FunnelDesign, tmp_path: Path) -> Files:
+def files(held: FunnelDesign) -> Files:
     """Its documents."""
-    return saved(held, tmp_path)
+    return files_of(held)
 
 
 def largest(found: FunnelDesign, *, hold: float) -> float:
@@ -115,7 +114,8 @@ LONG = {"an input that turns more slowly", "rates of one sign", "a rate piece le
 
 @pytest.mark.parametrize("what", slow_among(HELD_FORGERIES, LONG))
 def test_what_is_a_little_more_than_was_proved_is_refused(files: Files, what: str) -> None:
-    refusals.refused_with_fresh_digests(forged_held(files, what), HELD_FORGERIES[what][1])
+    forge, reason = HELD_FORGERIES[what]
+    refusals.refused_with_fresh_digests(forged_by(forge, files), reason)
 
 
 @pytest.mark.slow

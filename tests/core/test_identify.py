@@ -36,7 +36,6 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.identification import (
     METHODS,
-    Method,
     methods_of,
     prove_stability,
     validate,
@@ -73,15 +72,6 @@ def config(tmp_path: Path) -> Path:
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
-
-
-@pytest.mark.parametrize("method", [Rse(), Sem(), LeastSquares()])
-def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Method) -> None:
-    fit = identify(train, Polynomial(2), method=method)
-    assert isinstance(fit.model, DifferenceEquation)
-    assert fit.chosen.method is method
-    assert fit[method.name] is fit.chosen
-    assert fit.proof.rate < 1.0
 
 
 def test_a_fit_says_what_was_found(train: Dataset) -> None:

@@ -1,7 +1,8 @@
 """Implicit models in the convex sets of thesis Chapter 2: exact proofs, and their forgeries."""
 
 import json
-from collections.abc import Callable
+import math
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from examples import not_a_contraction
-from nlsid_core import files
-from nlsid_core.arrays import Json
 from nlsid_core.errors import (
     CertificateMismatch,
     CertificateRejected,
@@ -25,13 +24,13 @@ from nlsid_core.identification.proofs.conditions import Inequality, constraint
 from nlsid_core.identification.proofs.stable_sets import prove_implicit
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import variables
-from nlsid_core.proofs import check, proof_document
+from nlsid_core.proofs import check, decide
 from nlsid_core.sos import Program, SumOfSquares, forms_of, solve
-from tests.decided import decided
+from tests.edits import Edit, both, changed, put, scaled, without
+from tests.funnel_files import Files, bind, forged_by, write
 from tests.implicit_models import coupled, cubic_spring, lagged, linear, quintic
 
 DELTA = 0.1
-Change = Callable[[Json, Json], None]
 
 
 STABLE = np.array([[0.5, 0.4], [-0.4, 0.6]])
@@ -47,40 +46,28 @@ GENUINE: dict[str, tuple[ImplicitModel, str, tuple[tuple[float, float], ...]]] =
 }
 
 
-@pytest.fixture(scope="module")
-def made() -> dict[str, tuple[Json, Json]]:
-    """Every genuine model and proof, made once."""
-    found = {}
-    for name, (model, kind, ends) in GENUINE.items():
-        proof = prove_implicit(model, delta=DELTA, set=kind, ends=ends)
-        assert proof is not None
-        found[name] = model.document(), proof.document(model, "model.json")
-    return found
+MODEL, CLAIM = "model.json", "claim.proof.json"
 
 
-def copied(document: Json) -> Json:
-    return json.loads(json.dumps(document))  # type: ignore[no-any-return]
+@cache
+def _made(name: str) -> str:
+    model, kind, ends = GENUINE[name]
+    proof = prove_implicit(model, delta=DELTA, set=kind, ends=ends)
+    assert proof is not None
+    return json.dumps({MODEL: model.document(), CLAIM: proof.document(model, MODEL)})
 
 
-def write(folder: Path, model: Json, proof: Json, *, rebound: bool = True) -> Path:
-    """Write both; rebound: with matching digests, so that only the mathematics can refuse."""
-    files.write_document(folder / "model.json", model)
-    if rebound:
-        proof["claim"]["about"]["model"]["digest"] = files.digest(model)
-    path = folder / "model.proof.json"
-    files.write_document(path, proof_document(proof["claim"], proof["proof"]))
-    return path
+def made(name: str) -> Files:
+    """Fresh copies of a genuine model and its proof."""
+    return dict(json.loads(_made(name)))
 
 
 NAMES = list(GENUINE)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_genuine_proof_of_each_set_passes(
-    name: str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made[name])
-    verdict = check(write(tmp_path, model, proof))
+def test_a_genuine_proof_of_each_set_passes(name: str, tmp_path: Path) -> None:
+    verdict = check(write(made(name), tmp_path))
     assert f"(set {GENUINE[name][1]}: " in verdict.statement
     assert float(verdict.margin) == DELTA
     assert ("both solutions stay in this box" in str(verdict)) == bool(GENUINE[name][2])
@@ -99,140 +86,82 @@ def test_two_solutions_of_a_proved_model_meet(name: str) -> None:
     assert np.linalg.norm(gap[-1]) < 1e-6
 
 
-def _larger_right_side(model: Json, _: Json) -> None:
-    rows = model["h"]
+def _larger_right_side(files: Files) -> None:
+    rows = files[MODEL]["h"]
     for exponents, values in zip(rows["exponents"], rows["coefficients"], strict=True):
         if not any(exponents[: len(values)]) and any(exponents[len(values) :]):
             values[:] = [8.0 * value for value in values]
 
 
-def _not_so_monotone(model: Json, _: Json) -> None:
-    model["monotonicity"] *= 100.0
-
-
-def _greedy(_: Json, proof: Json) -> None:
-    proof["claim"]["delta"] = 1e3
-
-
-def _negative_delta(_: Json, proof: Json) -> None:
-    proof["claim"]["delta"] = -0.1
-
-
-def _too_large_squares(_: Json, proof: Json) -> None:
-    proof["proof"]["inequalities"]["stable"]["squares"]["unit"] -= 1
-
-
-def _other_set(_: Json, proof: Json) -> None:
-    others = {"2.11": "2.13", "2.13": "2.19", "2.19": "2.13"}
-    proof["claim"]["set"] = others[proof["claim"]["set"]]
-
-
-def _unknown_set(_: Json, proof: Json) -> None:
-    proof["claim"]["set"] = "2.16"
-
-
-def _missing_inequality(_: Json, proof: Json) -> None:
-    identities = proof["proof"]["inequalities"]
-    del identities["monotone"]
-
-
-def _stranger(_: Json, proof: Json) -> None:
-    proof["proof"]["note"] = "trust me"
-
-
-CHANGES: list[Change] = [
-    _larger_right_side,
-    _not_so_monotone,
-    _greedy,
-    _negative_delta,
-    _too_large_squares,
-    _other_set,
-    _unknown_set,
-    _missing_inequality,
-    _stranger,
-]
+OTHERS = {"2.11": "2.13", "2.13": "2.19", "2.19": "2.13"}
+STABLE_PART = f"{CLAIM} proof inequalities stable"
+CHANGES: dict[str, Edit] = {
+    "a larger right side": _larger_right_side,
+    "not so monotone": scaled(f"{MODEL} monotonicity", 100.0),
+    "greedy": put(f"{CLAIM} claim delta", 1e3),
+    "a negative delta": put(f"{CLAIM} claim delta", -0.1),
+    "squares too large": changed(f"{STABLE_PART} squares unit", lambda unit: unit - 1),
+    "another set": changed(f"{CLAIM} claim set", OTHERS.__getitem__),
+    "no such set": put(f"{CLAIM} claim set", "2.16"),
+    "an inequality less": without(f"{CLAIM} proof inequalities monotone"),
+    "a stranger": put(f"{CLAIM} proof note", "trust me"),
+}
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_forgery_of_any_set_is_rejected(
-    name: str, change: Change, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made[name])
-    change(model, proof)
-    with pytest.raises(CertificateRejected):
-        decided(write(tmp_path, model, proof))
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_forgery_of_any_set_is_rejected(name: str, what: str) -> None:
+    rejected(forged_by(CHANGES[what], made(name)))
+
+
+def rejected(files: Files) -> None:
+    """Though all digests fit: only the mathematics can refuse."""
+    bind(files)
+    with pytest.raises(CertificateRejected) as refused:
+        decide(files[CLAIM], files)
+    assert not isinstance(refused.value, CertificateMismatch)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_proof_of_another_model_is_a_mismatch(
-    name: str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made[name])
-    model["h"]["coefficients"][0][0] = float(np.nextafter(model["h"]["coefficients"][0][0], 9.0))
+def test_a_proof_of_another_model_is_a_mismatch(name: str) -> None:
+    other = changed(f"{MODEL} h coefficients 0 0", lambda c: math.nextafter(c, 9.0))
+    forged = forged_by(other, made(name))
     with pytest.raises(CertificateMismatch):
-        decided(write(tmp_path, model, proof, rebound=False))
+        decide(forged[CLAIM], forged)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
-@pytest.mark.parametrize("size", [100.0, "shrunk"])
-def test_a_local_proof_is_about_its_own_box(
-    name: str, size: float | str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    """Wider is false; empty or shrunk to nothing is no box; none at all is another claim."""
-    model, proof = map(copied, made[name])
-    if size == "shrunk":
-        proof["claim"]["box"] = [[0.5, 0.5] for _ in proof["claim"]["box"]]
-    else:
-        proof["claim"]["box"] = [[-100.0, 100.0] for _ in proof["claim"]["box"]]
-    with pytest.raises(CertificateRejected):
-        decided(write(tmp_path, model, proof))
-    del proof["claim"]["box"]
-    with pytest.raises(CertificateRejected):
-        decided(write(tmp_path, model, proof))
+LOCAL = [name for name in NAMES if GENUINE[name][2]]
+STABLE_MULTIPLIERS = f"{STABLE_PART} multipliers"
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if GENUINE[name][2]])
-def test_a_multiplier_of_the_wrong_size_or_place_is_rejected(
-    name: str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    for change in (_shrunk, _misplaced, _stranger_to_the_domain):
-        model, proof = map(copied, made[name])
-        change(proof["proof"]["inequalities"]["stable"]["multipliers"])
-        with pytest.raises(CertificateRejected):
-            decided(write(tmp_path, model, proof))
-
-
-def _shrunk(multipliers: list[Json]) -> None:
-    for multiplier in multipliers:
-        multiplier["squares"]["unit"] -= 5
-
-
-def _misplaced(multipliers: list[Json]) -> None:
-    multipliers.reverse()
-    multipliers.append(multipliers[0])
-
-
-def _stranger_to_the_domain(multipliers: list[Json]) -> None:
-    multipliers[-1]["of"] = 99
+@pytest.mark.parametrize("name", LOCAL)
+@pytest.mark.parametrize(
+    "change",
+    [
+        put(f"{CLAIM} claim box *", [-100.0, 100.0]),
+        put(f"{CLAIM} claim box *", [0.5, 0.5]),
+        without(f"{CLAIM} claim box"),
+        changed(f"{STABLE_MULTIPLIERS} * squares unit", lambda unit: unit - 5),
+        changed(STABLE_MULTIPLIERS, lambda given: [*reversed(given), given[-1]]),
+        put(f"{STABLE_MULTIPLIERS} -1 of", 99),
+    ],
+    ids=["wider", "empty", "another claim", "shrunk", "misplaced", "of no part of the box"],
+)
+def test_a_local_proof_is_about_its_own_box_by_its_own_multipliers(name: str, change: Edit) -> None:
+    rejected(forged_by(change, made(name)))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_storage_that_is_not_positive_is_rejected(
-    name: str, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made[name])
-    key = next((key for key in ("P", "M") if key in proof["proof"]), None)
-    if key is None:  # 2.19: the storage is the model's own E
-        model["h"]["coefficients"] = [[-v for v in row] for row in model["h"]["coefficients"]]
-        model["monotonicity"] = 1e-9
-    elif key == "P":
-        proof["proof"]["P"] = [[-entry for entry in row] for row in proof["proof"]["P"]]
-    else:
-        for entry in [entry for row in proof["proof"]["M"] for entry in row]:
-            entry["coefficients"] = [-c for c in entry["coefficients"]]
-    with pytest.raises(CertificateRejected):
-        decided(write(tmp_path, model, proof))
+def test_a_storage_that_is_not_positive_is_rejected(name: str) -> None:
+    forged = made(name)
+    key = next((key for key in ("P", "M") if key in forged[CLAIM]["proof"]), None)
+    {
+        "P": scaled(f"{CLAIM} proof P", -1.0),
+        "M": scaled(f"{CLAIM} proof M * * coefficients", -1.0),
+        # 2.19: the storage is the model's own E
+        None: both(scaled(f"{MODEL} h coefficients", -1.0), put(f"{MODEL} monotonicity", 1e-9)),
+    }[key](forged)
+    rejected(forged)
 
 
 @settings(deadline=None, max_examples=10)
@@ -267,23 +196,21 @@ def test_sets_that_do_not_exist_are_refused() -> None:
         prove_implicit(quintic(), delta=-1.0)
 
 
-def _huge_degree(_: Json, proof: Json) -> None:
-    proof["proof"]["M"][0][0]["exponents"][-1][-1] = 10**6
-
-
-def _huge_model(model: Json, _: Json) -> None:
-    model["h"]["exponents"] += [[15, 15, 15, 15 - k] for k in range(8)]
-    model["h"]["coefficients"] += [[1.0]] * 8
-
-
-@pytest.mark.parametrize("change", [_huge_degree, _huge_model])
-def test_a_document_that_would_take_forever_is_refused(
-    change: Change, tmp_path: Path, made: dict[str, tuple[Json, Json]]
-) -> None:
-    model, proof = map(copied, made["derivatives, 2.11"])
-    change(model, proof)
-    with pytest.raises(CertificateRejected):
-        decided(write(tmp_path, model, proof))
+@pytest.mark.parametrize(
+    "change",
+    [
+        put(f"{CLAIM} proof M 0 0 exponents -1 -1", 10**6),
+        both(
+            changed(
+                f"{MODEL} h exponents", lambda e: [*e, *([15, 15, 15, 15 - k] for k in range(8))]
+            ),
+            changed(f"{MODEL} h coefficients", lambda c: [*c, *[[1.0]] * 8]),
+        ),
+    ],
+    ids=["a degree", "a model"],
+)
+def test_a_document_that_would_take_forever_is_refused(change: Edit) -> None:
+    rejected(forged_by(change, made("derivatives, 2.11")))
 
 
 # -- The convex sets of stable models: what they contain, what they exclude, exact proofs
@@ -307,18 +234,9 @@ def test_example_2_3_1_gives_the_published_slope_and_an_exact_proof(tmp_path: Pa
     computed, published = not_a_contraction.example()
     assert computed == pytest.approx(published, abs=5e-4)
     model, proof = not_a_contraction.model, not_a_contraction.proof()
-    path = tmp_path / "example.proof.json"
-    files.write_document(tmp_path / "model.json", model.document())
-    files.write_document(path, proof.document(model, "model.json"))
-    assert "for every state and input" in check(path).statement
-    steeper = model.document()
-    steeper["h"]["coefficients"][-1] = [-0.6]
-    files.write_document(tmp_path / "model.json", steeper)
-    document = proof.document(model, "model.json")
-    document["claim"]["about"]["model"]["digest"] = files.digest(steeper)
-    files.write_document(path, proof_document(document["claim"], document["proof"]))
-    with pytest.raises(CertificateRejected):
-        check(path)
+    example = {MODEL: model.document(), CLAIM: proof.document(model, MODEL)}
+    assert "for every state and input" in check(write(example, tmp_path)).statement
+    rejected(forged_by(put(f"{MODEL} h coefficients -1", [-0.6]), example))
 
 
 def test_a_cubic_map_needs_a_domain_and_gets_one() -> None:

@@ -222,7 +222,7 @@ def test_a_stamp_years_ahead_is_answered_at_once_and_starts_a_new_run() -> None:
 
 
 def test_a_caller_may_fill_the_same_arrays_again() -> None:
-    for name in ("linear", "implicit_linear"):
+    for name in ("linear", "implicit_ray"):
         trial, monitor = trial_of(name, 100), monitor_of(name)
         y_same, u_same = np.empty_like(trial.y[0]), np.empty_like(trial.u[0])
         said = []

@@ -334,14 +334,6 @@ def test_a_shape_that_cannot_be_found_keeps_what_is_proved(
     assert found.verdict.margin > 0
 
 
-def test_bounds_of_a_w_that_a_polynomial_does_not_have_are_refused() -> None:
-    def falls(x: Any, u: Any) -> Any:
-        return [x[1], x[0] - x[0] ** 3 / 6 + u[0]]
-
-    with pytest.raises(DataError, match="no argument w"):
-        design_funnel(ContinuousTracking(falls, upright(), goal=[0.2, 0.5], uncertain=[[-1, 1]]))
-
-
 @pytest.mark.parametrize(
     ("rate", "options", "said"),
     [

@@ -12,9 +12,7 @@ from nlsid_core.identification.methods.banded import Rows
 from nlsid_core.identification.methods.newton import (
     Descent,
     Repulsion,
-    SchurBarrier,
     minimise,
-    smallest_eigenvalues,
 )
 from nlsid_core.identification.methods.rse import Bound
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
@@ -65,24 +63,6 @@ def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
     gradient, hessian = bound.derivatives(point)
     np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=EXACT * abs(expected).max())
     np.testing.assert_allclose(hessian, reduced, rtol=1e-7, atol=1e-9 * abs(reduced).max())
-
-    U = np.linalg.qr(np.random.default_rng(2).standard_normal((len(rows), 3)))[0]
-    barrier = SchurBarrier(bound, U)
-    middle = U.T @ inverse @ U
-    assert barrier.value(point) == pytest.approx(np.linalg.slogdet(middle)[1], rel=1e-9)
-    moved = [-U.T @ inverse @ S @ inverse @ U for S in slopes]
-    weights = np.linalg.inv(middle)
-    slope, curvature = barrier.derivatives(point)
-    np.testing.assert_allclose(slope, [np.trace(weights @ d) for d in moved], rtol=1e-7, atol=1e-9)
-    second = [
-        [
-            2.0 * np.trace(weights @ U.T @ inverse @ S @ inverse @ T @ inverse @ U)
-            - np.trace(weights @ d @ weights @ c)
-            for T, c in zip(slopes, moved, strict=True)
-        ]
-        for S, d in zip(slopes, moved, strict=True)
-    ]
-    np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-8 * np.abs(second).max())
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
@@ -220,12 +200,10 @@ def test_minimisers_where_eigenvalues_vanish_equal_the_cone_solver_s(N: int) -> 
     rows = burst_rows(N)
     optimum = matrix_inequality(rows)
     found = minimise(Bound(rows, None), rows.identity)
-    assert found.on_boundary
-    smallest, _ = smallest_eigenvalues(found.point.factor, len(rows), 4)
-    assert smallest[0] < 1e-4 * float(np.median(found.point.factor.pivots))
+    assert found.converged
+    smallest = np.linalg.eigvalsh(dense_K(rows, found.point.theta, None))[0]
+    assert smallest < 1e-4 * float(np.median(found.point.factor.pivots))
     assert pytest.approx(optimum, rel=SOLVER) == found.point.J
-    dense_smallest = np.linalg.eigvalsh(dense_K(rows, found.point.theta, None))[0]
-    assert smallest[0] == pytest.approx(dense_smallest, rel=1e-2)
 
 
 def slow_outputs() -> Rows:
@@ -251,7 +229,6 @@ def test_where_newton_stalls_on_its_way_the_minimiser_inside_is_found() -> None:
     assert 2.0 * optimum < stalled.point.J
     found = minimise(bound, rows.identity)
     assert found.is_inside
-    assert not found.on_boundary
     assert found.steps < 40
     assert pytest.approx(optimum, rel=SOLVER) == found.point.J
 

@@ -1,6 +1,5 @@
 """Funnels of policies whose inputs saturate: proved mode by mode, simulated, and forged."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
+from nlsid_core import proofs
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -25,11 +25,10 @@ from nlsid_core.dynamics import Nominal, VectorField, constant_on
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.proofs import check
 from tests import funnel_problem
 from tests.core.kernel import refusals
-from tests.decided import decided
-from tests.funnel_files import Files, forged_by, saved, write
+from tests.edits import Edit, changed, put, scaled
+from tests.funnel_files import POLICY, PROOF, Files, bind, files_of, forged_by
 from tests.verbs import nlsid
 
 LIMIT = 9.0
@@ -54,9 +53,9 @@ def design() -> FunnelDesign:
 
 
 @pytest.fixture(scope="module")
-def files(design: FunnelDesign, tmp_path_factory: pytest.TempPathFactory) -> Files:
+def files(design: FunnelDesign) -> Files:
     """Its four documents."""
-    return saved(design, tmp_path_factory.mktemp("saturated"))
+    return files_of(design)
 
 
 def demand(found: FunnelDesign, t: float) -> float:
@@ -71,7 +70,7 @@ def test_a_funnel_in_which_the_input_saturates_is_proved_and_says_so(
 ) -> None:
     assert demand(design, 0.0) > 1.2 * LIMIT
     proof = design.save(tmp_path)[-1]
-    exact = check(proof)
+    exact = proofs.check(proof)
     assert "u0 clipped to [-9, 9]" in exact.assumptions[0]
     assert "without" not in exact.assumptions[0]
     assert exact.margin > 0
@@ -152,72 +151,45 @@ def unit(rng: np.random.Generator, count: int) -> FloatArray:
 # -- forgeries -------------------------------------------------------------------------------
 
 
-def pieces_of(files: Files) -> list[Any]:
-    """The proof's pieces."""
-    return list(files["funnel.proof.json"]["proof"]["pieces"])
+def piece_of(mode: int, edit: Edit) -> Edit:
+    """Changes the first piece of a mode."""
+
+    def forge(files: Files) -> None:
+        pieces = files[PROOF]["proof"]["pieces"]
+        edit(next(piece for piece in pieces if piece["mode"] == [mode]))
+
+    return forge
 
 
-def limits_widened(files: Files) -> None:
-    """By 1 %, after the fact."""
-    files["policy.json"]["limits"] = [[0, -1.01 * LIMIT, 1.01 * LIMIT]]
+PIECES = f"{PROOF} proof pieces"
+FORGERIES: dict[str, tuple[Edit, str]] = {
+    "limits wider": (scaled(f"{POLICY} limits", 1.01), "not_positive"),
+    "no limits": (put(f"{POLICY} limits", []), "malformed"),
+    "nothing for the high limit": (
+        changed(PIECES, lambda pieces: [each for each in pieces if each["mode"] != [1]]),
+        "not_covered",
+    ),
+    "a free piece called high": (piece_of(0, put("mode", [1])), "not_covered"),
+    "no such mode": (put(f"{PIECES} 0 mode", [2]), "not_covered"),
+    "weights, for which format 2 had a place": (
+        piece_of(1, put("tau 0 squares weights", [-1, -1])),
+        "left",
+    ),
+    "a multiplier four times as large": (
+        piece_of(-1, changed("tau 0 squares unit", lambda unit: unit - 1)),
+        "not_positive",
+    ),
+}
 
 
-def limits_dropped(files: Files) -> None:
-    """As if the motor could do anything."""
-    files["policy.json"]["limits"] = []
+@pytest.mark.parametrize(("forge", "reason"), FORGERIES.values(), ids=FORGERIES)
+def test_a_forged_saturated_funnel_is_refused(files: Files, forge: Edit, reason: str) -> None:
+    refusals.refused_with_fresh_digests(forged_by(forge, files), reason)
 
 
-def mode_missing(files: Files) -> None:
-    """Nothing is shown for the high limit."""
-    kept = [piece for piece in pieces_of(files) if piece["mode"] != [1]]
-    files["funnel.proof.json"]["proof"]["pieces"] = kept
-
-
-def mode_renamed(files: Files) -> None:
-    """The free mode's piece, called high."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [0])
-    piece["mode"] = [1]
-
-
-def mode_unknown(files: Files) -> None:
-    """There is no mode 2."""
-    pieces_of(files)[0]["mode"] = [2]
-
-
-def multiplier_flipped(files: Files) -> None:
-    """τ ≤ 0 would allow V to grow in its mode; format 2 had a place for it."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [1])
-    squares = piece["tau"][0]["squares"]
-    squares["weights"] = [-1] * max(map(len, squares["factors"]))
-
-
-def multiplier_changed(files: Files) -> None:
-    """Four times as large: another polynomial than its factors stand for."""
-    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [-1])
-    piece["tau"][0]["squares"]["unit"] -= 1
-
-
-FORGERIES: list[tuple[Callable[[Files], None], str]] = [
-    (limits_widened, "not_positive"),
-    (limits_dropped, "malformed"),
-    (mode_missing, "not_covered"),
-    (mode_renamed, "not_covered"),
-    (mode_unknown, "not_covered"),
-    (multiplier_flipped, "left"),
-    (multiplier_changed, "not_positive"),
-]
-
-
-@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
-def test_a_forged_saturated_funnel_is_refused(
-    files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
-) -> None:
-    with refusals.refused(reason):
-        decided(write(forged_by(forge, files), tmp_path, rebind=True))
-
-
-def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> None:
-    assert decided(write(files, tmp_path, rebind=True)).margin > 0
+def test_the_same_files_bound_again_are_proved(files: Files) -> None:
+    bind(files)
+    assert proofs.decide(files[PROOF], files).margin > 0
 
 
 # -- more inputs, bad input --------------------------------------------------------------------
@@ -251,7 +223,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     edge = found.funnel.outline(0.0, (0, 1))
     asked = -(edge - found.policy.x(0.0)) @ found.policy.K(0.0).T
     assert (np.abs(asked).max(axis=0) > [0.9, 0.8]).all()
-    assert check(found.save(tmp_path)[-1]).margin > 0
+    assert proofs.check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(7)
     assert (
         Simulation(field, found.policy, found.funnel).boundary(starts=3000, rng=rng).violations == 0
@@ -271,7 +243,7 @@ def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
     found = design_funnel(ContinuousTracking(field, **options, policy=policy))
     assert found.found.proved.pieces.kappa is not None
     assert demand(found, 0.0) > 0.6
-    assert check(found.save(tmp_path)[-1]).margin > 0
+    assert proofs.check(found.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(10)
     run = Simulation(field, found.policy, found.funnel).boundary(
         starts=2000, rng=rng, adversary=True

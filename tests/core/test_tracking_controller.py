@@ -14,16 +14,15 @@ from bags.monitoring.replay import announced_runs, replay_messages
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.message_reader import SignalVector
-from nlsid import Dataset, Monitor, Status, Trajectory
+from nlsid import Dataset, Status, Trajectory
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.sampled.design import assume
 from nlsid_core.designs import AnyDesign
-from nlsid_core.errors import BagError, CertificateMismatch, DataError, ShapeError
+from nlsid_core.errors import BagError, DataError
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.reading import Level, Reading
-from nlsid_core.running.stage import Stage
 from tests.tracked import PERIOD, STEPS, designed, run, tracked
 
 STRING = "std_msgs/msg/String"
@@ -71,37 +70,6 @@ def test_every_input_is_the_policys_and_the_run_stays_inside() -> None:
     monitor = made.monitor()
     said = [monitor.update(k * PERIOD, y[k], u[k]) for k in range(STEPS + 1)]
     assert {reading.status for reading in said} == {Status.INSIDE}
-
-
-def test_a_robot_away_from_the_start_is_waited_for_and_then_given_up() -> None:
-    controller = design().controller(LIMITS, 0.1)
-    for k in range(10):
-        controller.update(k * PERIOD, np.array([1.1, 0.0]))
-    assert "not at the start of the plan after 0.1 s" in controller.ended
-
-
-@pytest.mark.parametrize(
-    ("t", "y", "said"),
-    [(2 * PERIOD, [np.nan, 0.0], "state is"), (3.5 * PERIOD, [0.0, 0.0], "from when the next one")],
-)
-def test_a_sample_that_cannot_be_used_ends_the_run(t: float, y: list[float], said: str) -> None:
-    controller = design().controller(LIMITS, 1.0)
-    for k in range(2):
-        controller.update(k * PERIOD, np.zeros(2))
-    u = controller.u
-    np.testing.assert_array_equal(controller.update(t, np.array(y)), u)
-    assert said in controller.ended
-
-
-def test_limits_that_cut_off_the_plan_are_refused_before_anything_moves() -> None:
-    with pytest.raises(DataError, match=r"plan's input .* is beyond the limits"):
-        design().controller(Limits(lowest=-0.1, highest=0.1, stop_rate=1.0), 1.0)
-
-
-def test_limits_of_another_number_of_inputs_are_refused_before_anything_moves() -> None:
-    two = Limits(lowest=np.array([-9.0, -9.0]), highest=9.0, stop_rate=1.0)
-    with pytest.raises(DataError, match="limits for 2 inputs; the design has 1"):
-        design().controller(two, 1.0)
 
 
 def test_an_input_that_the_limits_would_cut_is_not_sent_and_ends_the_run() -> None:
@@ -225,64 +193,6 @@ def test_a_start_outside_the_inlet_is_flagged_at_once() -> None:
         design.funnel.S[0], [1.5 * design.funnel.radius[0], 0.0]
     )
     assert readings(run(start=far))[0].status is Status.OUTSIDE
-
-
-def test_another_input_than_the_policys_breaks_the_assumption() -> None:
-    recorded = run()
-    u = recorded.u.copy()
-    u[5] += 0.01
-    flagged = readings(replace(recorded, u=u))[5]
-    assert flagged.status is Status.ASSUMPTION_VIOLATED
-    assert "not the policy's" in flagged.reason
-
-
-@pytest.mark.parametrize(
-    ("t", "y", "u", "reason"),
-    [
-        (PERIOD, [math.nan, 0.0], [0.0], "state"),
-        (PERIOD, [0.0, 0.0], [math.nan], "input"),
-        (PERIOD, [0.0, 0.0], None, "input"),
-        (3 * PERIOD, [0.0, 0.0], [0.0], "missing"),
-        (-PERIOD, [0.0, 0.0], [0.0], "back"),
-    ],
-)
-def test_a_bad_sample_reads_unknown_from_then_on(
-    t: float, y: list[float], u: list[float] | None, reason: str
-) -> None:
-    design = designed()
-    monitor = design.monitor()
-    recorded = run()
-    monitor.update(0.0, recorded.y[0], recorded.u[0])
-    reading = monitor.update(t, y, u)
-    assert reading.status is Status.UNKNOWN
-    assert reason in reading.reason
-    assert math.isnan(reading.margin)
-    assert monitor.update(2 * PERIOD, recorded.y[1], recorded.u[1]).status is Status.UNKNOWN
-    monitor.restart()
-    assert monitor.update(9.0, recorded.y[0], recorded.u[0]).status is Status.INSIDE
-
-
-def test_after_the_horizon_nothing_is_claimed() -> None:
-    design, recorded = designed(), run()
-    monitor = design.monitor()
-    for t, y, u in zip(recorded.t, recorded.y, recorded.u, strict=True):
-        monitor.update(float(t), y, u)
-    reading = monitor.update(float(recorded.t[-1]) + PERIOD, recorded.y[-1], recorded.u[-1])
-    assert reading.status is Status.UNKNOWN
-    assert "over" in reading.reason
-
-
-def test_a_funnel_of_another_policy_is_refused() -> None:
-    design = designed()
-    with pytest.raises(CertificateMismatch):
-        Monitor([Stage(design.model, designed(goal=0.3).policy, design.funnel)])
-
-
-def test_a_state_of_another_size_is_an_error() -> None:
-    design = designed()
-    monitor = design.monitor()
-    with pytest.raises(ShapeError):
-        monitor.update(0.0, [0.0, 0.0, 0.0], [0.0])
 
 
 def test_the_assumption_is_the_largest_commissioning_run_times_the_safety_factor() -> None:

@@ -10,9 +10,9 @@ import pytest
 from benchmarks.thesis.soundness import Simulation
 from nlsid import ContinuousTracking, VectorField, check, integrate_nominal
 from nlsid_core.design import FunnelDesign, design_funnel
-from nlsid_core.errors import CertificateRejected
-from tests.decided import decided
-from tests.funnel_files import saved, write
+from tests.core.kernel import refusals
+from tests.edits import put
+from tests.funnel_files import FIELD, PROOF, files_of, forged_by
 
 
 def disturbed(x: Any, u: Any, w: Any) -> Any:
@@ -79,24 +79,19 @@ def test_the_worst_w_at_every_instant_breaks_nothing_and_a_larger_one_does(
     assert run.violations > 0
 
 
-def test_wider_bounds_after_the_fact_are_refused(design: FunnelDesign, tmp_path: Path) -> None:
+def test_wider_bounds_after_the_fact_are_refused(design: FunnelDesign) -> None:
     """By 1 %: the claim is then more than the proof shows."""
-    files = saved(design, tmp_path)
-    field = files["vector_field.json"]
-    low, high = field["uncertain"][0]
-    middle, half = (low + high) / 2, 1.01 * (high - low) / 2
-    field["uncertain"][0] = [middle - half, middle + half]
-    with pytest.raises(CertificateRejected, match="not positive"):
-        decided(write(files, tmp_path))
+    low, high = design.model.uncertain[0].tolist()
+    more = 0.005 * (high - low)
+    wider = put(f"{FIELD} uncertain 0", [low - more, high + more])
+    refusals.refused_with_fresh_digests(forged_by(wider, files_of(design)), "not_positive")
 
 
-def test_a_corner_left_out_is_refused(kind: str, design: FunnelDesign, tmp_path: Path) -> None:
-    files = saved(design, tmp_path)
-    proof = files["funnel.proof.json"]["proof"]
-    last = max(piece["vertex"] for piece in proof["pieces"])
-    proof["pieces"] = [piece for piece in proof["pieces"] if piece["vertex"] < last] or (
-        proof["pieces"][:-1]
-    )
+def test_a_corner_left_out_is_refused(kind: str, design: FunnelDesign) -> None:
+    files = files_of(design)
+    pieces = files[PROOF]["proof"]["pieces"]
+    last = max(piece["vertex"] for piece in pieces)
     assert (last == 0) is (kind == "pushes")
-    with pytest.raises(CertificateRejected, match="missing"):
-        decided(write(files, tmp_path, rebind=True))
+    kept = [piece for piece in pieces if piece["vertex"] < last] or pieces[:-1]
+    fewer = put(f"{PROOF} proof pieces", kept)
+    refusals.refused_with_fresh_digests(forged_by(fewer, files), "not_covered")

@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_913,
-    ("bags",): 11_559,
+    ("nlsid_core",): 17_865,
+    ("bags",): 11_495,
     ("nlsid_ros",): 2_550,
-    ("tests",): 22_195,
+    ("tests",): 21_488,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -1,16 +1,9 @@
 """Newton's method on the robust simulation error, with a barrier where the minimiser needs one.
 
 Damped Newton can come too near the boundary of K ≻ 0 on its way, where J stays finite, and stall at
-a wrong value. J + μ u'K⁻¹u, u a random vector, is as convex and as cheap as J, and infinite on
-nearly all of the boundary: its minimisers for μ → 0 lead to a minimiser of J inside.
-
-A minimiser can also lie on the boundary. Only a few eigenvalues of K vanish there. With U their
-vectors where Newton stalled,
-    J + μ log det(U'K⁻¹U)
-is minimised for μ → 0: (U'K⁻¹U)⁻¹ is a Schur complement of K, concave in K, so the barrier is
-convex, keeps K ≻ 0 and has parameter rank U; the last iterate is within μ·rank U of the minimum.
-Its derivatives are exact and cost a few solves, log det K would need every entry of K⁻¹. If other
-eigenvalues vanish on the way, they join U. Matrix inequalities on θ join as further barriers.
+a wrong value. J + μ tr(U'K⁻¹U), U a few random vectors, is as convex as J and nearly as cheap, and
+infinite on the boundary. So its minimisers for μ → 0 lead to a minimiser of J inside or, where J is
+least on the boundary, there. Matrix inequalities on θ join as further barriers.
 """
 
 from collections.abc import Sequence
@@ -33,16 +26,14 @@ MAX_CENTRING = 20  # with a barrier; more, and some eigenvalue vanishes that it 
 ARMIJO = 1e-4  # the usual sufficient-decrease fraction
 SHORTEST_STEP = 2.0**-30
 BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken to the barrier
-SMALL = 0.1  # eigenvalue of K relative to its size that may vanish at the minimum
-FEWEST, WIDEST, MAX_BASES = 2, 4, 8  # vectors that join U at once, and how often they do
-INVERSE_ITERATIONS = 4  # of a subspace: what matters is orders of magnitude apart
 SHORT_STEP, SHORT_STEPS = 2.0**-2, 2  # so many steps so short, and Newton alone has stalled
 GAP = 1e-7  # μ·(barrier parameter) relative to J at which the barrier path of K ends
 INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
 FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near by itself
+VECTORS = 3  # one stops short of 2 of 7 hard minima (by 21 % of J), two and three of none
 MU_FALL = 0.01
 CENTRED = 0.1  # decrement relative to μ at which a point of the path is close enough
-MU_FALL_K, CENTRED_K = 0.01, 1.0  # the same two on the path of K, whose barrier is of low rank
+CENTRED_K = 1.0  # the same on the path of K, whose barrier is of low rank
 
 
 class Root(Protocol):
@@ -145,7 +136,6 @@ class Minimum:
     extra: FloatArray
     steps: int
     converged: bool
-    on_boundary: bool = False
 
     @property
     def is_inside(self) -> bool:
@@ -165,8 +155,8 @@ def minimise(
 ) -> Minimum:
     """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
 
-    extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
-    of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
+    extra: start of further unknowns that only occur in the inequalities. Where the path around the
+    boundary does not converge, the lowest point is returned: a bound may be made exact there too.
     steps: only so many of Newton's method, without a barrier of K and with that of the inequalities
     at the one μ whose minimiser is within `gap`·J of the minimum.
     """
@@ -175,108 +165,33 @@ def minimise(
     if steps is not None:
         return descent.to_minimum(z, mu=descent.weight(z, gap), limit=steps)
     found = descent.freely(z)
-    return found if found.is_inside else _on_boundary(bound, descent, z, found)
-
-
-def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
-    """Minimise where eigenvalues of K vanish; `start` is well inside, Newton ended at `found`."""
-    led = _past_boundary(bound, descent, 0.5 * (start + _unknowns(found)))
-    if led is not None:
-        return led
-    U, best, lowest = np.zeros((len(found.point.x), 0)), found if found.converged else None, found
-    for _ in range(MAX_BASES):
-        U = np.linalg.qr(np.column_stack([U, _vanishing(found.point)]))[0]
-        # K is affine: half way back to the start no eigenvalue is small.
-        found = descent.path(0.5 * (start + _unknowns(found)), barrier=SchurBarrier(bound, U))
-        if found.converged:
-            if best is not None and best.point.J <= found.point.J:
-                found = best
-            return replace(found, steps=descent.steps, on_boundary=True)
-        lowest = min(lowest, found, key=lambda minimum: minimum.point.J)
-    return replace(lowest if best is None else best, steps=descent.steps)
-
-
-def _past_boundary(bound: Convex, descent: "Descent", z: FloatArray) -> Minimum | None:
-    """The minimiser that the path of `Repulsion` from z leads to; None if it does not converge.
-
-    On the boundary that is the end of the path, unless Newton goes lower from there.
-    """
-    here = descent.objective.at(z[: descent.parameters])
-    away = descent.path(z, barrier=Repulsion(bound, here))
-    if not away.converged:
-        return None
-    found = descent.freely(_unknowns(away))
-    if found.is_inside:
-        return replace(found, steps=descent.steps)
-    return replace(found, converged=True, steps=descent.steps, on_boundary=True)
-
-
-def _vanishing(point: Point) -> FloatArray:
-    """(N, r): the vectors of the eigenvalues of K that may vanish."""
-    values, vectors = smallest_eigenvalues(point.factor, len(point.x), WIDEST)
-    small = int((values < SMALL * np.median(point.factor.pivots)).sum())
-    return vectors[:, : max(FEWEST, small)]
-
-
-def smallest_eigenvalues(factor: Root, N: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """(values, (N, count) orthonormal vectors): about the smallest of K = LL', ascending.
-
-    Inverse iteration on a subspace; values are Rayleigh quotients of K⁻¹.
-    """
-    U: FloatArray = np.random.default_rng(0).standard_normal((N, min(N, count)))
-    for _ in range(INVERSE_ITERATIONS):
-        U = np.linalg.qr(factor.half_solve_transposed(factor.half_solve(U)))[0]
-    half = factor.half_solve(U)
-    inverses, rotation = np.linalg.eigh(half.T @ half)
-    return 1.0 / inverses[::-1], U @ rotation[:, ::-1]
+    if not found.is_inside:
+        z = 0.5 * (z + _unknowns(found))  # K is affine: half way back no eigenvalue is small
+        here = bound.at(z[: len(start)])
+        away = descent.path(z, barrier=Repulsion(bound, here))
+        if away.converged:  # J is least on the boundary there, unless Newton goes lower
+            found = replace(descent.freely(_unknowns(away)), converged=True)
+    return replace(found, steps=descent.steps)
 
 
 class Repulsion:
-    """u'K⁻¹u with a random vector u, 1 at the point it is made at."""
+    """tr(U'K⁻¹U) with random vectors U, 1 at the point it is made at."""
 
     def __init__(self, bound: Convex, at: Point) -> None:
-        u = np.random.default_rng(0).standard_normal((len(at.x), 1))
-        self.bound, self.U = bound, u / np.linalg.norm(at.factor.half_solve(u))
+        U = np.random.default_rng(0).standard_normal((len(at.x), VECTORS))
+        self.bound, self.U = bound, U / np.linalg.norm(at.factor.half_solve(U))
 
     def value(self, point: Point) -> float:
         """At a point of J."""
         return float(np.square(point.factor.half_solve(self.U)).sum())
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
-        """Gradient -x'K_i x and Hessian 2 (L⁻¹K_i x)'(L⁻¹K_j x), x = K⁻¹u."""
-        x = point.factor.half_solve_transposed(point.factor.half_solve(self.U))[:, 0]
-        slopes = self.bound.slopes(x)
-        half = point.factor.half_solve(slopes)
-        return -slopes.T @ x, 2.0 * half.T @ half
-
-
-class SchurBarrier:
-    """log det(U'K⁻¹U): keeps a Schur complement of K positive definite. parameter: its rank."""
-
-    def __init__(self, bound: Convex, U: FloatArray) -> None:
-        self.bound, self.U = bound, U
-
-    def value(self, point: Point) -> float:
-        """At a point of J."""
-        R = np.linalg.qr(point.factor.half_solve(self.U), mode="r")
-        return float(2.0 * np.log(abs(np.diag(R))).sum())
-
-    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian.
-
-        With M_i = L⁻¹K_iL⁻ᵀ and orthonormal columns Y of L⁻¹U: gradient_i = -tr(Y'M_iY),
-        Hessian_ij = tr(Y'M_iY Y'M_jY) + 2 tr(Y'M_i(I - YY')M_jY).
-        """
-        Y = np.linalg.qr(point.factor.half_solve(self.U))[0]
-        X = point.factor.half_solve_transposed(Y)
-        parts = [point.factor.half_solve(self.bound.slopes(x)) for x in X.T]
-        inner = np.array([Y.T @ part for part in parts])  # (r, r, n): [a, b, i] = y_b'M_iy_a
-        flat = inner.reshape(-1, inner.shape[-1])
-        hessian = flat.T @ flat
-        for a, part in enumerate(parts):
-            outer = part - Y @ inner[a]
-            hessian += 2.0 * outer.T @ outer
-        return -np.einsum("aai->i", inner), hessian
+        """Gradient -Σ x'K_i x and Hessian 2 Σ (L⁻¹K_i x)'(L⁻¹K_j x) over x of K⁻¹U."""
+        X = point.factor.half_solve_transposed(point.factor.half_solve(self.U))
+        slopes = [self.bound.slopes(x) for x in X.T]
+        halves = [point.factor.half_solve(each) for each in slopes]
+        gradient = -sum(each.T @ x for each, x in zip(slopes, X.T, strict=True))
+        return np.asarray(gradient), np.asarray(2.0 * sum(half.T @ half for half in halves))
 
 
 def _unknowns(found: Minimum) -> FloatArray:
@@ -317,26 +232,27 @@ class Descent:
         """Without a barrier of K."""
         return self.path(z) if self.inequalities else self.to_minimum(z)
 
-    def path(self, z: FloatArray, *, barrier: Repulsion | SchurBarrier | None = None) -> Minimum:
-        """Follow the minimisers for μ → 0."""
+    def path(self, z: FloatArray, *, barrier: Repulsion | None = None) -> Minimum:
+        """Follow the minimisers for μ → 0; the last that was reached, if one is not."""
         size = sum(inequality.order for inequality in self.inequalities)
         size += 0 if barrier is None else barrier.U.shape[1]
-        gap = INEQUALITY_GAP if barrier is None else GAP
+        gap, last = INEQUALITY_GAP if barrier is None else GAP, None
         mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
         while True:
             found = self.to_minimum(z, mu=mu, barrier=barrier)
-            z = _unknowns(found)
-            small = mu * size <= gap * found.point.J or self.perfect >= found.point.J
-            if small or not found.converged:
+            if not found.converged:
+                return found if last is None else replace(last, converged=False)
+            if mu * size <= gap * found.point.J or self.perfect >= found.point.J:
                 return found
-            mu *= MU_FALL if barrier is None else MU_FALL_K
+            z, last = _unknowns(found), found
+            mu *= MU_FALL
 
     def to_minimum(
         self,
         z: FloatArray,
         *,
         mu: float = 0.0,
-        barrier: Repulsion | SchurBarrier | None = None,
+        barrier: Repulsion | None = None,
         limit: int = MAX_NEWTON,
     ) -> Minimum:
         """Newton's method for one μ, of `limit` steps at most."""
@@ -374,7 +290,7 @@ class Descent:
         return Minimum(point, z[self.parameters :], self.steps, converged=False)
 
     def _value(
-        self, z: FloatArray, mu: float, barrier: Repulsion | SchurBarrier | None
+        self, z: FloatArray, mu: float, barrier: Repulsion | None
     ) -> tuple[float, Point | None]:
         total = sum(inequality.barrier(z) for inequality in self.inequalities)
         if not np.isfinite(total):
@@ -388,7 +304,7 @@ class Descent:
         return point.J + mu * total, point
 
     def _derivatives(
-        self, z: FloatArray, point: Point, mu: float, barrier: Repulsion | SchurBarrier | None
+        self, z: FloatArray, point: Point, mu: float, barrier: Repulsion | None
     ) -> tuple[FloatArray, FloatArray]:
         gradient, hessian = np.zeros(len(z)), np.zeros((len(z), len(z)))
         inner = slice(0, self.parameters)

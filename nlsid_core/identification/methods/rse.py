@@ -26,14 +26,11 @@ WORK = 5e10  # rows times squared left parameters, of all Newton steps together:
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """One minimiser: left parameters θ, right parameters p, J, the bound at them (scaled), and
-    whether it lies on the boundary of K ≻ 0.
-    """
+    """One minimiser: left parameters θ, right parameters p, and J, the bound at them (scaled)."""
 
     theta: FloatArray
     p: FloatArray
     J: float
-    on_boundary: bool
 
 
 def robust_simulation_error(
@@ -56,9 +53,8 @@ def robust_simulation_error(
     previous = float("inf")
     for _ in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at
-        found = minimise(Bound(rows, linearised_at), start, steps=steps)
-        point = found.point
-        yield Iterate(point.theta, point.p, point.J, found.on_boundary)
+        point = minimise(Bound(rows, linearised_at), start, steps=steps).point
+        yield Iterate(point.theta, point.p, point.J)
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:
             return
         linearised_at, previous = point.theta, point.J

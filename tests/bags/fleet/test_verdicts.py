@@ -241,16 +241,10 @@ def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
     split = config.split.model_copy(update={"test": ["r0/*"], "calibration": []})
     config = config.model_copy(update={"split": split})
     rows = read_rows(CheckBag(config), bags, workers=Workers()).rows
-    listed = {
-        verdict: {row.bag for row in rows if row.verdict == verdict}
-        for verdict in ("not read", "bad", "copy")
-    }
-    read = read_fleet(bags, config, tmp_path, workers=Workers())
-    assert listed == {
-        "not read": set(read.unread),
-        "bad": set(read.unusable),
-        "copy": set(read.copies),
-    }
+    listed = {row.bag: row.reason for row in rows if row.verdict in ("not read", "bad", "copy")}
+    left_out = read_fleet(bags, config, tmp_path, workers=Workers()).left_out
+    assert listed.keys() == left_out.keys()
+    assert all(listed[name].endswith(reason) for name, reason in left_out.items())
 
 
 def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
@@ -328,11 +322,9 @@ def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -
         ["drive"], tmp_path / "bags", tmp_path, "all of the bags are test trials"
     )
     lines = said.splitlines()
-    assert lines[0].startswith(
-        "2 bags: 1 used, 1 not read, 0 not usable, 0 copies; 0 of them known"
-    )
+    assert lines[0].startswith("2 bags: 1 used; 0 of them known")
     assert lines[1:3] == [
-        "left out, not read: 1 bag",
+        "left out: 1 bag",
         "  cut: is damaged or not a bag: it is no MCAP, SQLite or ROS 1 file: "
         "it starts with 6e 6f 20 62 61 67. `nlsid bag import` makes a bag of a table",
     ]

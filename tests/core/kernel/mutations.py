@@ -12,6 +12,7 @@ import pickle
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,34 @@ def mutant(case: Case, rng: np.random.Generator) -> Case:
             _exchange_files(forged, rng)
     bind_again(forged)
     return forged
+
+
+def moved(case: Case, rng: np.random.Generator) -> Case:
+    """A copy with one number moved, by a little or by its size; what is symmetric stays so."""
+    forged = case.copied()
+    parts = [forged.document["proof"], forged.document["claim"], *forged.about.values()]
+    leaves = [[(o, k) for o, k in _leaves(part) if type(o[k]) is float] for part in parts]
+    chosen = [part for part in leaves if part]
+    numbers = chosen[rng.integers(len(chosen))]
+    owner, key = numbers[rng.integers(len(numbers))]
+    owner[key] *= 1.0 + float(10.0 ** rng.uniform(-10, 1) * rng.choice((-1, 1)))
+    for entries in (each for part in parts for each in _containers(part)):
+        for name in ("P", "R") if isinstance(entries, dict) else ():
+            _made_symmetric(entries.get(name))
+    bind_again(forged)
+    return forged
+
+
+def _made_symmetric(part: Any) -> None:
+    """A matrix, or each of a list of them."""
+    if not isinstance(part, list) or not isinstance(part[0], list):
+        return
+    if isinstance(part[0][0], list):
+        for each in part:
+            _made_symmetric(each)
+        return
+    for i, j in product(range(len(part)), repeat=2):
+        part[max(i, j)][min(i, j)] = part[min(i, j)][max(i, j)]
 
 
 def bind_again(forged: Case) -> None:

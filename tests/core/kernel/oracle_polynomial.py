@@ -300,4 +300,8 @@ def _side_conditions(claim: Any, proof: Any, model: Any) -> bool:
         return symmetric and (flat or "box" not in claim)
     if kind == "2.13":
         return is_definite([[Fraction(entry) for entry in row] for row in proof["P"]])
-    return bool(kind == "2.19")
+    h, size = model["h"], len(model["h"]["exponents"][0])
+    linear = {tuple(row): c for row, c in zip(h["exponents"], h["coefficients"], strict=True)}
+    units = [tuple(int(i == j) for i in range(size)) for j in range(n)]
+    E = [linear.get(unit, [0] * n) for unit in units]
+    return bool(kind == "2.19") and all(E[i][j] == E[j][i] for i in range(n) for j in range(i))

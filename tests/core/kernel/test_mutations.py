@@ -6,10 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlsid_core import files, kernel
+from nlsid_core import files, kernel, proofs
+from nlsid_core.errors import CertificateMismatch
 from nlsid_core.kernel import Rejected
 from tests.core.kernel import mutations, oracle_composition
 from tests.core.kernel.mutations import CORPUS, ORACLES, PROOF, Case, corpus
+from tests.core.kernel.refusals import refused
+from tests.edits import put, without
+from tests.funnel_files import forged_by
 
 CASES = pytest.mark.parametrize("case", corpus(), ids=lambda case: f"{case.kind}/{case.name}")
 LEFT = CORPUS.parent / "left"
@@ -26,6 +30,49 @@ def test_a_case_of_the_corpus_is_proved_and_its_oracle_agrees(case: Case) -> Non
     assert ORACLES[case.kind](case.document, case.about)
     content = (CORPUS / case.kind / case.name / PROOF).read_bytes()
     assert files.encode(case.document) == content  # what is decided here is the file's bytes
+
+
+@pytest.mark.parametrize("tries", [6, pytest.param(60, marks=pytest.mark.slow)])
+@CASES
+def test_numbers_moved_at_random_are_decided_as_the_oracle_decides(case: Case, tries: int) -> None:
+    """Each by a little or by its size: some claims stay true, others become false."""
+    rng, found = np.random.default_rng(5), {"proved": 0, "rejected": 0}
+    for _ in range(tries // 2 if case.kind == "continuous_funnel" else tries):
+        forged = mutations.moved(case, rng)
+        truth = ORACLES[case.kind](forged.document, forged.about)
+        said = mutations.decide(forged)
+        assert said == ("proved" if truth else "rejected")
+        found[said] += 1
+    assert tries < 60 or min(found.values()) > 0
+
+
+@CASES
+def test_a_changed_digit_or_a_missing_file_is_a_mismatch(case: Case) -> None:
+    contents = {name: files.encode(document) for name, document in case.about.items()}
+    for name, content in contents.items():
+        digits = [i for i, sign in enumerate(content) if sign in b"12345678"]
+        for i in digits[:: max(1, len(digits) // 12)]:
+            other = content[:i] + bytes([content[i] + 1]) + content[i + 1 :]
+            with refused("mismatch"):
+                proofs.decide(case.document, contents | {name: other})
+        with pytest.raises(CertificateMismatch, match=name):
+            proofs.decide(case.document, {n: c for n, c in contents.items() if n != name})
+
+
+DAMAGES = [
+    *map(without, ("claim", "proof", "claim kind", "claim about")),
+    *(
+        put("claim about * file", name)
+        for name in ("../model.json", "/etc/hostname", "a/b.json", "", "..\\x")
+    ),
+]
+
+
+@CASES
+def test_a_proof_without_a_member_or_about_files_elsewhere_is_malformed(case: Case) -> None:
+    for damage in DAMAGES:
+        with refused("malformed"):
+            proofs.decide(forged_by(damage, case.document), case.about)
 
 
 @pytest.mark.parametrize("name", FALSE)

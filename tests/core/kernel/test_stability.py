@@ -1,11 +1,9 @@
 """The claim `stability` of every class: oracle, sentence, exact counterexamples, forgeries."""
 
-import json
 import random
 from collections.abc import Callable
 from decimal import Context, Decimal
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ from tests.core.kernel.stability_claims import (
     state_affine,
 )
 from tests.core.kernel.stability_forgeries import CHANGES
-from tests.decided import decided
 from tests.marks import slow_among
 
 NAMES = list(MODELS)
@@ -92,60 +89,6 @@ def test_the_kernels_matrices_are_those_of_the_specification(name: str) -> None:
                 values = [E[i][j] for E in expected]
                 kept = [E[i][j] for E in found]
                 assert (min(values), max(values)) == (min(kept), max(kept))
-
-
-@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split", "cascade"}))
-def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
-    """Every number moved at random, a little or by its size: true and false claims."""
-    rng = random.Random(name)
-    decided = {True: 0, False: 0}
-    for trial in range(40):
-        model, proof = claim(name)
-        size = 10.0 ** rng.uniform(-5, 1)
-        change = rng.choice(("rate", "P", "N", "model"))
-        if change == "rate":
-            proof["claim"]["rate"] *= 1 + size * rng.choice((-1, 1))
-        elif change == "P":
-            _move(proof["proof"]["P"], size, rng, symmetric=True)
-        elif change == "N" and "multipliers" in proof["proof"]:
-            _move(_a_leaf(proof["proof"]["multipliers"], rng)["N"], size, rng)
-        elif name == "cascade":
-            _move([model["f"]["coefficients"], model["b1"][0]], size, rng)
-        elif name == "network":
-            parts = [f[key] for f in model["maps"] for key in ("knots", "values")]
-            _move([*parts, *model["next"], *model["into"]], size, rng)
-        elif name in ("monotone", "straight"):
-            _move([model["e"], model["a"]], size, rng)
-        elif name == "linear":
-            _move([model["a"]], size, rng)
-        else:
-            _move(
-                [row for block in model["G"][trial % 2]["coefficients"] for row in block], size, rng
-            )
-        truth = oracle.is_proved(model, proof["claim"], proof["proof"])
-        decided[truth] += 1
-        if truth:
-            decide(model, proof)
-        else:
-            with pytest.raises(CertificateRejected):
-                decide(model, proof)
-    assert min(decided.values()) >= 5, decided
-
-
-def _move(
-    rows: list[list[float]], size: float, rng: random.Random, *, symmetric: bool = False
-) -> None:
-    i = rng.randrange(len(rows))
-    j = rng.randrange(len(rows[i]))
-    rows[i][j] = rows[i][j] * (1 + size * rng.choice((-1, 1))) + size * 1e-3
-    if symmetric:
-        rows[j][i] = rows[i][j]
-
-
-def _a_leaf(tree: Json, rng: random.Random) -> Json:
-    while "parts" in tree:
-        tree = rng.choice(tree["parts"])
-    return tree
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n not in NO_INPUT])
@@ -300,50 +243,6 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
     change(model, proof)
     with refused(reason):
         decide(model, proof)
-
-
-# -- files -----------------------------------------------------------------------------------
-
-
-def written(folder: Path, name: str = "linear") -> Path:
-    model, proof = claim(name)
-    files.write_document(folder / "model.json", model)
-    files.write_document(folder / "model.proof.json", proof)
-    return folder / "model.proof.json"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_changed_digit_in_a_model_is_refused(tmp_path: Path, name: str) -> None:
-    path, model = written(tmp_path, name), tmp_path / "model.json"
-    original = model.read_text()
-    digits = [i for i, c in enumerate(original) if c in "12345678"]
-    for i in digits[:: max(1, len(digits) // 20)]:
-        model.write_text(original[:i] + str(int(original[i]) + 1) + original[i + 1 :])
-        with refused("mismatch"):
-            decided(path)
-
-
-@pytest.mark.parametrize("file", ["../model.json", "/etc/hostname", "a/b.json", "", "..\\x"])
-def test_a_file_name_that_leaves_the_folder_is_refused(tmp_path: Path, file: str) -> None:
-    path = written(tmp_path)
-    document = json.loads(path.read_text())
-    document["claim"]["about"]["model"]["file"] = file
-    files.write_document(path, document)
-    with refused("malformed"):
-        decided(path)
-
-
-@pytest.mark.parametrize("place", [("claim",), ("proof",), ("claim", "about"), ("claim", "kind")])
-def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str, ...]) -> None:
-    path = written(tmp_path)
-    document = json.loads(path.read_text())
-    inner = document
-    for key in place[:-1]:
-        inner = inner[key]
-    del inner[place[-1]]
-    files.write_document(path, document)
-    with refused("malformed"):
-        decided(path)
 
 
 @pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split"}))

@@ -1,14 +1,11 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
-import hashlib
-import json
 import random
 import re
 import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +26,21 @@ from tests.core.kernel import mutations, stability_claims
 from tests.core.kernel.held_claims import claim
 from tests.core.kernel.sampled_claims import one_step
 from tests.core.kernel.stability_forgeries import CHANGES
+from tests.edits import Edit, both, exchanged, put, scaled, without
 from tests.falling_pendulum import tracking
-from tests.forged_held import HELD_FORGERIES, forged_held
-from tests.forged_tracking import FORGERIES, forged
-from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
-from tests.funnel_files import saved as saved_design
+from tests.forged_held import HELD_FORGERIES
+from tests.forged_tracking import FORGERIES
+from tests.funnel_files import (
+    FIELD,
+    FUNNEL,
+    POLICY,
+    Files,
+    files_of,
+    forged_by,
+    read,
+    write,
+)
 from tests.tracked import designed
-from tests.tracked import write as write_design
 from tests.verbs import nlsid
 
 Json = dict[str, Any]
@@ -43,6 +48,7 @@ ROOT = Path(__file__).resolve().parents[3]
 VERIFIED = ROOT / "verified"
 CORPUS = ROOT / "tests" / "core" / "kernel" / "corpus"
 FUNNELS = CORPUS / "continuous_funnel"
+CLAIM = "claim.proof.json"
 GAPS = re.compile(r"\b(Admitted|admit|Axioms?|Parameters?|Conjectures?|Unset \w+ Checking)\b")
 
 pytestmark = pytest.mark.timeout(3600)  # the theory is built once, also on a slow machine
@@ -187,63 +193,6 @@ def test_coq_proves_the_theorem_of_a_funnel(name: str, build: Path) -> None:
     assert ("held_in_bounds data x u t" if name == "held" else "in_bounds data x t") in text
 
 
-def rho_raised(files: Files) -> None:
-    """At one knot, by 0.1 %."""
-    files[FUNNEL]["rho"][1] *= 1.001
-
-
-def gain_lower(files: Files) -> None:
-    """By half."""
-    K = files[POLICY]["K"]
-    files[POLICY]["K"] = [[[[g / 2 for g in row] for row in k] for k in ks] for ks in K]
-
-
-def multiplier_sign(files: Files) -> None:
-    """Of one piece."""
-    mu = files[PROOF]["proof"]["pieces"][3]["mu"]
-    for end in ("start", "end"):
-        mu[end] = [-entry for entry in mu[end]]
-
-
-def piece_missing(files: Files) -> None:
-    """One mode of one part of time."""
-    del files[PROOF]["proof"]["pieces"][7]
-
-
-def limit_wider(files: Files) -> None:
-    """The proof is about another clip."""
-    files[POLICY]["limits"][0][2] *= 2
-
-
-def goal_smaller(files: Files) -> None:
-    """By 18 % in every direction."""
-    goal = files[PROOF]["claim"]["goal"]
-    goal["P"] = [[1.5 * entry for entry in row] for row in goal["P"]]
-
-
-def bounds_too_narrow(files: Files) -> None:
-    """The equations are said to be valid for |x0| <= 0.01 only."""
-    files[FIELD]["valid"] = [[0.0, -0.01, 0.01]]
-
-
-def input_bounds_too_narrow(files: Files) -> None:
-    """The equations are said to be valid for |u0| <= 0.01 only."""
-    n = files[FIELD]["states"]
-    files[FIELD]["valid"].append([float(n), -0.01, 0.01])
-
-
-def kappa_smaller(files: Files) -> None:
-    """A twentieth: 1 / kappa is what w adds in the middle."""
-    kappa = files[PROOF]["proof"]["kappa"]
-    kappa[:] = [[entry / 20 for entry in row] for row in kappa]
-
-
-def pushed_more(files: Files) -> None:
-    """Twenty times."""
-    box = files[FIELD]["uncertain"]
-    box[:] = [[20 * end for end in row] for row in box]
-
-
 def pushed_by_the_state(files: Files) -> None:
     """x0 w0 in the place of w0: the centre and kappa do not cover it."""
     exponents = files[FIELD]["pieces"][0][1]["exponents"]
@@ -252,72 +201,45 @@ def pushed_by_the_state(files: Files) -> None:
     exponents.sort()
 
 
-def held_longer(files: Files) -> None:
-    """Three times."""
-    files[PROOF]["claim"]["hold"] *= 3
+def valid(entry: float) -> Edit:
+    """The equations are said to be valid for a hundredth of a unit of this entry of (x, u) only."""
+    return put(f"{FIELD} valid", [[entry, -0.01, 0.01]])
 
 
-def measured_worse(files: Files) -> None:
-    """Ten times."""
-    files[PROOF]["claim"]["error"] = [0.02]
-
-
-def turns_more_slowly(files: Files) -> None:
-    """A third: rates of one interval."""
-    files[PROOF]["proof"]["rates"][0][0] /= 3
+MU = f"{CLAIM} proof pieces 3 mu"
+CONTINUOUS: dict[tuple[str, str], Edit] = {
+    ("clipped", "rho raised"): scaled(f"{FUNNEL} rho 1", 1.001),
+    ("clipped", "gain lower"): scaled(f"{POLICY} K", 0.5),
+    ("clipped", "multiplier's sign"): both(scaled(f"{MU} start", -1), scaled(f"{MU} end", -1)),
+    ("clipped", "piece missing"): without(f"{CLAIM} proof pieces 7"),
+    ("clipped", "limit wider"): scaled(f"{POLICY} limits 0 2", 2.0),
+    ("clipped", "goal smaller"): scaled(f"{CLAIM} claim goal P", 1.5),
+    ("clipped", "bounds too narrow"): valid(0.0),
+    ("clipped", "input's bounds too narrow"): valid(1.0),
+    ("pushed", "bounds too narrow"): valid(0.0),
+    ("pushed", "input's bounds too narrow"): valid(2.0),
+    ("pushed", "kappa smaller"): scaled(f"{CLAIM} proof kappa", 0.05),
+    ("pushed", "pushed more"): scaled(f"{FIELD} uncertain", 20.0),
+    ("pushed", "pushed by the state"): pushed_by_the_state,
+    ("held", "rho raised"): scaled(f"{FUNNEL} rho 1", 1.001),
+    ("held", "gain lower"): scaled(f"{POLICY} K", 0.5),
+    ("held", "input's bounds too narrow"): valid(1.0),
+    ("held", "held longer"): scaled(f"{CLAIM} claim hold", 3.0),
+    ("held", "measured worse"): put(f"{CLAIM} claim error", [0.02]),
+    ("held", "turns more slowly"): scaled(f"{CLAIM} proof rates 0 0", 1 / 3),
+}
 
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize(
-    ("name", "forge"),
-    [
-        ("clipped", forge)
-        for forge in (
-            rho_raised,
-            gain_lower,
-            multiplier_sign,
-            piece_missing,
-            limit_wider,
-            goal_smaller,
-            bounds_too_narrow,
-            input_bounds_too_narrow,
-        )
-    ]
-    + [
-        ("pushed", forge)
-        for forge in (
-            bounds_too_narrow,
-            input_bounds_too_narrow,
-            kappa_smaller,
-            pushed_more,
-            pushed_by_the_state,
-        )
-    ]
-    + [
-        ("held", forge)
-        for forge in (
-            rho_raised,
-            gain_lower,
-            input_bounds_too_narrow,
-            held_longer,
-            measured_worse,
-            turns_more_slowly,
-        )
-    ],
-)
+@pytest.mark.parametrize("forgery", CONTINUOUS, ids=" ".join)
 def test_both_kernels_refuse_a_forgery(
-    name: str, forge: Callable[[Files], None], build: Path, tmp_path: Path
+    forgery: tuple[str, str], build: Path, tmp_path: Path
 ) -> None:
-    names = {"claim.proof.json": PROOF, "vector_field.json": FIELD}
-    names |= {"policy.json": POLICY, "funnel.json": FUNNEL}
-    files = {new: json.loads((FUNNELS / name / old).read_text()) for old, new in names.items()}
-    forge(files)
-    bind(files)
-    write(files, tmp_path)
+    proof = write(forged_by(CONTINUOUS[forgery], read(FUNNELS / forgery[0])), tmp_path)
     with pytest.raises(CertificateRejected):
-        proofs.check(tmp_path / PROOF)
-    done = accepted(tmp_path / PROOF, build)
+        proofs.check(proof)
+    done = accepted(proof, build)
     assert done.returncode != 0
     assert "theorem.v" in done.stderr, "refused by Coq, not before"
 
@@ -376,15 +298,11 @@ def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
 
 def test_a_file_that_is_not_in_canonical_form_is_refused(tmp_path: Path) -> None:
     generate = generator()
-    names = {"claim.proof.json": PROOF, "vector_field.json": FIELD}
-    names |= {"policy.json": POLICY, "funnel.json": FUNNEL}
-    files = {new: json.loads((FUNNELS / "pushed" / old).read_text()) for old, new in names.items()}
+    files = read(FUNNELS / "pushed")
     coefficients = files[FIELD]["pieces"][0][1]["coefficients"]
     assert coefficients[-1] == "1/6"
     coefficients[-1] = "2/12"
-    bind(files)
-    write(files, tmp_path)
-    problem = generate.read(tmp_path / PROOF)
+    problem = generate.read(write(files, tmp_path))
     with pytest.raises(generate.printed.Differs, match="2/12"):
         generate.compared(problem, generate.coq(problem))
 
@@ -396,30 +314,6 @@ def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
     done = accepted(CORPUS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
     assert "accepted: " in done.stdout
-
-
-def put(files: Files, folder: Path) -> Path:
-    """The files of a tube or of stability, bound again; the path of the proof."""
-    digests: dict[str, str] = {}
-    for name in ("model.json", "policy.json", "funnel.json", "claim.proof.json"):
-        if name in files:
-            content = json.dumps(rebound(files[name], digests))
-            digests[name] = "sha256:" + hashlib.sha256(content.encode()).hexdigest()
-            (folder / name).write_text(content)
-    return folder / "claim.proof.json"
-
-
-def at(place: str, value: Any) -> Callable[[Files], None]:
-    """Puts a value at a place like `funnel.json tubes 0 level`."""
-
-    def forge(files: Files) -> None:
-        *owners, last = (int(key) if key.isdigit() else key for key in place.split())
-        owner: Any = files
-        for key in owners:
-            owner = owner[key]
-        owner[last] = value
-
-    return forge
 
 
 ASSUMED = "funnel.json tubes 0 assumption"
@@ -437,60 +331,68 @@ def wide_window(files: Files) -> None:
 @pytest.mark.parametrize(
     ("name", "forge", "said"),
     [
-        ("lasting_linear", at("model.json y name", "a\nb"), "no short printable text"),
-        ("lasting_linear", at("model.json y units", "m"), "unknown members: 'units'"),
-        ("lasting_linear", at("model.json period", True), "should be a number"),
-        ("lasting_linear", at("model.json period", 0), "should be > 0"),
-        ("lasting_linear", at("model.json u_range", [2, 1]), "low > high"),
-        ("lasting_linear", at("funnel.json settling", 2.5), "0 to 1000000000 is allowed"),
-        ("lasting_linear", at("funnel.json box", {}), "unknown members: 'box'"),
-        ("lasting_linear", at("funnel.json tubes 0 rho", 1.0), "exactly for an energy"),
-        ("lasting_linear", at(f"{ASSUMED} samples", 3), "unknown members: 'samples'"),
+        ("lasting_linear", put("model.json y name", "a\nb"), "no short printable text"),
+        ("lasting_linear", put("model.json y units", "m"), "unknown members: 'units'"),
+        ("lasting_linear", put("model.json period", True), "should be a number"),
+        ("lasting_linear", put("model.json period", 0), "should be > 0"),
+        ("lasting_linear", put("model.json u_range", [2, 1]), "low > high"),
+        ("lasting_linear", put("funnel.json settling", 2.5), "0 to 1000000000 is allowed"),
+        ("lasting_linear", put("funnel.json box", {}), "unknown members: 'box'"),
+        ("lasting_linear", put("funnel.json tubes 0 rho", 1.0), "exactly for an energy"),
+        ("lasting_linear", put(f"{ASSUMED} samples", 3), "unknown members: 'samples'"),
         (
             "lasting_linear",
-            at("funnel.json tubes 0 follows", {"terms": [], "weights": [[]]}),
+            put("funnel.json tubes 0 follows", {"terms": [], "weights": [[]]}),
             "1 to 200 entries",
         ),
-        ("lasting_linear", at("claim.proof.json proof multipliers", []), "unknown members"),
-        ("lasting_split", at("model.json window 0", [0, 9]), "a delay of the window"),
-        ("lasting_split", at("model.json y_scale 0", -1.0), "should be > 0"),
-        ("lasting_two_outputs", at("model.json y 1 name", "y0"), "two signals of one name"),
-        ("lasting_two_outputs", at("claim.proof.json proof multipliers 0 N", []), "3 to 3 entries"),
-        ("lasting_network", at("model.json into 0 0", 1.0), "a map should use earlier ones only"),
-        ("lasting_network", at("model.json maps 0 knots 0", 5.0), "should increase"),
-        ("lasting_cascade", at("model.json f spacing", 0.0), "the spacing should be > 0"),
-        ("lasting_cascade", at("model.json f coefficients", [0.0, 1.0, 2.0]), "4 to"),
-        ("lasting_cascade", at("model.json b1 1", [1.0]), "3 to 3 entries"),
-        ("lasting_cascade", at("model.json b2", [[1.0]]), "2 to 2 entries"),
+        ("lasting_linear", put("claim.proof.json proof multipliers", []), "unknown members"),
+        ("lasting_split", put("model.json window 0", [0, 9]), "a delay of the window"),
+        ("lasting_split", put("model.json y_scale 0", -1.0), "should be > 0"),
+        ("lasting_two_outputs", put("model.json y 1 name", "y0"), "two signals of one name"),
+        (
+            "lasting_two_outputs",
+            put("claim.proof.json proof multipliers 0 N", []),
+            "3 to 3 entries",
+        ),
+        ("lasting_network", put("model.json into 0 0", 1.0), "a map should use earlier ones only"),
+        ("lasting_network", put("model.json maps 0 knots 0", 5.0), "should increase"),
+        ("lasting_cascade", put("model.json f spacing", 0.0), "the spacing should be > 0"),
+        ("lasting_cascade", put("model.json f coefficients", [0.0, 1.0, 2.0]), "4 to"),
+        ("lasting_cascade", put("model.json b1 1", [1.0]), "3 to 3 entries"),
+        ("lasting_cascade", put("model.json b2", [[1.0]]), "2 to 2 entries"),
         (
             "lasting_implicit_ray",
-            at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
+            put("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
             "a box of a model that needs none",
         ),
-        ("engaged", at("policy.json u 0 0", 7.0), "outside the model's range"),
-        ("engaged", at("policy.json period", 0.2), "another period"),
-        ("engaged", at("policy.json L 0 0", 0.0), "L is not the policy's"),
-        ("response", at("model.json kind", "map"), "should be one of state_map"),
-        ("response", at("model.json x 1 name", "angle"), "two signals of one name"),
-        ("response", at("model.json exponents 4", [0, 63, 63]), "a degree above 63"),
-        ("response", at("model.json exponents 4", [0, 60, 0]), "too many monomials in a step"),
-        ("response", at("policy.json period", 0.04), "another period"),
-        ("response", at("policy.json L", [[1.0]]), "2 to 2 entries"),
-        ("response", at("funnel.json tube 0", 5.0), "starts outside the inlet"),
-        ("response", at("funnel.json roots", [1.0]), "unknown members: 'roots'"),
-        ("response", at("funnel.json assumption rate", 0.5), "rate and gain 1"),
-        ("response", at("funnel.json assumption gain", 2.0), "rate and gain 1"),
-        ("response", at("funnel.json assumption form", "linear"), "should be one of response"),
-        ("response", at("funnel.json assumption form", "energy"), "should be one of response"),
-        ("response", at("claim.proof.json proof steps 0 kappa", -1.0), "kappa >= 0"),
-        ("response", at("claim.proof.json proof steps 0 curvature", [-1.0]), "curvature >= 0"),
-        ("response", at("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
-        ("response", at("claim.proof.json version", 2.0), "not of version 2"),
-        ("response", at("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
-        ("response", at("claim.proof.json proof steps 0 tube squares scale", 1), "unknown members"),
+        ("engaged", put("policy.json u 0 0", 7.0), "outside the model's range"),
+        ("engaged", put("policy.json period", 0.2), "another period"),
+        ("engaged", put("policy.json L 0 0", 0.0), "L is not the policy's"),
+        ("response", put("model.json kind", "map"), "should be one of state_map"),
+        ("response", put("model.json x 1 name", "angle"), "two signals of one name"),
+        ("response", put("model.json exponents 4", [0, 63, 63]), "a degree above 63"),
+        ("response", put("model.json exponents 4", [0, 60, 0]), "too many monomials in a step"),
+        ("response", put("policy.json period", 0.04), "another period"),
+        ("response", put("policy.json L", [[1.0]]), "2 to 2 entries"),
+        ("response", put("funnel.json tube 0", 5.0), "starts outside the inlet"),
+        ("response", put("funnel.json roots", [1.0]), "unknown members: 'roots'"),
+        ("response", put("funnel.json assumption rate", 0.5), "rate and gain 1"),
+        ("response", put("funnel.json assumption gain", 2.0), "rate and gain 1"),
+        ("response", put("funnel.json assumption form", "linear"), "should be one of response"),
+        ("response", put("funnel.json assumption form", "energy"), "should be one of response"),
+        ("response", put("claim.proof.json proof steps 0 kappa", -1.0), "kappa >= 0"),
+        ("response", put("claim.proof.json proof steps 0 curvature", [-1.0]), "curvature >= 0"),
+        ("response", put("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
+        ("response", put("claim.proof.json version", 2.0), "not of version 2"),
+        ("response", put("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
+        (
+            "response",
+            put("claim.proof.json proof steps 0 tube squares scale", 1),
+            "unknown members",
+        ),
         (
             "lasting_split",
-            at(
+            put(
                 "funnel.json tubes 0 follows",
                 {
                     "terms": [
@@ -504,21 +406,21 @@ def wide_window(files: Files) -> None:
         ("lasting_split", wide_window, "a degree above 63"),
         (
             "lasting_split",
-            at("model.json p", {"exponents": [], "coefficients": []}),
+            put("model.json p", {"exponents": [], "coefficients": []}),
             "p has no monomials",
         ),
     ],
 )
 def test_a_file_that_the_pages_do_not_allow_is_refused(
-    name: str, forge: Callable[[Files], None], said: str, tmp_path: Path
+    name: str, forge: Edit, said: str, tmp_path: Path
 ) -> None:
     """By both kernels; with the file as it is, both have nothing against it."""
     sampled = CORPUS / "sampled_funnel" / name
     folder, generate = sampled if sampled.exists() else CORPUS / "tube" / name, generator()
-    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    assert generate.decided(put(files, tmp_path)) == (0, "")
+    files = read(folder)
+    assert generate.decided(write(files, tmp_path)) == (0, "")
     forge(files)
-    proof = put(files, tmp_path)
+    proof = write(files, tmp_path)
     status, why = generate.decided(proof)
     assert status == 1
     assert said in why
@@ -528,8 +430,8 @@ def test_a_file_that_the_pages_do_not_allow_is_refused(
 
 def test_a_number_that_is_not_written_as_a_float64_is_refused(tmp_path: Path) -> None:
     folder, generate = CORPUS / "stability" / "linear", generator()
-    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    proof = put(files, tmp_path)
+    files = read(folder)
+    proof = write(files, tmp_path)
     claim = files["claim.proof.json"]["claim"]
     text = proof.read_text()
     proof.write_text(text.replace(str(claim["rate"]), str(claim["rate"]) + "00"))
@@ -565,67 +467,6 @@ def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path
         assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 2
 
 
-def fades_faster(files: Files) -> None:
-    """The innovations are forgotten by 0.6 a sample."""
-    files["funnel.json"]["tubes"][0]["rho"] *= 0.6
-
-
-def narrower(files: Files) -> None:
-    """Half-widths by 10 %: the level does not allow it."""
-    widths = files["funnel.json"]["tubes"][0]["half_widths"]
-    widths[:] = [0.9 * width for width in widths]
-
-
-def tau_larger(files: Files) -> None:
-    """By half: the output is not bounded by the storage so."""
-    tau = files["funnel.json"]["tubes"][0]["tau"]
-    tau[:] = [1.5 * entry for entry in tau]
-
-
-def storage_of_another_size(files: Files) -> None:
-    """P ten times smaller: it takes innovations in that it forgets."""
-    P = files["funnel.json"]["tubes"][0]["P"]
-    P[:] = [[entry / 10 for entry in row] for row in P]
-
-
-def indefinite(files: Files) -> None:
-    """P changes its sign."""
-    P = files["funnel.json"]["tubes"][0]["P"]
-    P[:] = [[-entry for entry in row] for row in P]
-
-
-def outputs_counted_twice(files: Files) -> None:
-    """A model whose outputs are in another unit."""
-    scales = files["model.json"]["y_scale"]
-    scales[:] = [2 * scale for scale in scales]
-
-
-def multipliers_gone(files: Files) -> None:
-    """Zeros in their place."""
-    N = files["claim.proof.json"]["proof"]["multipliers"][0]["N"]
-    N[:] = [[[0.0 for _ in row] for row in matrix] for matrix in N]
-
-
-def spline_steeper(files: Files) -> None:
-    """Four times, where it is steepest."""
-    c = files["model.json"]["f"]["coefficients"]
-    steepest = max(range(len(c) - 1), key=lambda i: c[i + 1] - c[i])
-    rise = 3.0 * (c[steepest + 1] - c[steepest])
-    c[steepest + 1 :] = [entry + rise for entry in c[steepest + 1 :]]
-
-
-def filter_stronger(files: Files) -> None:
-    """Twice what goes from the spline into the second filter."""
-    b2 = files["model.json"]["b2"]
-    b2[:] = [[2 * entry for entry in row] for row in b2]
-
-
-def feedback_stronger(files: Files) -> None:
-    """Ten times: the tube was made for less."""
-    K = files["policy.json"]["K"]
-    K[:] = [[10 * gain for gain in row] for row in K]
-
-
 @pytest.fixture(scope="module")
 def program(build: Path) -> Path:
     """The extracted checker."""
@@ -637,32 +478,34 @@ def program(build: Path) -> Path:
     return build / "nlsid-second"
 
 
+TUBE = "funnel.json tubes 0"
+TUBES: dict[str, tuple[str, Edit]] = {
+    "the innovations are forgotten faster": ("lasting_two_outputs", scaled(f"{TUBE} rho", 0.6)),
+    "narrower": ("lasting_two_outputs", scaled(f"{TUBE} half_widths", 0.9)),
+    "tau larger": ("lasting_two_outputs", scaled(f"{TUBE} tau", 1.5)),
+    "storage of another size": ("lasting_two_outputs", scaled(f"{TUBE} P", 0.1)),
+    "indefinite": ("lasting_two_outputs", scaled(f"{TUBE} P", -1.0)),
+    "outputs in another unit": ("lasting_two_outputs", scaled("model.json y_scale", 2.0)),
+    "multipliers gone": (
+        "lasting_two_outputs",
+        scaled("claim.proof.json proof multipliers 0 N", 0.0),
+    ),
+    "feedback stronger": ("engaged", scaled("policy.json K", 10.0)),
+    "spline steeper": ("lasting_cascade", scaled("model.json f coefficients", 4.0)),
+    "filter stronger": ("lasting_cascade", scaled("model.json b2", 2.0)),
+}
+
+
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize(
-    "forge",
-    [
-        fades_faster,
-        narrower,
-        tau_larger,
-        storage_of_another_size,
-        indefinite,
-        outputs_counted_twice,
-        multipliers_gone,
-        feedback_stronger,
-        spline_steeper,
-        filter_stronger,
-    ],
-)
+@pytest.mark.parametrize(("name", "forge"), TUBES.values(), ids=TUBES)
 def test_both_kernels_refuse_a_forged_tube(
-    forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
+    name: str, forge: Edit, build: Path, program: Path, tmp_path: Path
 ) -> None:
-    of_cascades = forge in (spline_steeper, filter_stronger)
-    planned = "engaged" if forge is feedback_stronger else "lasting_two_outputs"
-    folder = CORPUS / "tube" / ("lasting_cascade" if of_cascades else planned)
-    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    folder = CORPUS / "tube" / name
+    files = read(folder)
     forge(files)
-    proof = put(files, tmp_path)
+    proof = write(files, tmp_path)
     with pytest.raises(CertificateRejected):
         proofs.check(proof)
     assert second.opinion(proof, program).verdict == "refused"
@@ -675,9 +518,9 @@ def test_both_kernels_refuse_a_forged_tube(
 @pytest.mark.coq
 def test_every_forged_sampled_funnel_is_refused(program: Path, tmp_path: Path) -> None:
     """Those that the first kernel's tests hold; the funnel that they were made of is accepted."""
-    assert second.opinion(write_design(designed(), tmp_path), program).verdict == "accepted"
-    for what in FORGERIES:
-        proof = write_design(forged(designed(), what), tmp_path)
+    assert second.opinion(write(files_of(designed()), tmp_path), program).verdict == "accepted"
+    for what, (forge, _) in FORGERIES.items():
+        proof = write(forged_by(forge, files_of(designed())), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
 
 
@@ -685,10 +528,10 @@ def test_every_forged_sampled_funnel_is_refused(program: Path, tmp_path: Path) -
 @pytest.mark.coq
 def test_every_forged_held_funnel_is_refused(program: Path, tmp_path: Path) -> None:
     """Those that the first kernel's tests hold; one whose input is held between samples."""
-    files = saved_design(design(tracking(hold=0.01, error=[0.002, 0.01])), tmp_path)
+    files = files_of(design(tracking(hold=0.01, error=[0.002, 0.01])))
     assert second.opinion(write(files, tmp_path), program).verdict == "accepted"
-    for what in HELD_FORGERIES:
-        proof = write(forged_held(files, what), tmp_path)
+    for what, (forge, _) in HELD_FORGERIES.items():
+        proof = write(forged_by(forge, files), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
 
 
@@ -706,7 +549,7 @@ def test_every_forged_stability_is_refused(program: Path, tmp_path: Path) -> Non
 def said_of(model: Json, proof: Json, program: Path, folder: Path) -> str:
     """What the second kernel says of a proof of stability."""
     files = {"model.json": model, "claim.proof.json": proof}
-    return second.opinion(put(files, folder), program).verdict
+    return second.opinion(write(files, folder), program).verdict
 
 
 @needs_coq
@@ -722,7 +565,8 @@ def test_a_bound_that_an_old_input_breaks_is_refused(
 @needs_coq
 @pytest.mark.coq
 def test_a_forged_sampled_funnel_has_no_theorem(build: Path, tmp_path: Path) -> None:
-    proof = write_design(forged(designed(), "curvature made smaller"), tmp_path)
+    forge, _ = FORGERIES["curvature made smaller"]
+    proof = write(forged_by(forge, files_of(designed())), tmp_path)
     done = accepted(proof, build)
     assert done.returncode != 0
     assert "theorem.v" in done.stderr, "refused by Coq, not before"
@@ -741,64 +585,28 @@ def test_sampled_claims_are_decided_as_the_closed_form_decides(
         files["claim.proof.json"] = proofs.proof_document(
             {"kind": "sampled_funnel", "about": about}, claim.proof()
         )
-        found, _ = generate.decided(put(files, tmp_path), checker=program.parent / "second")
+        found, _ = generate.decided(write(files, tmp_path), checker=program.parent / "second")
         assert found == (0 if true else 1)
 
 
-def start_narrower(case: mutations.Case) -> None:
-    """Stage 2 starts 1 % narrower: stage 1 no longer ends inside it."""
-    case.about["stage2.funnel.json"]["rho"][0] *= 0.99
-
-
-def multiplier_raised(case: mutations.Case) -> None:
-    """Past 1 the S-lemma gives nothing."""
-    case.document["proof"]["multipliers"] = [1.01]
-
-
-def multiplier_negative(case: mutations.Case) -> None:
-    """Less than nothing."""
-    case.document["proof"]["multipliers"] = [-0.5]
-
-
-def stages_swapped(case: mutations.Case) -> None:
-    """Proofs and all."""
-    about = case.document["claim"]["about"]
-    about["stage1"], about["stage2"] = about["stage2"], about["stage1"]
-
-
-def stage_repeated(case: mutations.Case) -> None:
-    """Stage 1 follows itself."""
-    about = case.document["claim"]["about"]
-    about["stage2"] = dict(about["stage1"])
-
-
-def stage_of_another_motion(case: mutations.Case) -> None:
-    """Stage 2's equations are driven harder than its own proof allows."""
-    case.about["stage2.policy.json"]["K"] = [
-        [[[-g for g in row] for row in k] for k in ks]
-        for ks in case.about["stage2.policy.json"]["K"]
-    ]
+ABOUT = f"{mutations.PROOF} claim about"
+COMPOSITIONS: dict[str, Edit] = {
+    "stage 2 starts narrower": scaled("stage2.funnel.json rho 0", 0.99),
+    "a multiplier above 1": put(f"{mutations.PROOF} proof multipliers", [1.01]),
+    "a negative multiplier": put(f"{mutations.PROOF} proof multipliers", [-0.5]),
+    "stages exchanged": exchanged(f"{ABOUT} stage1", f"{ABOUT} stage2"),
+    "stage 1 follows itself": put(f"{ABOUT} stage2 file", "stage1.proof.json"),
+    "stage 2 is driven the other way": scaled("stage2.policy.json K", -1.0),
+}
 
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize(
-    "forge",
-    [
-        start_narrower,
-        multiplier_raised,
-        multiplier_negative,
-        stages_swapped,
-        stage_repeated,
-        stage_of_another_motion,
-    ],
-)
-def test_both_kernels_refuse_a_forged_composition(
-    forge: Callable[[mutations.Case], None], program: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("what", COMPOSITIONS)
+def test_both_kernels_refuse_a_forged_composition(what: str, program: Path, tmp_path: Path) -> None:
     (case,) = (case for case in mutations.corpus() if case.kind == "funnel_composition")
     forged = case.copied()
-    forge(forged)
+    COMPOSITIONS[what]({**forged.about, mutations.PROOF: forged.document})
     mutations.bind_again(forged)
     for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
         (tmp_path / name).write_bytes(saved.encode(document))
@@ -806,16 +614,6 @@ def test_both_kernels_refuse_a_forged_composition(
         kernel.check(tmp_path / mutations.PROOF)
     status, why = generator().decided(tmp_path / mutations.PROOF, checker=program.parent / "second")
     assert (status, why) == (1, ""), "refused by the checker, not before"
-
-
-def rebound(document: Json, digests: dict[str, str]) -> Json:
-    """With the digests of the files that it names."""
-    for role in ("model", "policy"):
-        if role in document:
-            document[role] = digests[f"{role}.json"]
-    for entry in document.get("claim", {}).get("about", {}).values():
-        entry["digest"] = digests[entry["file"]]
-    return document
 
 
 @needs_coq
