@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 17_865,
     ("bags",): 11_495,
     ("nlsid_ros",): 2_550,
-    ("tests",): 21_488,
+    ("tests",): 21_489,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
