@@ -24,7 +24,6 @@ from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, LogClock, Recent, Recording
-from bags.signals.timing import seconds
 from bags.tools.recover import repair, unfinished_bags
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -36,7 +35,6 @@ from nlsid_ros.subscribing import Received, Subscriptions, Wanted
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
-LATE = 1.0  # s since a repeat began, or its pause at rest, after which its beginning is lost
 MOST_TOPICS = 12  # that a status names: with the rest it has at most 20 values
 SAID_BY = "excitation/experiment"  # the topic on which an excitation says what it does,
 EXPERIMENT = "experiment"  # and the custom datum that holds it
@@ -51,12 +49,7 @@ class TrajectoryRecorder(ManagedNode):
     parameters = (
         Parameter("topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"),
         Parameter("bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"),
-        Parameter(
-            "at_once",
-            True,
-            "begin a bag when activated; false: wait for ~/start or an excitation, each repeat of "
-            "which then gets a bag of its own",
-        ),
+        Parameter("at_once", True, "begin a bag when activated; false: wait for ~/start"),
         Parameter("chunk_period", 0.5, "s of messages a kill may lose", (0.05, 0.9)),
         Parameter("least_free", 200.0, "MB left on the disk at which recording stops", (0.0, 1e12)),
         Parameter("snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", (0.0, 600.0)),
@@ -200,30 +193,22 @@ class TrajectoryRecorder(ManagedNode):
             self._recording.add(arrival)
 
     def _on_experiment(self, message: String) -> None:
-        """Keep what an excitation says it does; how one ended is for the bag it was in.
-
-        Of one that began before this recorder a part would be recorded, which is no repeat.
-        """
+        """Keep what an excitation says it does; how one ended is for the bag it was in."""
         try:
             said = files.parse_document(message.data)
-            ended, now_ns = "ended" in said, self.get_clock().now().nanoseconds
-            late = seconds(now_ns, files.member(said, "start_ns", int, source=SAID_BY))
-            is_late = late > max(LATE, files.number(said, "pause", source=SAID_BY))
-            is_of_before = not self._experiment if ended else is_late
-            if is_of_before:
-                return
-            group = files.member(said, "repeat_group", str, source=SAID_BY)
-            now = {EXPERIMENT: message.data, "repeat_group": group}
-            if not (ended or self.values.at_once):
-                self._on_stop()
-                self._on_start()
-            if self._recording is not None:
-                self._recording.annotate(now)
-            self._experiment = {} if ended else now
-            if ended and not self.values.at_once:
-                self._on_stop()
-        except (NlsidError, OSError) as error:
-            self.get_logger().error(f"no bag of what {SAID_BY} says: {error}")
+        except NlsidError as error:
+            self.get_logger().warning(f"{SAID_BY} is not in the bag's metadata: {error}")
+            return
+        ended = "ended" in said
+        if ended and not self._experiment:  # latched, of an experiment before this recorder
+            return
+        group = said.get("repeat_group")
+        now = {EXPERIMENT: message.data}
+        if isinstance(group, str):
+            now["repeat_group"] = group
+        if self._recording is not None:
+            self._recording.annotate(now)
+        self._experiment = {} if ended else now
 
     def _keep_up(self) -> None:
         if self._recording is None:

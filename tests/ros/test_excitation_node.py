@@ -23,7 +23,7 @@ from nlsid_core.designs import VECTOR_FIELD
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.continuous_stage import stage
-from tests.ros.processes import Bench, ros_test, stop
+from tests.ros.processes import Bench, ros_test, service, stop
 
 pytestmark = ros_test
 
@@ -200,7 +200,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
     wiring = {"response": RESPONSE, "command": COMMAND} | dict.fromkeys(types, kind)
     bench.start("plant", model=field, state="'0.0'", **wiring)
     recorder = bench.start("trajectory_recorder", topics=topics, bag=bags / "trial", at_once=False)
-    bench.start("excitation", **(JOINTS | SIGNAL), repeats=3)
+    bench.start("excitation", **(JOINTS | SIGNAL), repeats=3, recorder="trajectory_recorder")
     bench.spin_until(lambda: bench.node.count_subscribers("/joint_states") == 1)
     bench.spin_until(lambda: bench.node.count_subscribers("/joint_commands") == 2)
     bench.hears("idle", "excitation")
@@ -232,13 +232,27 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         assert np.corrcoef(first[:common], member.u[:common, 0])[0, 1] > 0.98
 
 
-def test_a_repeat_that_began_before_the_recorder_has_no_bag(
-    stack: ExitStack, tmp_path: Path
+@pytest.mark.parametrize("recorder", ["none", "busy", "does not answer"])
+def test_a_recorder_that_gives_no_bag_stops_the_experiment_before_it_moves(
+    bench: Bench, recorder: str, tmp_path: Path
 ) -> None:
-    robot, bag = Excited(stack, kind="steps", period=0.02, pause=0.0), tmp_path / "part"
-    robot.begin(above=0.2)
-    robot.waits(1.0)
-    robot.start("trajectory_recorder", topics="[/cmd_vel]", bag=bag, at_once=False)
-    robot.hears("waiting for ~/start", "trajectory_recorder")
-    robot.end()
-    assert not bag.exists()
+    name, at_once = "trajectory_recorder", recorder == "busy"
+    if recorder != "none":
+        process = bench.start(name, topics="[/joints]", bag=tmp_path / "own", at_once=at_once)
+        bench.hears("", name)
+    bench.start("excitation", **(JOINTS | SIGNAL), recorder=name)
+    bench.hears("idle", "excitation")
+    start = service(bench.node, bench.spin_until, "/excitation/start")
+    if recorder == "none":
+        answer = bench.call("/excitation/start")
+        assert "there is no recorder trajectory_recorder" in answer.message
+        return
+    bench.spin_until(lambda: bench.said["excitation"][-1][1]["recorder"] == "ready")
+    if recorder == "does not answer":
+        process.send_signal(signal.SIGSTOP)
+    bench.spin_until(lambda: bench.call("/excitation/start").success)
+    says = "no bag from the recorder: recording" if at_once else "has not answered for 10 s"
+    bench.hears(says, "excitation")
+    assert bench.levels["excitation"] == DiagnosticStatus.ERROR
+    process.send_signal(signal.SIGCONT)
+    assert start.service_is_ready(), "it goes on"
