@@ -31,12 +31,11 @@ nav a { margin-right: 1rem; display: inline-block }
 figure { margin: 1rem 0 } figure img { max-width: 100% }
 section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
 @media screen and (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem }
-  pre { font-size: 7.5px; overflow-x: auto }
   svg, figure img { max-width: 200% } }
 @page { size: A4; margin: 15mm }
 @media print { nav { display: none } h2, h3 { break-after: avoid }
   figure, tr, svg { break-inside: avoid } section { overflow: visible }
-  table { font-size: .8em } th, td { padding: .2rem .4rem } pre { font-size: 7pt }
+  table { font-size: .8em } th, td { padding: .2rem .4rem }
   th, td:first-child, td[colspan] { white-space: normal }
   body { max-width: none; margin: 0; font-size: 11pt } }
 """
@@ -73,9 +72,9 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
     drawn = "" if design is None else _drawn(folder, design)
     chapters = {
         "What is proved": _in_short(design) + decided,
+        **(held or {}),
         "The model": model,
         "Pictures": _pictures(folder, without=in_model) + drawn,
-        **(held or {}),
     }
     present = [(title, text) for title, text in chapters.items() if text]
     links = "".join(f'<a href="#c{k}">{title}</a>' for k, (title, _) in enumerate(present))

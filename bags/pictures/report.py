@@ -27,13 +27,13 @@ th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
 ul { padding-left: 1.2rem }
 tbody tr { border-bottom: 1px solid #ddd } td code { white-space: nowrap }
-pre { font-size: .8rem; overflow-x: auto } .picture { overflow-x: auto }
-@media screen and (min-width: 62rem) { pre { white-space: pre-wrap } }
-@media screen and (max-width: 40rem) { body { font-size: 14px } pre { font-size: 7.5px }
+.picture { overflow-x: auto }
+@media screen and (max-width: 40rem) { body { font-size: 14px }
   table { display: block; overflow-x: auto } th, td { padding: .25rem .4rem }
   .picture svg { max-width: none; width: 48rem } }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
-.note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
+.chosen { font-weight: 600 } .note { color: #555 }
+.proved { color: #1a7f37 } .not { color: #b35900 }
 """
 
 
@@ -130,9 +130,9 @@ for this table and the pictures below{calibrated if "calibration" in parts else 
 {_residuals(chosen, test)}
 {FUNNEL_BEGINS}{FUNNEL_ENDS}
 <h2>Recordings</h2>
-<table class="left">
+<details><summary>{counts}</summary><table class="left">
 <thead><tr><th>trial</th><th>samples</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
-<tbody>{listed}</tbody></table>{MODEL_ENDS}
+<tbody>{listed}</tbody></table></details>{MODEL_ENDS}
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """

@@ -3,10 +3,13 @@
 import io
 import math
 from collections.abc import Callable, Sequence
+from html import escape
+from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from bags.monitoring.catching import Catching, Caught
 from nlsid_core.data.trajectory import Dataset
@@ -15,14 +18,50 @@ from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stat
 from nlsid_core.models import StateAffineModel
 
 STABILITY = "proved rate a sample (time constant)"
-PAGE_COLUMNS = 110  # of what a page shows as it is printed
+SHADES: Final = {"bold": "chosen", "green": "proved", "dark_orange3": "not"}  # classes of a page
+
+
+class _Page(Console):
+    """A console whose prints are elements of a page: tables are tables, all else paragraphs."""
+
+    def __init__(self) -> None:
+        super().__init__(file=io.StringIO())
+        self.elements: list[str] = []
+
+    def print(self, *objects: Any, style: Any = None, **_: Any) -> None:
+        """Add an element for each object."""
+        for printed in objects:
+            shade = SHADES.get(str(style), "said")
+            paragraph = f'<p class="{shade}">{escape(str(printed))}</p>'
+            self.elements.append(_table(printed) if isinstance(printed, Table) else paragraph)
 
 
 def html(say: Callable[[Console], None]) -> str:
-    """Give what is printed as an element of a page, with its colours."""
-    console = Console(record=True, file=io.StringIO(), width=PAGE_COLUMNS)
-    say(console)
-    return console.export_html(inline_styles=True, code_format="<pre>{code}</pre>")
+    """Give what is printed as elements of a page, with its colours."""
+    page = _Page()
+    say(page)
+    return "\n".join(page.elements)
+
+
+def _table(table: Table) -> str:
+    """A table as one of a page, its title above it and its caption below."""
+    heads = "".join(f"<th>{escape(str(column.header))}</th>" for column in table.columns)
+    cells = zip(*(column.cells for column in table.columns), strict=True)
+    rows = "".join(
+        f'<tr class="{SHADES.get(str(row.style), "")}">{"".join(map(_cell, each))}</tr>'
+        for row, each in zip(table.rows, cells, strict=True)
+    )
+    titled, noted = (escape(str(words or "")) for words in (table.title, table.caption))
+    return (
+        f"<p>{titled}</p><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+        f'<p class="note">{noted}</p>'
+    )
+
+
+def _cell(cell: Any) -> str:
+    text = cell if isinstance(cell, Text) else Text.from_markup(str(cell))
+    shade = SHADES.get(str(text.spans[0].style), "") if text.spans else ""
+    return f'<td class="{shade}">{escape(text.plain)}</td>'
 
 
 def methods_table(fit: Fit[Model], test: Dataset, uses: Sequence[str] = ("test",)) -> Table:

@@ -299,10 +299,6 @@ def _say_signals(
             best = pairs[0]
             before = f"{proposal.why[text]}; " if proposal.why[text] else ""
             proposal.why[text] = f"{before}follows {best.command.text}: {best}"
-            if abs(best.correlation) < RELATED:
-                proposal.walls.append(
-                    f"{text} hardly follows {best.command.text} ({best}); is it the right one?"
-                )
             washed = "|washout" in text
             if best.response.is_position and not best.command.is_position and not washed:
                 proposal.walls.append(

@@ -1,5 +1,7 @@
 """Recorded or nominal motions: `Trajectory`, and `Dataset`, several of them on one time grid."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -85,7 +87,7 @@ class Trajectory:
             )
         return period
 
-    def rows(self, part: slice, name: str | None = None) -> "Trajectory":
+    def rows(self, part: slice, name: str | None = None) -> Trajectory:
         """These samples of it, called so (None: as it is)."""
         return replace(
             self,
@@ -149,7 +151,7 @@ class Dataset:
         y: Sequence[str] | str,
         u: Sequence[str] | str,
         paths: Mapping[str, str] | None = None,
-    ) -> "Dataset":
+    ) -> Dataset:
         """Make a dataset of pandas DataFrames, one a trial, on one grid of time.
 
         Args:
@@ -224,7 +226,7 @@ class Dataset:
         """(name, digest of its recording) of every trajectory, as a model names them."""
         return tuple((trajectory.name, trajectory.digest) for trajectory in self.trajectories)
 
-    def select(self, names: Sequence[str]) -> "Dataset":
+    def select(self, names: Sequence[str]) -> Dataset:
         """The named trajectories, in the order given; DataError names an unknown one."""
         known = {trajectory.name: trajectory for trajectory in self.trajectories}
         for name in names:
@@ -232,7 +234,7 @@ class Dataset:
                 raise DataError(f"no trajectory '{name}'; there are: {', '.join(known)}")
         return Dataset(tuple(known[name] for name in names))
 
-    def without(self, names: Sequence[str]) -> "Dataset":
+    def without(self, names: Sequence[str]) -> Dataset:
         """All but the named trajectories."""
         return Dataset(tuple(t for t in self.trajectories if t.name not in set(names)))
 

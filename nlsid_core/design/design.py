@@ -3,6 +3,8 @@
 Each kind has one search, which the kernel decides before anything is returned.
 """
 
+from __future__ import annotations
+
 from typing import get_args, overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel

@@ -1,5 +1,7 @@
 """What `design` solves: a frozen dataclass for each kind of funnel, checked when it is made."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args

@@ -1,5 +1,7 @@
 """`Nominal`: the motion a funnel is built around, x₀ and u₀ as piecewise cubics on common knots."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +47,7 @@ class Nominal:
         """(K,) knots in s."""
         return self.x.t
 
-    def halved(self, chosen: ArrayLike) -> "Nominal":
+    def halved(self, chosen: ArrayLike) -> Nominal:
         """The same motion with a knot more in the middle of the chosen (K-1,) intervals."""
         return Nominal(self.x.halved(chosen), self.u.halved(chosen))
 

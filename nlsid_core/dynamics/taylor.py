@@ -4,6 +4,8 @@
 are cubics as they are written stay what they are; every other one has a bounded w of its own.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -77,7 +79,7 @@ class Rates:
         uncertain: ArrayLike | None = None,
         *,
         affine: bool = False,
-    ) -> "Rates":
+    ) -> Rates:
         """Look at the function once, with symbols."""
         box = box_of(function, uncertain)
         names = ("t", *variable_names(n, m, len(box)))
@@ -91,7 +93,7 @@ class Rates:
         return cls(function, n, m, box, tuple(exact), tuple(row.uses for row in traced), affine)
 
     @classmethod
-    def numeric(cls, function: Callable[..., Any], n: int, m: int) -> "Rates":
+    def numeric(cls, function: Callable[..., Any], n: int, m: int) -> Rates:
         """Only for values at points: nothing is asked of the function but numbers."""
         return cls(function, n, m, box_of(function, None), (), ())
 
@@ -190,7 +192,7 @@ class Rates:
             [called(x, u, w) for x, u, w in zip(X, U, W, strict=True)], dtype=np.float64
         )
 
-    def on(self, low: FloatArray, high: FloatArray, times: tuple[float, float]) -> "Cubic":
+    def on(self, low: FloatArray, high: FloatArray, times: tuple[float, float]) -> Cubic:
         """The cubics on the box low ≤ (x, u) ≤ high, (n + m,), and the times; DataError if none."""
         low, high = low.copy(), high.copy()
         for j, least, most in self.valid.tolist():
@@ -217,7 +219,7 @@ class _Row:
     places: IntArray
 
     @classmethod
-    def of(cls, row: Any, rates: Rates) -> "_Row":
+    def of(cls, row: Any, rates: Rates) -> _Row:
         """Products of w with anything else go to the bound, if too many corners would decide.
 
         Of affine rates a square d_j² of an input is 1/2 ± 1/2, as |d_j| ≤ 1.
@@ -452,7 +454,7 @@ class _Symbol:
         self.p, self.uses = p, uses
 
     @classmethod
-    def made(cls, value: Any) -> "_Symbol":
+    def made(cls, value: Any) -> _Symbol:
         if isinstance(value, _Symbol):
             return value
         return cls(as_polynomial(value).exact(), frozenset())
@@ -480,7 +482,7 @@ class _Symbol:
             p = None
         return _Symbol(p, uses)
 
-    def _power(self, power: Any) -> "_Symbol":
+    def _power(self, power: Any) -> _Symbol:
         try:
             p = (
                 None
@@ -491,7 +493,7 @@ class _Symbol:
             p = None
         return _Symbol(p, self.uses)
 
-    def _unknown(self, *others: Any) -> "_Symbol":
+    def _unknown(self, *others: Any) -> _Symbol:
         uses = self.uses.union(*(o.uses for o in others if isinstance(o, _Symbol)))
         return _Symbol(None, uses)
 
@@ -504,7 +506,7 @@ class _Symbol:
     __abs__ = sqrt = sin = cos = tan = exp = log = tanh = arctan = arctan2 = fabs = _unknown
     absolute = _unknown
 
-    def square(self) -> "_Symbol":
+    def square(self) -> _Symbol:
         return self._power(2)
 
     def __float__(self) -> float:
@@ -513,10 +515,10 @@ class _Symbol:
             "an array of floats holds numbers only: return a list"
         )
 
-    def __neg__(self) -> "_Symbol":
+    def __neg__(self) -> _Symbol:
         return _Symbol(None if self.p is None else -self.p, self.uses)
 
-    def __pos__(self) -> "_Symbol":
+    def __pos__(self) -> _Symbol:
         return self
 
 

@@ -1,5 +1,7 @@
 """`VectorField`: polynomial dynamics ẋ = f(t, x, u, w), exact, piecewise in time if need be."""
 
+from __future__ import annotations
+
 import inspect
 import re
 from collections.abc import Callable, Sequence
@@ -100,7 +102,7 @@ class VectorField:
         return ("t", *variable_names(self.n, self.m, len(self.uncertain)))
 
     @cached_property
-    def _plans(self) -> tuple["Plan", ...]:
+    def _plans(self) -> tuple[Plan, ...]:
         return tuple(Plan.of(p, self.names) for p in self.pieces)
 
     @cached_property
@@ -119,7 +121,7 @@ class VectorField:
         uncertain: ArrayLike | None = None,
         valid: ArrayLike | None = None,
         expansion: str = "",
-    ) -> "VectorField":
+    ) -> VectorField:
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
         Raises NotPolynomial naming the operation; where a function is taken, it is then expanded.
@@ -161,7 +163,7 @@ class VectorField:
         pieces = (tuple(p.over(names) for p in equations),)
         return cls(pieces, n, m, uncertain=bounds, valid=within, expansion=expansion)
 
-    def pushed(self, box: ArrayLike) -> "VectorField":
+    def pushed(self, box: ArrayLike) -> VectorField:
         """ẋ = f + w with w in `box` (n, 2) too; a row of zeros adds nothing."""
         rows = np.asarray(box, dtype=np.float64)
         if rows.shape != (self.n, 2):
@@ -178,7 +180,7 @@ class VectorField:
             uncertain=np.vstack([self.uncertain, rows[states]]),
         )
 
-    def within(self, rows: FloatArray) -> "VectorField":
+    def within(self, rows: FloatArray) -> VectorField:
         """The same equations, valid only where entries of (x, u) are within `rows` (D, 3) too."""
         if self.valid.shape[1] == 4:
             spans = range(len(self.pieces))
@@ -338,7 +340,7 @@ class VectorField:
         }
 
     @classmethod
-    def from_document(cls, document: Json, *, source: str = "vector field") -> "VectorField":
+    def from_document(cls, document: Json, *, source: str = "vector field") -> VectorField:
         """Raises DocumentError if the document is not a vector field."""
         files.header(document, FORMAT, source=source)
         n = files.member(document, "states", int, source=source)
@@ -371,7 +373,7 @@ class Plan:
     table: FloatArray
 
     @classmethod
-    def of(cls, equations: Sequence[Polynomial], names: Sequence[str]) -> "Plan":
+    def of(cls, equations: Sequence[Polynomial], names: Sequence[str]) -> Plan:
         """Make the plan for n polynomials in the variables `names`."""
         exponents, table = _table(equations, names)
         size = exponents.shape[1]

@@ -1,5 +1,7 @@
 """`identify`: a dataset in, one stable model with its proof and the comparators out."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

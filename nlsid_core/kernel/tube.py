@@ -18,6 +18,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
+from math import prod
 
 from . import text
 from .exact import Matrix, at_most, combined, definite, unit
@@ -99,14 +100,15 @@ def decide(claim: Node, proof: Node, read: Read) -> text.Verdict:
     if funnel["box"] is not None:
         assumptions.append(_inside(model, funnel["box"]))
     own = " of its own observer" if several else ""
-    shown: dict[tuple[bool, int, int], dict[str, str]] = {}
+    shown: list[Members] = []
     for i, tube in enumerate(tubes, 1):
         label = f"tube {i}" if len(tubes) > 1 else ""
-        plainness = (bool(tube["follows"]), tube["assumption"]["samples"] or 0, i)
-        shown[plainness] = _shown(model, tube, label)
+        lasts, size = tube["assumption"]["samples"] or 0, prod(tube["half_widths"])
+        plainness = (bool(tube["follows"]), lasts, size, i)
+        shown.append({**_shown(model, tube, label), "plainness": plainness})
         which = f"{label}: " if label else ""
         assumptions.append(f"{which}innovation energy{own}: {_energy(model, tube)}")
-    first, *others = (shown[plainness] for plainness in sorted(shown))
+    first, *others = sorted(shown, key=lambda words: words["plainness"])
     stay = " stays" if len(model.y) == 1 else " stay"
     said = text.say(
         SENTENCE,

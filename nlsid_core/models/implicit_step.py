@@ -1,7 +1,8 @@
 """`SingleStep`: one sample of an implicit model, for a few states at once, with little overhead.
 
 For given (x, w) every equation is a polynomial in v alone, whose coefficients are found for all
-states together; then Newton's method runs on plain numbers from the last output on.
+states together. Then Newton's method runs from the last output on: on plain numbers for a single
+equation, on arrays of all states for several.
 """
 
 import math
@@ -12,8 +13,6 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.monotone import NEWTON_STEPS, RESIDUAL
 from nlsid_core.polynomial.products import Products
-
-Monomial = list[tuple[int, int]]  # (variable, power) of each variable that occurs
 
 
 class SingleStep:
@@ -39,10 +38,11 @@ class SingleStep:
         for place, values in zip(places[len(of) :], shift.coefficients, strict=True):
             self._table[place, self._split :] += values
         self._products, self._size = Products(known), known.shape[1] + 1
-        self._monomials: list[Monomial] = [
-            [(j, e) for j, e in enumerate(row) if e] for row in powers.tolist()
-        ]
-        self._degrees = [row[0] for row in powers.tolist()] if n_v == 1 else []
+        self._degrees: list[int] = powers[:, 0].tolist()
+        # What is multiplied by h's coefficients: monomials of v, and their derivatives.
+        units = np.eye(n_v, dtype=np.int64)
+        self._in_v = Products(np.concatenate([powers, *(np.maximum(powers - e, 0) for e in units)]))
+        self._factors = np.concatenate([np.ones(len(powers)), *powers.T])
 
     def __call__(self, x: FloatArray, w: FloatArray) -> FloatArray:
         """The next states (B, n)."""
@@ -52,13 +52,15 @@ class SingleStep:
         found = self._products(known) @ self._table
         after = np.empty_like(x)
         after[:, n_v:] = found[:, self._split :]
-        equations, starts = found[:, : self._split].tolist(), x[:, :n_v].tolist()
-        for i, (row, start) in enumerate(zip(equations, starts, strict=True)):
-            v = [self._single(row, start[0])] if n_v == 1 else self._several(row, start)
-            if not all(map(math.isfinite, v)):
-                given = known[i : i + 1, :-1]
-                v = self._model.solve(given, start=x[i : i + 1, :n_v])[0].tolist()
-            after[i, :n_v] = v
+        rows = found[:, : self._split]
+        if n_v == 1:
+            pairs = zip(rows.tolist(), x[:, 0].tolist(), strict=True)
+            after[:, 0] = [self._single(row, start) for row, start in pairs]
+        else:
+            after[:, :n_v] = self._several(rows.reshape(len(x), -1, n_v), x[:, :n_v])
+        failed = ~np.isfinite(after[:, :n_v]).all(axis=1)
+        if failed.any():
+            after[failed, :n_v] = self._model.solve(known[failed, :-1], start=x[failed, :n_v])
         return after
 
     def _single(self, row: list[float], v: float) -> float:
@@ -81,60 +83,28 @@ class SingleStep:
             v -= value / slope
         return math.nan
 
-    def _several(self, row: list[float], start: list[float]) -> list[float]:
-        """The root of the n_v equations, or NaNs."""
-        p, v, before = len(start), list(start), math.inf
-        constant = row[:p] if not self._monomials[0] else [0.0] * p  # h at v = 0
-        enough = RESIDUAL * (1.0 + math.hypot(*constant))
-        for _ in range(NEWTON_STEPS):
-            values = [0.0] * p
-            slopes = [[0.0] * p for _ in range(p)]
-            for m, monomial in enumerate(self._monomials):
-                c = row[m * p : m * p + p]
-                whole = math.prod([v[j] if e == 1 else _power(v[j], e) for j, e in monomial])
-                for i in range(p):
-                    values[i] += c[i] * whole
-                for j, e in monomial:
-                    rest = [_power(v[k], d - (k == j)) for k, d in monomial]
-                    slope = e * math.prod(rest)
-                    for i in range(p):
-                        slopes[i][j] += c[i] * slope
-            error = math.hypot(*values)
-            if error <= enough:
-                return v
-            steps = _solved(slopes, values) if error < before else None
-            if steps is None:
-                break
-            before = error
-            v = [now - step for now, step in zip(v, steps, strict=True)]
-        return [math.nan] * p
-
-
-def _power(value: float, exponent: int) -> float:
-    """value**exponent for a whole exponent, infinite where it overflows."""
-    result = 1.0
-    for _ in range(exponent):
-        result *= value
-    return result
-
-
-def _solved(A: list[list[float]], b: list[float]) -> list[float] | None:
-    """x with A x = b, by elimination with the largest pivots; None if A is singular.
-
-    A and b are overwritten.
-    """
-    n = len(b)
-    for k in range(n):
-        pivot = max(range(k, n), key=lambda i: abs(A[i][k]))
-        if not abs(A[pivot][k]) > 0.0:
-            return None
-        A[k], A[pivot], b[k], b[pivot] = A[pivot], A[k], b[pivot], b[k]
-        for i in range(k + 1, n):
-            part = A[i][k] / A[k][k]
-            if part:
-                for j in range(k + 1, n):
-                    A[i][j] -= part * A[k][j]
-                b[i] -= part * b[k]
-    for k in reversed(range(n)):
-        b[k] = (b[k] - sum(A[k][j] * b[j] for j in range(k + 1, n))) / A[k][k]
-    return b
+    def _several(self, C: FloatArray, start: FloatArray) -> FloatArray:
+        """(B, n_v) roots of the equations with coefficients C (B, monomials, n_v), or NaNs."""
+        (B, count, p), v = C.shape, np.ones((len(C), C.shape[2] + 1))  # v, and 1
+        v[:, :p], before = start, np.inf
+        enough = RESIDUAL * (1.0 + float(np.abs(C[:, 0]).max()))  # the constant, if there is one
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):
+                factors = (self._in_v(v) * self._factors).reshape(B, -1, count)
+                values, slopes = (
+                    factors[:, 0, None] @ C,
+                    factors[:, 1:] @ C,
+                )  # [i, j]: of C_j in v_i
+                error = float(np.linalg.norm(values, axis=2).max())
+                if error <= enough:
+                    return v[:, :p]
+                if not error < before:
+                    break
+                try:
+                    v[:, :p] -= np.linalg.solve(slopes.swapaxes(1, 2), values.swapaxes(1, 2))[
+                        ..., 0
+                    ]
+                except np.linalg.LinAlgError:
+                    break
+                before = error
+        return np.full((B, p), np.nan)

@@ -10,7 +10,6 @@ from benchmarks.thesis.alternation import exponential_start
 from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import Simulation
 from nlsid import ContinuousTracking, Design, Nominal, VectorField, check, integrate_nominal
-from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
@@ -103,6 +102,14 @@ def volume_of(design: FunnelDesign) -> float:
     return design.funnel.volume_integral()
 
 
+def no_start_leaves(design: FunnelDesign) -> bool:
+    """Pushed at every step as is worst."""
+    run = Simulation(design.model, design.policy, design.funnel).boundary(
+        starts=500, rng=np.random.default_rng(4), adversary=True
+    )
+    return run.violations == 0 and run.max_v > 0.9
+
+
 def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_further(
     setting: Setting,
 ) -> None:
@@ -138,7 +145,7 @@ def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     )
     assert design.model.is_pushed
     assert volume_of(design) > 1.25 * volume_of(rho)
-    stays_inside(design, pushed=0.01)
+    assert no_start_leaves(design)
 
 
 @pytest.mark.slow
@@ -148,7 +155,10 @@ def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
         for s in ("rho", "P")
     )
     assert volume_of(design) > 1.1 * volume_of(rho)
-    assert stays_inside(design) > 100
+    assert no_start_leaves(design)
+    edge = design.funnel.outline(0.0, (0, 1))
+    asked = (edge - design.policy.x(0.0)) @ design.policy.K(0.0).T
+    assert np.abs(asked).max() > 0.4, "more than there is"
 
 
 @pytest.mark.slow
@@ -169,31 +179,6 @@ def test_p_stays_where_a_taylor_polynomial_is_valid() -> None:
             for entry in set(box) & {0, 1}:
                 assert box[entry][0] <= -widths[entry]
                 assert widths[entry] <= box[entry][1]
-
-
-def stays_inside(design: FunnelDesign, pushed: float = 0.0) -> int:
-    """Follow 200 starts on the boundary, pushed anew at every step; how many inputs clipped."""
-    rng, steps, clipped = np.random.default_rng(4), 400, 0
-    funnel, policy, field = design.funnel, design.policy, design.model
-    times, h = np.linspace(funnel.t[0], funnel.t[-1], steps + 1, retstep=True)
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    x = 0.9999 * np.linalg.solve(np.linalg.cholesky(funnel.shape(times[0])).T, circle).T
-    for t in times[:-1].tolist():
-        w = pushed * rng.choice([-1.0, 1.0], size=len(field.uncertain))
-
-        def rate(x: FloatArray, t: float = t, w: FloatArray = w) -> FloatArray:
-            return field(t, x, policy(t, x), w)
-
-        if len(policy.limits):
-            clipped += int((np.abs(policy(t, x)) >= policy.limits[:, 2]).sum())
-        a = rate(x)
-        b = rate(x + h / 2 * a)
-        c = rate(x + h / 2 * b)
-        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
-        P = funnel.shape(t + h)
-        assert np.einsum("bi,ij,bj->b", x, P, x).max() <= 1.0
-    return clipped
 
 
 def test_a_design_knows_how_it_was_found() -> None:

@@ -1,4 +1,4 @@
-"""How fast held inputs change in a funnel, what the search makes of it, how small its proof is."""
+"""How fast held inputs change in a funnel, and what the search makes of it."""
 
 from itertools import product
 from typing import Any
@@ -10,7 +10,6 @@ from nlsid_core.design import ContinuousTracking, FunnelDesign, design, plan_mot
 from nlsid_core.design.continuous import search
 from nlsid_core.design.continuous.held import LONGEST, SHORTEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.continuous.rates import curving_states
 from nlsid_core.dynamics import PiecewisePolynomial, VectorField
 from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -106,34 +105,7 @@ def test_more_knots_do_not_make_a_held_funnel_narrower() -> None:
     assert widths[2] > 0.97 * widths[1]
 
 
-# -- How fast inputs change in a funnel: the bounds of the search, and how small its proof is
-
-
-@pytest.mark.parametrize(
-    ("rate", "expected"),
-    [
-        (lambda x, u: [x[1] * x[1] + x[0], u[0], u[1]], ()),
-        (lambda x, u: [x[1] * x[2] * x[0], x[2] ** 3 + u[0], x[1] ** 2 + u[1]], (2,)),
-        (lambda x, u: [x[2] * u[0] * u[1], x[2] * x[1] * x[1], u[1]], (2,)),
-        (lambda x, u: [x[0] ** 3, x[1] ** 2 * u[1], u[0]], (0, 1)),
-        (lambda x, u: [u[0] * u[0] * u[1], x[0], x[1] ** 3], (0, 1, 2)),
-    ],
-)
-def test_every_cubic_term_has_a_curving_state(rate: Any, expected: tuple[int, ...]) -> None:
-    assert curving_states(VectorField.from_function(rate, 3, 2)) == expected
-
-
-def test_a_proof_of_rates_has_no_products_that_no_cubic_term_needs(held: FunnelDesign) -> None:
-    """The angle is cubic; the square of its rate is in no cubic term times anything."""
-    proof = held.proof
-    unused = proof["basis"].index([0, 2])
-    size = len(proof["basis"])
-    for piece in proof["rate_pieces"]:
-        for factor in piece["squares"]["factors"]:
-            wide = [[0] * (size - len(row)) + row for row in factor]
-            assert len(wide) < size
-            assert not any(row[unused] for row in wide)
-        assert not any(any(row[2:]) for row in piece["tau"][0]["squares"]["factors"][0])
+# -- How fast inputs change in a funnel: the bounds of the search
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 
 from nlsid import Dataset, Monitor, OutputTube, Status
 from nlsid_core.design import OutputTubeDesign, design_output_tube
-from nlsid_core.design.tube import energy
 from nlsid_core.running.alarm import State, state_of
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
@@ -43,37 +42,6 @@ def test_the_worst_disturbance_nearly_reaches_the_boundary(
         output = x[0] + innovation
         x = model.A @ x + L * innovation
     assert 0.97 < output / tube.half_widths[0] <= 1
-
-
-def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(
-    design: OutputTubeDesign,
-) -> None:
-    model, policy = design.model, design.policy
-    rng = np.random.default_rng(5)
-    monitor = make_monitor(design, Centre.PROFILE)
-    n = len(model)
-    rest = policy.u[0]
-    y_rest = (model.b.sum() * rest + model.c) / (1 - model.a.sum())
-    for k in range(n):
-        monitor.update(k * PERIOD, y_rest, rest)
-    assert policy is not None
-    plan, e = policy.plan(model), rng.standard_normal(len(policy))
-    most = max(energy(e[:, None], tube).max() / tube.level for tube in design.funnel.tubes)
-    e *= 0.9 / math.sqrt(most)
-    x = model.state_after([y_rest] * n, [rest] * n)
-    for k in range(len(policy)):
-        u = plan(k, x)
-        y = x[0] + model.D * u + model.c + e[k]
-        reading = monitor.update((n + k) * PERIOD, y, u)
-        if not model.u_range[0] <= u <= model.u_range[1]:
-            assert reading.status is Status.ASSUMPTION_VIOLATED
-            assert "outside the fitted range" in reading.reason
-            return
-        assert reading.status is Status.INSIDE, reading
-        x = model.A @ x + model.B[:, 0] * u + model.offset + policy.L * e[k]
-    over = monitor.update((n + len(policy)) * PERIOD, y, u)
-    assert over.status is Status.UNKNOWN
-    assert "the proof covers 70 samples; they are over" in over.reason
 
 
 def test_a_sensor_that_reads_60_percent_is_caught_and_named(

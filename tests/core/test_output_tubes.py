@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from bags.designs.provenance import of_funnel
 from nlsid import Dataset, Monitor, OutputTube, Status, Trajectory
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
@@ -330,20 +329,6 @@ def test_an_energy_is_over_and_the_fading_tube_lasts() -> None:
 
 
 # -- design ----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() -> None:
-    model = MODELS["linear"]()
-    made = design_output_tube(OutputTube(model, dataset(model, 0, 6)))
-    tube = made.funnel.tubes[0]
-    assert [name for name, _ in tube.measured.designed_on] == ["trial 0", "trial 2", "trial 4"]
-    assert [name for name, _ in tube.measured.measured_on] == ["trial 1", "trial 3", "trial 5"]
-    with pytest.raises(DataError, match="for the design and for the calibration"):
-        design_output_tube(OutputTube(model, dataset(model, 0, 3), dataset(model, 2, 3)))
-    single = design_output_tube(OutputTube(model, dataset(model, 0, 1, 1200)))
-    said = of_funnel(model.document(), single.funnel.document()).said[0]
-    assert "windows of one recording are hardly exchangeable" in said
 
 
 @pytest.mark.slow

@@ -136,6 +136,13 @@ def test_another_input_than_the_policys_breaks_the_assumption(run: Run) -> None:
     assert "is not the policy's" in reading.reason
 
 
+@pytest.mark.parametrize("run", ["tube"], indirect=True)
+def test_an_input_beyond_the_range_of_the_model_breaks_the_assumption(run: Run) -> None:
+    reading = run.watched(5).update(5 * run.period, run.y[5], 9.0)
+    assert reading.status is Status.ASSUMPTION_VIOLATED
+    assert "outside the fitted range" in reading.reason
+
+
 def test_parts_that_do_not_belong_together_are_refused(run: Run) -> None:
     for i, other in enumerate(run.others):
         with pytest.raises(

@@ -11,7 +11,6 @@ from benchmarks.thesis.soundness import Simulation, TrueDynamics
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
 from nlsid_core import proofs
-from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design import (
     ContinuousTracking,
     FunnelDesign,
@@ -19,12 +18,9 @@ from nlsid_core.design import (
     design_funnel,
     integrate_nominal,
 )
-from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
-from nlsid_core.design.continuous.graded import Graded, monomials_of
 from nlsid_core.dynamics import Nominal, VectorField, constant_on
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.polynomial.values import monomial_values
 from tests import funnel_problem
 from tests.core.kernel import refusals
 from tests.edits import Edit, changed, put, scaled
@@ -90,62 +86,6 @@ def test_no_start_leaves_with_the_true_sine_and_with_less_torque_some_do(
         assert run.violations == 0
     weaker = replace(design.policy, limits=np.array([[0, -LIMIT / 2, LIMIT / 2]]))
     assert Simulation(truth, weaker, design.funnel).boundary(starts=500, rng=rng).violations > 0
-
-
-def test_what_is_proved_in_a_mode_is_what_the_clipped_loop_does(design: FunnelDesign) -> None:
-    """c + Στq = dρ/ds - dW/ds where ρ = W, with V̇ of the simulated dynamics in that mode."""
-    rng = np.random.default_rng(5)
-    pieces, seen = design.found.proved.pieces, set()
-    for i in rng.permutation(len(pieces))[:60].tolist():
-        piece = pieces.select(np.array([i]))
-        s = float(rng.uniform())
-        share = (float(piece.index[0]) + s) / 2.0 ** float(piece.level[0])
-        k = int(piece.interval[0])
-        t, h = design.funnel.t[k], design.funnel.t[k + 1] - design.funnel.t[k]
-        when = float(t + share * h)
-        X = design.funnel.boundary(when, unit(rng, 40))
-        x_bar = X - design.funnel.nominal(when)
-        asked = design.policy.u(when) - x_bar @ design.policy.K(when).T
-        side = np.where(asked > LIMIT, 1, np.where(asked < -LIMIT, -1, 0))[:, 0]
-        here = side == piece.mode[0, 0]
-        if not here.any():
-            continue
-        seen.add(int(piece.mode[0, 0]))
-        w = design.model.vertices()[int(piece.vertex[0])]
-        rate = design.model(when, X, design.policy(when, X), w) - design.policy.x.derivative()(when)
-        P = (1 - share) * design.funnel.P[k] + share * design.funnel.P[k + 1]
-        P_rate = design.funnel.P[k + 1] - design.funnel.P[k]
-        growth = design.funnel.rho[k + 1] - design.funnel.rho[k]
-        W_rate = 2 * h * np.einsum("ni,ij,nj->n", x_bar, P, rate)
-        W_rate += np.einsum("ni,ij,nj->n", x_bar, P_rate, x_bar)
-        z = np.linalg.solve(piece.T[0], x_bar.T).T
-        c = value(design, piece, z, s)
-        bare = value(design, replace(piece, tau=0 * piece.tau), z, s)
-        assert bare[here] == pytest.approx((growth - W_rate)[here], rel=1e-6, abs=1e-9)
-        assert (c[here] <= bare[here] + 1e-9).all()  # τq ≥ 0 in the mode
-        assert (c > 0).all()  # and everywhere on the boundary c is what the proof says it is
-    assert seen == {-1, 0, 1}
-
-
-def value(design: FunnelDesign, piece: Pieces, z: FloatArray, s: float) -> FloatArray:
-    """c(s, z) of one piece, from the search's own expansion."""
-    return sum_of(closed_loop_polynomial(design.model, design.policy, design.funnel, piece), z, s)
-
-
-def sum_of(c: Graded, z: FloatArray, s: float) -> FloatArray:
-    total = np.zeros(len(z))
-    for q, part in c.items():
-        S = part.shape[1] - 1
-        weights = np.array([s**k * (1 - s) ** (S - k) for k in range(S + 1)])
-        rows: IntArray = monomials_of(z.shape[1], q)
-        total += monomial_values(rows, z) @ (weights @ part[0])
-    return total
-
-
-def unit(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points of the unit circle."""
-    angle = rng.uniform(0, 2 * np.pi, count)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 # -- forgeries -------------------------------------------------------------------------------

@@ -33,9 +33,6 @@ from nlsid_core.kernel.files import Rejected
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.proofs import check
 from tests import funnel_problem
-from tests.core.kernel import refusals
-from tests.edits import put
-from tests.funnel_files import FIELD, PROOF, files_of, forged_by
 from tests.funnel_problem import hanging, satellite
 from tests.verbs import nlsid
 
@@ -103,36 +100,6 @@ def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
         )
         > 0
     )
-
-
-def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_valid(
-    tmp_path: Path,
-) -> None:
-    def pushed(x: Any, u: Any, w: Any) -> Any:
-        return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
-
-    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
-    valid: list[list[float]] = [[0, -0.2, 0.2], [2, -9, 9]]
-    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
-    _, nominal = hanging(21)
-    design = design_funnel(ContinuousTracking(field, nominal, goal=30 * np.eye(2)))
-    assert design.found.proved.pieces.kappa is not None
-    assert not design.found.proved.pieces.vertex.any()
-    proof = design.save(tmp_path)[-1]
-    verdict = check(proof)
-    assert verdict.margin > 0
-    assert "u0 in [-9, 9]" in verdict.statement
-    assert "saturation" not in " ".join(verdict.assumptions)
-    for t in design.funnel.t:
-        assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
-    rng = np.random.default_rng(4)
-    run = Simulation(field, design.policy, design.funnel).boundary(starts=2000, rng=rng)
-    assert run.violations == 0
-    for change, reason in (
-        (put(f"{FIELD} valid", [[0, -0.1, 0.1]]), "not_valid"),
-        (put(f"{PROOF} proof kappa 1 1", -1.0), "not_below"),
-    ):
-        refusals.refused_with_fresh_digests(forged_by(change, files_of(design)), reason)
 
 
 @pytest.mark.slow

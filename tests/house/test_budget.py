@@ -12,10 +12,10 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_865,
-    ("bags",): 11_495,
+    ("nlsid_core",): 17_800,
+    ("bags",): 11_515,
     ("nlsid_ros",): 2_599,
-    ("tests",): 21_502,
+    ("tests",): 21_208,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8

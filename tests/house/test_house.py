@@ -1,11 +1,13 @@
 """What every public name owes its reader, and what the project's files have to agree on."""
 
 import ast
+import pydoc
 import re
 import tomllib
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
+import nlsid
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, sources
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -95,6 +97,11 @@ def test_every_public_signature_says_what_it_takes() -> None:
             ):
                 hidden.append(name)
     assert not hidden
+
+
+def test_help_shows_types_as_they_are_written() -> None:
+    public = [getattr(nlsid, name) for name in nlsid.__all__]
+    assert not [each for each in public if "numpy._typing" in pydoc.render_doc(each)]
 
 
 def test_every_folder_of_modules_is_a_package_and_so_gets_installed() -> None:

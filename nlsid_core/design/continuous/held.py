@@ -22,7 +22,7 @@ from nlsid_core.design.continuous.pieces import (
     substitution,
     unsolved,
 )
-from nlsid_core.design.continuous.rates import curving_states, frames_of, least_rates, used_of
+from nlsid_core.design.continuous.rates import frames_of, least_rates
 from nlsid_core.design.continuous.witnesses import rate_documents, stated_multipliers
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible, OptionError
@@ -137,7 +137,7 @@ class Changes:
         corners = corners_of([not pushes for pushes in _pushing(field, 1 + field.n, field.m)])
         chosen, count = (corners > 0).astype(int), len(corners)
         signs = _signs(chosen)
-        unit, curving = np.ones((K, field.m)), curving_states(field)
+        unit, curving = np.ones((K, field.m)), steps.multiplied
         found: tuple[list[list[FloatArray]], list[list[FloatArray]]] = ([], [])
         rows = []
         intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
@@ -226,15 +226,15 @@ def prove_rates(
     Raises Infeasible if a rate is not shown on some part of time.
     """
     waiting = [Part(k, 0, 0) for k in range(len(rates))]
-    used, widths = used_of(basis, curving_states(steps.field)), steps.widths
+    widths = steps.widths
     assert widths is not None  # a search for a hold sets them first
     found: list[Json] = []
     while waiting:
         written: dict[Part, list[Json | None]] = {}
-        for batch in _batches(steps, waiting, basis[used], widths):
+        for batch in _batches(steps, waiting, basis, widths):
             of = _witnessed(steps, funnel, batch, rates)
             c = rate_polynomial(steps.field, steps.policy, funnel, of, of.room(rates, widths))
-            rows = rate_documents(funnel, of.pieces, c, basis, used)
+            rows = rate_documents(funnel, of.pieces, c)
             places = zip(of.entry.tolist(), of.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
                 place = of.pieces.interval, of.pieces.level, of.pieces.index
@@ -328,7 +328,7 @@ def _at_end(
     steps: LSteps, funnel: ContinuousFunnel, of: InputRates, end: int
 ) -> tuple[list[FloatArray], FloatArray]:
     """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and z by x̄, (B, n, n)."""
-    pieces, n, curving = of.pieces, funnel.n, curving_states(steps.field)
+    pieces, n, curving = of.pieces, funnel.n, steps.multiplied
     T, inverse = frames_of(funnel, pieces.interval, _ends(pieces)[end], curving)
     framed = replace(of, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)))
     c = rate_polynomial(steps.field, steps.policy, funnel, framed, np.zeros(len(pieces)), end)
@@ -344,7 +344,7 @@ def _witnessed(
     rates: FloatArray,
 ) -> InputRates:
     """The rates with τ as a proof states it, and Gram matrices in x̄ at both ends."""
-    pieces, k, curving = of.pieces, of.pieces.interval, curving_states(steps.field)
+    pieces, k, curving = of.pieces, of.pieces.interval, steps.multiplied
     tau, gram = pieces.tau.copy(), pieces.gram.copy()
     assert steps.widths is not None  # as in `prove_rates`
     room = np.diff(funnel.t)[k] * of.room(rates, steps.widths)

@@ -6,6 +6,8 @@ Source: Hargraves and Paris, "Direct trajectory optimization using nonlinear pro
 collocation", 1987; Mao, Szmuk and Açıkmeşe, "Successive convexification", 2016.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,5 +1,7 @@
 """`ContinuousTracking`: what a funnel of given equations is asked for, and the goal it ends in."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -25,7 +27,7 @@ class Goal:
     P: FloatArray
 
     @classmethod
-    def start_of(cls, funnel: ContinuousFunnel) -> "Goal":
+    def start_of(cls, funnel: ContinuousFunnel) -> Goal:
         """A little less than where `funnel` starts, so that the two compose."""
         P = START_ROOM * funnel.P[0] / funnel.rho[0]
         return cls(funnel.x.ends()[0], np.asarray((P + P.T) / 2))

@@ -1,45 +1,25 @@
 """How fast an input changes in a funnel at one instant: a bound, and the Gram matrix that shows it.
 
-At an instant a rate is p(z) of degree 3 in |z| ≤ 1. Each of its cubic terms has a factor among a
-few of the states: z_y, the curving ones. With C its cubic part written on products z_a z_y,
+At an instant a rate is p(z) of degree 3 in |z| ≤ 1. Each of its cubic terms has a factor among the
+states with which the L-steps' basis has products: z_y, the curving ones. With C its cubic part
+written on products z_a z_y,
     r - p - (λ₀ + λ₁|z_y|²)(1 - |z|²)
-is a sum of squares of 1, z and these products if r is large enough: no other products are needed.
+is a sum of squares of 1, z and these products if r is large enough: of the basis of the proof.
 Source: docs/theory-funnels.md, "The hold between samples".
 """
 
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.lstep import coordinates
-from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
 
 QUARTICS = (0.03, 0.1, 0.3, 1.0, 3.0)  # λ₁ over the cubic part's size
 LEAST_QUARTIC = 1e-3  # of the linear part's size
 NEWTONS = 6  # for a multiplier: any will do, and six are at the best one
-
-
-def curving_states(field: VectorField) -> tuple[int, ...]:
-    """Few states, such that every term of degree 3 in x and u has one of them; if none can, all."""
-    first, last = 1 + field.n, 1 + field.n + field.m
-    rows = np.concatenate([p.exponents for p in chain.from_iterable(field.pieces)])
-    left = rows[rows[:, 1:last].sum(axis=1) > 2, 1:first] > 0
-    if not left.any(axis=1).all():
-        return tuple(range(field.n))
-    found: set[int] = set()
-    while len(left):
-        found.add(int(np.argmax(left.sum(axis=0))))
-        left = left[~left[:, sorted(found)].any(axis=1)]
-    return tuple(sorted(found))
-
-
-def used_of(basis: IntArray, curving: tuple[int, ...]) -> IntArray:
-    """The rows of a basis (k, n) that a rate needs: 1, each state, products with a curving one."""
-    return np.flatnonzero((basis.sum(axis=1) < 2) | basis[:, list(curving)].any(axis=1))
 
 
 def frames_of(
@@ -78,7 +58,7 @@ class Shown:
     products: IntArray
 
     def gram(self, basis: IntArray) -> FloatArray:
-        """(B, k, k) in the basis that `used_of` leaves; for r = 0: its constant is r more."""
+        """(B, k, k) in 1, z and these products; for r = 0: its constant is r more."""
         p0, p1, p2, C = self.polynomials
         count, n = p1.shape
         gram = np.zeros((count, len(basis), len(basis)))
@@ -102,7 +82,7 @@ def least_rates(p: list[FloatArray], curving: tuple[int, ...]) -> Shown:
     p0, count, n = p[0][:, 0], len(p[0]), p[1].shape[1]
     linear = p[1][:, positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))]
     quadratic, cubic = monomials_of(n, 2), monomials_of(n, 3)
-    products = quadratic[used_of(quadratic, curving)]
+    products = quadratic[quadratic[:, list(curving)].any(axis=1)]
     i, j = (np.array([np.repeat(np.arange(n), row)[side] for row in quadratic]) for side in (0, 1))
     Q = np.zeros((count, n, n))
     Q[:, i, j] += p[2] / 2

@@ -3,6 +3,8 @@
 Source: thesis Section 6.1, (6.2).
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.witness import Scale, multiplier, products_of, witness
+from nlsid_core.sos.witness import Scale, multiplier, witness
 
 SHARE = 0.5  # of what the constant can lose that becomes the margin
 FIT = 0.4  # of the least eigenvalue of the scaled Gram matrices: how well factors have to fit
@@ -130,66 +130,16 @@ def documents(
     return [_written(pieces, curves, b) for b in range(len(pieces))]
 
 
-def rate_documents(
-    funnel: ContinuousFunnel, pieces: Pieces, c: Graded, basis: IntArray, used: IntArray
-) -> list[Json | None]:
-    """The rate pieces as the kernel reads them; None where one is not shown to be positive.
-
-    basis: (k, n) of the proof, of which `used` are those of the pieces.
-    """
+def rate_documents(funnel: ContinuousFunnel, pieces: Pieces, c: Graded) -> list[Json | None]:
+    """The rate pieces as the kernel reads them; None where one is not shown to be positive."""
     curves = _Curves.of(funnel, pieces, c)
-    lowest = curves.lowest()
     found: list[Json | None] = []
-    for b in range(len(pieces)):
+    for b, lowest in enumerate(curves.lowest().tolist()):
         try:
-            row = _written(pieces, curves, b) if lowest[b] > 0 else None
+            found.append(_written(pieces, curves, b) if lowest > 0 else None)
         except Infeasible:
-            row = None
-        if row is not None and len(used) < len(basis):
-            row = among(row, used, unused_columns(basis, used, row["columns"]))
-        found.append(row)
+            found.append(None)
     return found
-
-
-def among(stated: Json, used: IntArray, columns: Sequence[int]) -> Json:
-    """A witness in `used` of a basis as one in all of it; columns: (k,) of those not used."""
-    size, places, squares = len(columns), used.tolist(), stated["squares"]
-    every = list(columns)
-    for place, column in zip(places, stated["columns"], strict=True):
-        every[place] = column
-    factors = []
-    for factor in squares["factors"]:
-        rows = []
-        for row in factor:
-            wide: list[int | str] = [0] * size
-            for place, entry in zip(places[-len(row) :], row, strict=True):
-                wide[place] = entry
-            rows.append(wide[places[-len(row)] :])
-        factors.append(rows)
-    return stated | {"columns": every, "squares": squares | {"factors": factors}}
-
-
-def unused_columns(basis: IntArray, used: IntArray, columns: Sequence[int]) -> list[int]:
-    """(k,) so low that no pair with a monomial that is not used is charged for a product.
-
-    The kernel charges the pair with the largest columns. No square of a monomial that is not used
-    is a product of two that are.
-    """
-    every = np.zeros(len(basis), dtype=np.int64)
-    every[used] = columns
-    product, square = products_of(basis)
-    i, j = np.triu_indices(len(used), 1)
-    none = np.iinfo(np.int64).max // 2
-    best = np.full(len(square), -none)
-    np.maximum.at(best, product[used[i], used[j]], every[used[i]] + every[used[j]])
-    best[(best == -none) | (square >= 0)] = none
-    rest = np.setdiff1d(np.arange(len(basis)), used)
-    known = used
-    for u in rest.tolist():
-        room = (best[product[u, known]] - every[known]).min() - 1
-        every[u] = min(int(room), max(columns))
-        known = np.append(known, u)
-    return every.tolist()
 
 
 def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:

@@ -100,54 +100,6 @@ def claimed_at(documents: dict[str, Json], proof: Json, chain: str, k: int, y: V
     return value - size2(times(S_next, explicit_next(model, policy, k, deviation)))
 
 
-def refuted(documents: dict[str, Json]) -> str:
-    """What a claim about one state says and a grid of states shows to be false; empty if nothing.
-
-    Every obligation of the specification is tried at states and disturbances on a grid that
-    includes the ends of the intervals, where a linear step is at its worst.
-    """
-    model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    bound = Fraction(funnel["assumption"]["bound"])
-    S = [Fraction(s[0][0]) for s in funnel["S"]]
-    grid = [Fraction(i, 2) for i in range(-2, 3)]
-    for k, size in enumerate(S):
-        for chain in ("tube", "inlet"):
-            radius = Fraction(funnel[chain][k])
-            for part in grid:
-                deviation = [part * (radius + bound) / abs(size)]
-                if found := _outside(model, policy, k, deviation, last=k == len(S) - 1):
-                    return found
-                width = Fraction(funnel["half_widths"][k][0])
-                if chain == "tube" and abs(deviation[0]) > width:
-                    return "half-width"
-            if k == len(S) - 1:
-                continue
-            following, A = Fraction(funnel[chain][k + 1]), Fraction(funnel["A"][k][0][0])
-            for part in grid:
-                xi = part * radius / abs(size)
-                (start,) = explicit_next(model, policy, k, [xi])
-                if abs(S[k + 1] * start) > following:
-                    return "reach"
-                for push in grid:
-                    w = push * bound / abs(size)
-                    (after,) = explicit_next(model, policy, k, [xi + w])
-                    if abs(S[k + 1] * (after - A * w)) > following:
-                        return "response"
-    return ""
-
-
-def _outside(model: Json, policy: Json, k: int, deviation: Vector, *, last: bool) -> str:
-    """Which signal leaves the box of the data."""
-    x = plus(numbers(policy["x"][k]), deviation)
-    values = [(x[0], model["x_range"][0])]
-    if not last:
-        values.append((policy_input(policy, k, deviation)[0], model["u_range"][0]))
-    for value, (low, high) in values:
-        if not Fraction(low) <= value <= Fraction(high):
-            return "box"
-    return ""
-
-
 def agrees(document: Json, about: Mapping[str, Json]) -> bool:
     """Whether a proof document about these files proves its claim."""
     try:

@@ -12,15 +12,16 @@ from nlsid_core.kernel import Rejected
 from tests.core.kernel import mutations, oracle_composition
 from tests.core.kernel.mutations import CORPUS, ORACLES, PROOF, Case, corpus
 from tests.core.kernel.refusals import refused
-from tests.edits import put, without
+from tests.edits import Edit, put, without
 from tests.funnel_files import forged_by
 
 CASES = pytest.mark.parametrize("case", corpus(), ids=lambda case: f"{case.kind}/{case.name}")
 LEFT = CORPUS.parent / "left"
-FALSE = {  # a claim that is false, by one number of it: part, path, value
-    "stable_set/linear": ("delta", 10.0),
-    "stability/linear": ("rate", 0.6),  # the slowest pole is at 0.68
-    "stability/cascade": ("rate", 0.7071),  # the slowest pole is at √½
+FALSE: dict[str, Edit] = {  # a claim that is false, by one number of it
+    "stable_set/linear": put("claim delta", 10.0),
+    "stability/linear": put("claim rate", 0.6),  # the slowest pole is at 0.68
+    "stability/cascade": put("claim rate", 0.7071),  # the slowest pole is at √½
+    "continuous_funnel/pushed": put("proof kappa 1 1", -1.0),
 }
 
 
@@ -79,8 +80,7 @@ def test_a_proof_without_a_member_or_about_files_elsewhere_is_malformed(case: Ca
 def test_a_false_neighbour_is_refused(name: str) -> None:
     found = [case for case in corpus() if f"{case.kind}/{case.name}" == name]
     forged = found[0].copied()
-    member, value = FALSE[name]
-    forged.document["claim"][member] = value
+    FALSE[name](forged.document)
     assert mutations.decide(forged) == "rejected"
     assert not ORACLES[forged.kind](forged.document, forged.about)
 

@@ -132,22 +132,6 @@ def test_a_start_at_the_plans_and_played_inputs_are_said_in_those_words(
     assert verdict.statement.endswith("with those inputs played (no feedback)")
 
 
-@pytest.mark.parametrize("engaged", [0, 1])
-def test_the_half_width_bounds_the_output_in_the_tube(
-    design: OutputTubeDesign, engaged: int
-) -> None:
-    model, policy, rng = design.model, design.policy, np.random.default_rng(0)
-    assert policy is not None
-    c = model.C[0] - engaged * model.D * policy.K
-    for tube in design.funnel.tubes:
-        root = np.linalg.cholesky(np.linalg.inv(tube.rho * tube.P))
-        direction = rng.standard_normal((20_000, len(model) + 1))
-        most = tube.level + tube.rho * tube.inlet
-        direction *= np.sqrt(most) / np.linalg.norm(direction, axis=1, keepdims=True)
-        outputs = direction[:, :-1] @ root.T @ c + direction[:, -1]
-        assert np.abs(outputs).max() <= tube.half_widths[0]
-
-
 def trials(*digests: str) -> list[Json]:
     """Of recordings that are named by a letter, before a window if there is one."""
     return [
