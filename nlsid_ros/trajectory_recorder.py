@@ -149,7 +149,7 @@ class TrajectoryRecorder(ManagedNode):
         values = self.values
         name = values.bag or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S")
         path = Path(name if not (values.bag and self._bags) else f"{name}_{self._bags + 1}")
-        writer = BagWriter(path, in_place=True)
+        writer = BagWriter(path)
         self._bags += 1
         self._ended = ""
         self._recording = Recording(writer, least_free=values.least_free)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from bags.chain.config import Config
     from bags.fleet.monitor import FleetVerdict
-    from bags.fleet.rows import Row, Rows
+    from bags.fleet.rows import Row
     from bags.fleet.run import Task
     from bags.fleet.trials import FleetTrials
 
@@ -64,7 +64,7 @@ class Fleet(Sharing):
         typer.Option("--out", help="A .parquet file with a row for every bag, and all findings."),
     ] = None
 
-    def read(self, task: Task, bags: Mapping[str, Path], doing: str) -> Rows:
+    def read(self, task: Task, bags: Mapping[str, Path], doing: str) -> tuple[Row, ...]:
         """A row of each bag; they are written, if they are to be."""
         from bags.fleet.rows import read_rows, write_parquet
 
@@ -73,7 +73,7 @@ class Fleet(Sharing):
                 task, bags, workers=self.workers(), manifest=self.manifest, progress=progress
             )
         if self.table is not None:
-            write_parquet(found.rows, self.table)
+            write_parquet(found, self.table)
             out.print(f"wrote {self.table}", soft_wrap=True)
         return found
 
@@ -99,9 +99,9 @@ def check(
     named = named_bags(bags, patience=fleet.patience)
     _say_misspelt(named, settings)
     found = fleet.read(CheckBag(settings), named, "checking")
-    counts = Counter(row.verdict for row in found.rows)
+    counts = Counter(row.verdict for row in found)
     _say_counts(found, fleet.manifest, [(counts[v], v) for v in SERIOUS])
-    wrong = [row for verdict in SERIOUS[:-1] for row in found.rows if row.verdict == verdict]
+    wrong = [row for verdict in SERIOUS[:-1] for row in found if row.verdict == verdict]
     if wrong:
         lost = {"lost": lambda row: _number(row, "lost", ".0f")}
         out.print(
@@ -119,7 +119,7 @@ def check(
         left = Counter(row.verdict for row in more)
         said = ", ".join(f"{count} {verdict}" for verdict, count in left.items())
         out.print(f"and {len(more)} more ({said}); --out writes all of them")
-    usable = [row for row in found.rows if row.verdict in (LOOK, GOOD)]
+    usable = [row for row in found if row.verdict in (LOOK, GOOD)]
     if usable and not any(row.numbers["moves"] for row in usable):
         out.print(
             "no command moves in any bag that can be used: there is little to identify from",
@@ -167,7 +167,7 @@ def monitor(
     if settings is not None:
         _say_misspelt(named, settings)
     read = fleet.read(task, named, "judging")
-    found = FleetVerdict(read.rows, frozenset(design.made_with))
+    found = FleetVerdict(read, frozenset(design.made_with))
     counts = Counter(row.verdict for row in found.rows)
     _say_counts(read, fleet.manifest, [(counts[v], v) for v in _VERDICTS if counts[v]])
     _say_verdicts(found)
@@ -283,9 +283,11 @@ def _since(row: Row) -> str:
     return f"from {row.numbers['bad_at']:.3f} s on: {row.reason}"
 
 
-def _say_counts(read: Rows, manifest: Path | None, counts: Sequence[tuple[int, str]]) -> None:
+def _say_counts(
+    rows: Sequence[Row], manifest: Path | None, counts: Sequence[tuple[int, str]]
+) -> None:
     """How many there are of each verdict, and how many were known from a run before."""
-    count, known = len(read.rows), read.known
+    count, known = len(rows), sum(row.known for row in rows)
     said = ", ".join(f"{n} {'copies' if word == 'copy' and n != 1 else word}" for n, word in counts)
     out.print(f"{counted(count, 'bag')}: {said}", soft_wrap=True, highlight=False)
     if manifest is not None:

@@ -3,7 +3,7 @@
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,7 +22,8 @@ class Row:
 
     reason: why it is not good, or not inside. start: the bag's
     first log time, ISO 8601 in UTC, empty if unknown. marks: a second copy of the recording has one
-    of them too. said: what else is to be known, in words. numbers: those that are known.
+    of them too. said: what else is to be known, in words. numbers: those that are known. known: the
+    bag was asked of before.
     """
 
     bag: str
@@ -32,6 +33,7 @@ class Row:
     marks: tuple[str, ...] = ()
     said: Mapping[str, str] = field(default_factory=dict)
     numbers: Mapping[str, float] = field(default_factory=dict)
+    known: bool = False
 
     @classmethod
     def read(cls, content: bytes) -> "Row":
@@ -50,14 +52,6 @@ class Row:
         return {**named, **self.said, **self.numbers}
 
 
-@dataclass(frozen=True)
-class Rows:
-    """A row a bag, in order; known: how many were in the manifest before."""
-
-    rows: tuple[Row, ...]
-    known: int = 0
-
-
 def read_rows(
     task: Task,
     bags: Mapping[str, Path],
@@ -65,23 +59,21 @@ def read_rows(
     workers: Workers,
     manifest: Path | None = None,
     progress: Progress = silent,
-) -> Rows:
+) -> tuple[Row, ...]:
     """Ask of each bag; one that cannot be read is `not read`, a second of a recording a `copy`."""
     recordings = Recordings()
     rows: list[Row] = []
-    known = 0
     with Manifest(manifest) as kept:
         for answer in ask(task, bags, workers, kept, progress=progress):
-            known += answer.kept
             if answer.reason:
                 row = Row(answer.name, UNREAD, answer.reason)
             else:
-                row = Row.read(answer.content)
+                row = replace(Row.read(answer.content), known=answer.kept)
             first = recordings.first(row.bag, row.marks)
             if first != row.bag:
-                row = Row(row.bag, COPY, same_as(first), start=row.start)
+                row = Row(row.bag, COPY, same_as(first), start=row.start, known=row.known)
             rows.append(row)
-    return Rows(tuple(rows), known)
+    return tuple(rows)
 
 
 def iso(stamp_ns: int) -> str:

@@ -13,15 +13,13 @@ from concurrent.futures import (
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Protocol
 
 from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
-
-DEATHS: Final = 3  # of the worker that reads a bag; from the second time on, of that bag alone
 
 
 class Task(Protocol):
@@ -66,8 +64,8 @@ def ask(
     DataError if the workers are gone for good; what was answered by then is in the manifest.
     """
     answers: dict[str, Answer] = {}
+    asked: dict[str, tuple[Path, str]] = {}
     keys: dict[str, str] = {}
-    fresh: deque[str] = deque()
     for name, bag in bags.items():
         try:
             keys[name] = key_of(bag, name, task.asked)
@@ -77,10 +75,9 @@ def ask(
         if keys[name] in manifest:
             answers[name] = Answer(bag, name, kept=True)
         else:
-            fresh.append(name)
+            asked[name] = bag, keys[name]
     if known := sum(answer.kept for answer in answers.values()):
         progress(f"{known} of {len(bags)} bags are known", len(answers) / len(bags))
-    asked = {name: (bags[name], keys[name]) for name in fresh}
     with closing(_asked(task, asked, workers)) as given:
         for answer in given:
             if not answer.reason:
@@ -95,25 +92,36 @@ def ask(
 def _asked(
     task: Task, bags: Mapping[str, tuple[Path, str]], workers: Workers
 ) -> Generator[Answer, None, None]:
-    """An answer for each bag (where it is, its key), as they come."""
-    if not bags:
-        return
-    waiting, suspects = deque(bags), deque[str]()
-    deaths = dict.fromkeys(bags, 0)
+    """An answer for each bag (where it is, its key), as they come.
+
+    Those that were read when a worker died are asked of again, each alone.
+    """
+    died: list[str] = []
+    if bags:
+        yield from _answers(task, bags, workers, died)
+    for name in died:
+        again: list[str] = []
+        yield from _answers(task, {name: bags[name]}, workers, again)
+        if again:
+            yield Answer(bags[name][0], name, reason="its worker died twice")
+
+
+def _answers(
+    task: Task, bags: Mapping[str, tuple[Path, str]], workers: Workers, died: list[str]
+) -> Generator[Answer, None, None]:
+    """The same; died: gets the bags that were read when a worker died."""
+    waiting = deque(bags)
     executor = workers.open()
     running: dict[Future[Answer], str] = {}
     try:
-        while waiting or suspects or running:
-            while suspects and not running:
-                name = suspects.popleft()
-                running[_submitted(executor, task, *bags[name], name)] = name
-            while waiting and not suspects and len(running) < workers.window:
+        while waiting or running:
+            while waiting and len(running) < workers.window:
                 name = waiting.popleft()
                 running[_submitted(executor, task, *bags[name], name)] = name
                 if next(reversed(running)).done():
                     break  # in this process: said at once
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            died = []
+            before = len(died)
             for future in done:
                 name = running.pop(future)
                 error = _error(future)
@@ -123,19 +131,11 @@ def _asked(
                     died.append(name)
                 else:
                     yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
-            if not died:
-                continue
-
-            died += running.values()
-            running.clear()
-            workers.close(executor)
-            executor = workers.open()
-            for name in died:
-                deaths[name] += 1
-                if deaths[name] < DEATHS:
-                    suspects.append(name)
-                else:
-                    yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
+            if len(died) > before:
+                died += running.values()
+                running.clear()
+                workers.close(executor)
+                executor = workers.open()
     finally:
         workers.close(executor)
 

@@ -48,7 +48,6 @@ from bags.recordings.mcap_records import (
     RECORD,
     Block,
     Contents,
-    counted,
     index_offsets,
     index_times,
     messages_at,
@@ -116,7 +115,7 @@ class McapFile:
         self._size = self.path.stat().st_size
         self._stream: BinaryIO | None = None
         self._fetching: Fetching | None = None
-        self._total: int | None = None  # messages, as the statistics state
+        self._statistics: Statistics | None = None  # of a file that is walked
         try:
             if not isinstance(self.path, RemotePath):
                 self._stream = self.path.open("rb", buffering=0)
@@ -343,9 +342,7 @@ class McapFile:
         elif opcode == Opcode.ATTACHMENT:
             found.attachments.append((content, length))
         elif opcode == Opcode.STATISTICS:
-            statistics = self._parse(Statistics.read, content, length)
-            found.stated = counted(statistics)
-            self._total = statistics.message_count
+            self._statistics = statistics = self._parse(Statistics.read, content, length)
             found.lost += [
                 f"it has {there} {what}, its statistics say {said}"
                 for what, said, there in (
@@ -417,19 +414,22 @@ class McapFile:
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""
-        there = sum(self.contents.counts.values())
-        if self.contents.stated is None and self._total == there:
-            self.contents.stated = dict(self.contents.counts)
-        elif self.contents.stated is None and self._total is not None:
-            what = f"it has {there} messages, its statistics say {self._total}"
+        if self._statistics is None:
+            return
+        found, total = self.contents, self._statistics.message_count
+        stated = dict(self._statistics.channel_message_counts)
+        there = sum(found.counts.values())
+        if not stated and total not in (0, there):  # some writers state only how many there are
+            what = f"it has {there} messages, its statistics say {total}"
             if not self._salvage:
                 raise BagError(what)
-            self.contents.lost.append(what)
-        stated = self.contents.stated
-        if stated is None or self.contents.ending is not None or self._salvage:
+            found.lost.append(what)
             return
-        for channel, count in stated.items():
-            there = self.contents.counts.get(channel, 0)
+        found.stated = stated if stated or not total else dict(found.counts)
+        if found.ending is not None or self._salvage:
+            return
+        for channel, count in found.stated.items():
+            there = found.counts.get(channel, 0)
             if there != count:
                 raise BagError(
                     f"channel {channel} has {there} messages, the file's statistics say {count}"

@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema, Statistics
+from mcap.records import Channel, Metadata, Schema
 
 from bags.recordings.batch import Batch, Buffer
 from nlsid_core.arrays import IntArray
@@ -239,12 +239,6 @@ def index_offsets(record: bytes, channel: int, where: str) -> IntArray:
 def index_times(record: bytes, channel: int, where: str) -> IntArray:
     """Read their log times in ns."""
     return _time(index_entries(record, channel, where)["log"], where)
-
-
-def counted(statistics: Statistics) -> dict[int, int] | None:
-    """Messages of each channel; None of a writer that states only how many there are in all."""
-    counts = dict(statistics.channel_message_counts)
-    return counts if counts or not statistics.message_count else None
 
 
 def parse(read: Callable[[Any], Record], content: bytes) -> Record:

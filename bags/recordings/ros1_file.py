@@ -61,11 +61,7 @@ class Ros1File:
         if not block.has(channels):
             return
         content = self._unpacked(block)
-        found: dict[int, list[tuple[int, int, int]]] = {}
-        for fields, start, end in _records(BytesIO(content), len(content)):
-            if fields.get_uint8("op") == MESSAGE:
-                place = start, end - start, fields.get_time("time")
-                found.setdefault(fields.get_uint32("conn"), []).append(place)
+        found = self._messages(content)
         counts = {number: len(places) for number, places in found.items()}
         if counts != {number: count for number, (_, count) in (block.index or {}).items() if count}:
             raise BagError(f"the chunk at byte {block.offset} does not hold what its index says")
@@ -164,18 +160,21 @@ class Ros1File:
             found.lost.append(f"{found.counts.pop(number)} messages of unknown connection {number}")
 
     def _indexed(self, block: Block) -> Block:
-        counts: dict[int, int] = {}
-        times = []
-        content = self._unpacked(block)
+        found = self._messages(self._unpacked(block))
+        times = [log_ns for places in found.values() for *_, log_ns in places]
+        index = {number: (0, len(places)) for number, places in found.items()}
+        return replace(block, start_ns=min(times, default=0), index=index)
+
+    def _messages(self, content: bytes) -> dict[int, list[tuple[int, int, int]]]:
+        """(start, bytes, log time in ns) of each connection's messages; notes who is declared."""
+        found: dict[int, list[tuple[int, int, int]]] = {}
         for fields, start, end in _records(BytesIO(content), len(content)):
             if fields.get_uint8("op") == CONNECTION:
                 self._add_connection(fields, content[start:end])
             elif fields.get_uint8("op") == MESSAGE:
-                times.append(fields.get_time("time"))
-                number = fields.get_uint32("conn")
-                counts[number] = counts.get(number, 0) + 1
-        index = {number: (0, count) for number, count in counts.items()}
-        return replace(block, start_ns=min(times, default=0), index=index)
+                place = start, end - start, fields.get_time("time")
+                found.setdefault(fields.get_uint32("conn"), []).append(place)
+        return found
 
     def _unpacked(self, block: Block) -> bytes:
         where, size = f"the chunk at byte {block.offset}", block.uncompressed_size

@@ -11,7 +11,6 @@ import fcntl
 import os
 import shutil
 import struct
-import tempfile
 import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -109,11 +108,10 @@ class Output:
 class BagWriter:
     """A bag being written: NAME/NAME.mcap in compressed chunks, and NAME/metadata.yaml.
 
-    Normally everything is written to a temporary folder beside `path`, which gets its name when
-    the bag is closed; leaving a `with` block by an exception removes it. With `in_place=True` the
-    bag grows under its own name and whatever happens stays readable: a recorder that is killed, or
+    It grows under its own name, and whatever happens stays readable: a recorder that is killed, or
     whose disk is full, loses only the messages after the last closed chunk (it has no metadata.yaml
-    then). A killed process loses nothing of a closed chunk; a power cut may.
+    then). A killed process loses nothing of a closed chunk; a power cut may. Leaving a `with` block
+    by an exception removes the bag.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
     from a timer, limits what a kill loses. `mcap` takes what is copied as it is.
@@ -126,7 +124,6 @@ class BagWriter:
         path: Path | str,
         *,
         custom: Mapping[str, str] | None = None,
-        in_place: bool = False,
         compression: str = "zstd",
     ) -> None:
         self.path = Path(path)
@@ -135,25 +132,16 @@ class BagWriter:
         self._copies: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, tuple[str, bytes]], int] = {}
         self._custom: dict[str, str] = {}
-        self._in_place = in_place
         if compression not in PACKING:
             raise BagError(f"no compression '{compression}'; there are: {', '.join(PACKING)}")
         refuse_existing(self.path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        if in_place:
-            self._folder = self.path
-            self._folder.mkdir()
-        else:
-            self._folder = Path(
-                tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}.")
-            )
-            self._folder.chmod(0o755)
+        self.path.mkdir(parents=True)
         try:
-            self._output = Output(self._folder / f"{self.path.name}.mcap")
+            self._output = Output(self.path / f"{self.path.name}.mcap")
             self.mcap = McapWriter(self._output, compression)
             self.annotate(custom or {})
         except BaseException:
-            shutil.rmtree(self._folder)
+            shutil.rmtree(self.path)
             raise
 
     @property
@@ -262,10 +250,10 @@ class BagWriter:
         self._output.refuse_loss()
 
     def close(self) -> None:
-        """Finish the file, write metadata.yaml, give the folder its name; once.
+        """Finish the file and write metadata.yaml; once.
 
-        Where that fails (a full disk), a bag in place stays what a killed
-        recorder leaves: unfinished, all its closed chunks readable.
+        Where that fails (a full disk), the bag stays what a killed recorder leaves: unfinished, all
+        its closed chunks readable.
         """
         if self._output.closed:
             return
@@ -274,7 +262,7 @@ class BagWriter:
             self._output.sync()
             self._output.close()
             _write_metadata(
-                self._folder,
+                self.path,
                 f"{self.path.name}.mcap",
                 self._topics.values(),
                 self.counts,
@@ -284,16 +272,6 @@ class BagWriter:
         except OSError:
             self.abandon()
             raise
-        if not self._in_place:
-            if self.path.exists():  # rename would replace an empty folder
-                self.discard()
-                raise BagError(f"{self.path} appeared while the bag was written; not replaced")
-            self._folder.rename(self.path)
-
-    def discard(self) -> None:
-        """Remove what was written."""
-        self.abandon()
-        shutil.rmtree(self._folder)
 
     def abandon(self) -> None:
         """Let go of the file as it is: what a killed recorder leaves."""
@@ -308,10 +286,11 @@ class BagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is None or self._in_place:
+        if kind is None:
             self.close()
-        else:
-            self.discard()
+            return
+        self.abandon()
+        shutil.rmtree(self.path)
 
 
 class McapWriter:

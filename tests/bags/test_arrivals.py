@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bags.recordings.bag import Bag
+from bags.recordings.quality import LATCHED
 from bags.signals.publishers import counted_in_turn
 from bags.signals.recording import Arrival, LogClock, Recent
 from bags.signals.timing import Sequence
@@ -49,8 +50,9 @@ def test_the_last_seconds_are_kept_and_nothing_older(tmp_path: Path) -> None:
     for k in range(100):
         at = START_NS + k * 10**8
         recent.add(Arrival(CMD, CMD_TYPE, command(at, float(k)), at, at))
-    assert recent.save(tmp_path / "snapshot") == 21
+    assert recent.save(tmp_path / "snapshot", offered={CMD: (LATCHED,)}) == 21
     with Bag(tmp_path / "snapshot") as bag:
+        assert bag.offered(CMD) == (LATCHED,)
         data = [message.data for message in bag.messages()]
     assert data == [command(START_NS + k * 10**8, float(k)) for k in range(79, 100)]
 

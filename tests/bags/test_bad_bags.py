@@ -119,10 +119,13 @@ REFUSED: list[tuple[Callable[[Path], Path], str, str]] = [
     (lambda path: changed(path, "", "x: 1"), SPEED, DAMAGED),
     (lambda path: changed(path, "", "!!python/object/apply:os.system ['true']"), SPEED, DAMAGED),
     (lambda path: changed(path, "version: 9", "version: nine"), SPEED, DAMAGED),
-    (
-        lambda path: changed(path, "message_count: 50", "message_count: 51"),
-        SPEED,
-        "/odom has 50 messages, the bag's index says 51",
+    *(  # huge ones cost no memory
+        (
+            lambda path, n=n: changed(path, "message_count: 50", f"message_count: {n}"),
+            SPEED,
+            f"/odom has 50 messages, the bag's index says {n}",
+        )
+        for n in (51, -1, 2**62, 10**30)
     ),
     (lambda path: file_of(path, b""), SPEED, "no MCAP, SQLite or ROS 1 file: it is empty"),
     (lambda path: file_of(path, b"\0" * 100), SPEED, "no MCAP, SQLite or ROS 1 file"),
@@ -239,7 +242,7 @@ def test_topics_of_other_systems_are_exported(tmp_path: Path) -> None:
 
 
 def test_an_unfinished_recording_is_called_unfinished(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "live", in_place=True)
+    bag = BagWriter(tmp_path / "live")
     bag.write(ODOM, ODOM_TYPE, odometry(1, 0.5), log_time_ns=1, publish_time_ns=1)
     bag.close_chunk()
     assert "truncated or unfinished" in refused(tmp_path / "live")
@@ -318,16 +321,6 @@ def test_a_link_may_not_lead_outside_the_bag(bag: Path) -> None:
     (bag / "trial.mcap").unlink()
     (bag / "trial.mcap").symlink_to("trial.mcap")
     with pytest.raises((BagError, OSError)):
-        read_signals(bag, [SPEED])
-
-
-@pytest.mark.parametrize("count", [-1, 2**62, 10**30])
-def test_huge_counts_in_metadata_cost_no_memory(bag: Path, count: int) -> None:
-    metadata = bag / "metadata.yaml"
-    metadata.write_text(
-        metadata.read_text().replace("message_count: 50", f"message_count: {count}")
-    )
-    with pytest.raises(BagError, match="messages, the bag's index says"):
         read_signals(bag, [SPEED])
 
 

@@ -412,27 +412,6 @@ def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
     assert not (tmp_path / "ac").exists()
 
 
-def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: Path) -> None:
-    file = next(bag.glob("*.mcap"))
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    output = run("recover", damaged, "--out", tmp_path / "whole", status=1)
-    assert "what was lost is said above" in output
-    run("recover", bag, "--out", tmp_path / "copy")
-
-
-def test_custom_types_survive_cutting_and_recovery(tmp_path: Path) -> None:
-    cougars = SHARED / "cougars_auv" / "SO_lastbag_mcap"
-    if not cougars.is_dir():
-        pytest.skip("needs cougars_auv in ../shared/data")
-    fin = "/coug2/controls/command:fin[0]"
-    run("convert", cougars, "--out", tmp_path / "part", "--end", "20")
-    part = read_signals(tmp_path / "part", [fin])[fin].values
-    np.testing.assert_array_equal(part, read_signals(cougars, [fin])[fin].values[: len(part)])
-    output = run("recover", cougars, "--out", tmp_path / "whole")
-    assert "18558 messages, read back and compared; nothing was lost of what" in output
-
-
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_exported_topics_hold_the_bags_numbers_bit_for_bit(
     bag: Path, tmp_path: Path, form: str

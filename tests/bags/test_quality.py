@@ -1,11 +1,6 @@
 """Bags that are written: split, compressed, with quality of service, as every reader reads them."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -32,9 +27,8 @@ from bags.recordings.definitions import read_definitions
 from bags.recordings.message_types import decode
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
 from bags.recordings.writer import BagWriter
-from bags.signals.recording import Arrival, Recent
 from bags.tools.copies import Into
-from bags.tools.recover import recover, repair
+from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import (
     CMD,
@@ -98,33 +92,15 @@ def test_a_topic_without_messages_is_listed(tmp_path: Path) -> None:
 
 def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
     (tmp_path / "trial").mkdir()
-    for in_place in (False, True):
-        with pytest.raises(BagError, match="trial exists already"):
-            BagWriter(tmp_path / "trial", in_place=in_place)
+    with pytest.raises(BagError, match="trial exists already"):
+        BagWriter(tmp_path / "trial")
     assert list(tmp_path.rglob("*")) == [tmp_path / "trial"]
 
 
-@pytest.mark.parametrize("in_place", [False, True])
-def test_after_an_exception_only_a_bag_in_place_keeps_what_was_written(
-    tmp_path: Path, in_place: bool
-) -> None:
-    with (
-        pytest.raises(BagError, match="is not known"),
-        BagWriter(tmp_path / "trial", in_place=in_place) as bag,
-    ):
-        write_until_it_fails(bag)
-    assert [path.name for path in tmp_path.iterdir()] == ["trial"] * in_place
-    if in_place:
-        with Reader(tmp_path / "trial") as reader:
-            assert reader.message_count == 1
-
-
-def test_a_folder_that_appears_while_writing_is_not_replaced(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "trial")
-    (tmp_path / "trial").mkdir()
-    with pytest.raises(BagError, match="appeared while"):
-        bag.close()
-    assert list(tmp_path.iterdir()) == [tmp_path / "trial"]
+def test_an_exception_leaves_nothing_of_a_bag(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="is not known"), BagWriter(tmp_path / "trial") as bag:
+        bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_second_type_on_a_topic_is_refused(tmp_path: Path) -> None:
@@ -143,7 +119,7 @@ def test_an_unknown_type_and_a_negative_time_are_refused(tmp_path: Path) -> None
 
 
 def test_a_closed_chunk_is_on_disk(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "trial", in_place=True)
+    bag = BagWriter(tmp_path / "trial")
     bag.write(CMD, CMD_TYPE, command(1, 0.5), log_time_ns=1, publish_time_ns=1)
     assert _stamps_on_disk(bag.path) == []
     bag.close_chunk()
@@ -152,36 +128,6 @@ def test_a_closed_chunk_is_on_disk(tmp_path: Path) -> None:
     assert _stamps_on_disk(bag.path) == [1]
     bag.close()
     assert _stamps_on_disk(bag.path) == [1, 2]
-
-
-def test_a_killed_writer_loses_at_most_the_last_chunk(tmp_path: Path) -> None:
-    script = (
-        "import sys, time\n"
-        "from bags.recordings.writer import BagWriter\n"
-        "bag = BagWriter(sys.argv[1], in_place=True)\n"
-        "while True:\n"
-        "    now = time.time_ns()\n"
-        f"    bag.write('{CMD}', '{CMD_TYPE}', b'\\0\\1\\0\\0' + bytes(64), log_time_ns=now,"
-        " publish_time_ns=now)\n"
-        "    if bag.counts[sys.argv[2]] % 20 == 0:\n        bag.close_chunk()\n"
-        "    print(now, flush=True)\n"
-        "    time.sleep(0.001)\n"
-    )
-    root = Path(__file__).parents[2]
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path / "trial"), CMD],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=root,
-    )
-    assert process.stdout is not None
-    first = process.stdout.readline()
-    time.sleep(0.7)
-    os.kill(process.pid, signal.SIGKILL)
-    written = [int(line) for line in (first + process.communicate()[0]).split()]
-    kept = _stamps_on_disk(tmp_path / "trial")
-    assert kept == written[: len(kept)]
-    assert len(written) - len(kept) <= 20
 
 
 def _stamps_on_disk(bag: Path) -> list[int]:
@@ -197,11 +143,6 @@ def _stamps_on_disk(bag: Path) -> list[int]:
         except EndOfFile:
             return stamps
     return stamps
-
-
-def write_until_it_fails(bag: BagWriter) -> None:
-    bag.write(CMD, CMD_TYPE, command(0, 0.5), log_time_ns=0, publish_time_ns=0)
-    bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
 
 
 # -- Bags in several files, compressed or not, of custom types: as we, rosbags and mcap read them
@@ -415,28 +356,6 @@ def test_a_latched_topic_of_ros_1_is_latched_in_ros_2(tmp_path: Path) -> None:
     recover(tmp_path / "old.bag", tmp_path / "new")
     assert profiles_in(tmp_path / "new") == {MAP: [LATCHED.document()], CHATTER: []}
     assert counts_by_rosbags(tmp_path / "new") == {MAP: 1, CHATTER: 1}
-
-
-def test_a_repaired_recording_keeps_what_its_recorder_knew(tmp_path: Path) -> None:
-    bag = BagWriter(tmp_path / "run", in_place=True)
-    bag.add_topic(MAP, STRING, offered=(LATCHED,))
-    types = get_typestore(Stores.ROS2_JAZZY)
-    data = bytes(types.serialize_cdr(types.types[STRING]("a"), STRING))
-    bag.write(MAP, STRING, data, log_time_ns=5, publish_time_ns=5)
-    bag.close_chunk()
-    bag.abandon()
-    assert repair(tmp_path / "run") == 1
-    assert profiles_in(tmp_path / "run") == {MAP: [LATCHED.document()]}
-    assert counts_by_rosbags(tmp_path / "run") == {MAP: 1}
-
-
-def test_a_snapshot_keeps_what_was_offered(tmp_path: Path) -> None:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    data = bytes(types.serialize_cdr(types.types[STRING]("a"), STRING))
-    recent = Recent(10.0)
-    recent.add(Arrival(MAP, STRING, data, 5, 5))
-    recent.save(tmp_path / "snapshot", offered={MAP: (LATCHED,)})
-    assert profiles_in(tmp_path / "snapshot") == {MAP: [LATCHED.document()]}
 
 
 def test_profiles_are_read_as_rosbags_reads_them_and_written_as_it_does() -> None:

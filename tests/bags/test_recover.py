@@ -12,17 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-from mcap.reader import make_reader
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader
 
 from bags.monitoring.replay import replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import definitions_from
 from bags.recordings.mcap_file import McapFile
+from bags.recordings.quality import LATCHED
 from bags.recordings.writer import BagWriter, Output
 from bags.signals.reader import bag_origin, read_signals
 from bags.signals.recording import Arrival, Recording
@@ -49,6 +45,7 @@ from tests.bag_messages import (
     speed_bag,
 )
 from tests.conftest import PERIOD, simulate_truth
+from tests.mcap_files import three_readers
 
 CHUNKS, PER_CHUNK = 12, 10
 
@@ -184,7 +181,7 @@ COUNT = 300
 def killed_bag(path: Path, *, cut: int) -> Path:
     """A bag of 300 commands in three chunks whose file stops `cut` bytes early."""
     written = path.parent / "whole" / path.name
-    with BagWriter(written, in_place=True) as bag:
+    with BagWriter(written) as bag:
         for k in range(COUNT):
             stamp = START_NS + k * PERIOD_NS
             put(bag, stamp, CMD, CMD_TYPE, command(stamp, float(k)))
@@ -201,44 +198,21 @@ def killed_bag(path: Path, *, cut: int) -> Path:
 def test_every_complete_chunk_of_a_killed_bag_is_kept(tmp_path: Path, cut: int) -> None:
     bag = killed_bag(tmp_path / "trial", cut=cut)
     assert unfinished_bags(tmp_path) == [bag]
+    with pytest.raises(BagError, match="truncated or unfinished"):
+        Bag(bag)
     kept = repair(bag)
     assert kept % 100 == 0
     assert kept >= 100
-    with Bag(bag) as source:
-        messages = list(source.messages([CMD]))
-    assert [m.data for m in messages] == [
-        command(START_NS + k * PERIOD_NS, float(k)) for k in range(kept)
-    ]
+    expected = [command(START_NS + k * PERIOD_NS, float(k)) for k in range(kept)]
+    assert three_readers(bag, CMD) == [expected] * 3
     assert unfinished_bags(tmp_path) == []
     assert [p.name for p in tmp_path.iterdir()] == ["trial"]
 
 
-def test_before_its_repair_mcap_reads_the_complete_chunks_and_rosbags_nothing(
-    tmp_path: Path,
-) -> None:
-    bag = killed_bag(tmp_path / "trial", cut=1000)
-    kept: list[bytes] = []
-    with (
-        (bag / "trial.mcap").open("rb") as stream,
-        pytest.raises((EndOfFile, RecordLengthLimitExceeded)),
-    ):
-        kept.extend(r.data for r in StreamReader(stream).records if isinstance(r, Message))
-    with pytest.raises(FileNotFoundError, match="Expected metadata file"):
-        Reader(bag)
-    with pytest.raises(BagError, match="truncated or unfinished"):
-        Bag(bag)
-    repair(bag)
-    with AnyReader([bag]) as reader:
-        assert [bytes(data) for _, _, data in reader.messages()] == kept
-    with (bag / "trial.mcap").open("rb") as stream:
-        finished = [m.data for *_, m in make_reader(stream, validate_crcs=True).iter_messages()]
-    assert finished == kept
-
-
 def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) -> None:
     definition = definitions_from({"my_robot/msg/Arm": "float64 x\n"})["my_robot/msg/Arm"]
-    bag = BagWriter(tmp_path / "run", in_place=True, custom={"robot": "arm"})
-    bag.add_topic("/arm", definition.msgtype, definition=definition)
+    bag = BagWriter(tmp_path / "run", custom={"robot": "arm"})
+    bag.add_topic("/arm", definition.msgtype, definition=definition, offered=(LATCHED,))
     for k in range(25):
         data = b"\0\1\0\0" + struct.pack("<d", float(k))
         bag.write("/arm", definition.msgtype, data, log_time_ns=k, publish_time_ns=k)
@@ -247,6 +221,7 @@ def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) 
     assert repair(tmp_path / "run") == 25
     with Bag(tmp_path / "run") as source:
         assert source.custom == {"robot": "arm"}
+        assert source.offered("/arm") == (LATCHED,)
     [values] = read_signals(tmp_path / "run", ["/arm:x"]).values()
     assert values.values.tolist() == list(range(25))
     with AnyReader([tmp_path / "run"]) as reader:
@@ -254,7 +229,7 @@ def test_a_repaired_bag_keeps_its_custom_types_and_its_own_data(tmp_path: Path) 
 
 
 def test_a_bag_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "live", in_place=True) as bag:
+    with BagWriter(tmp_path / "live") as bag:
         bag.add_topic(ODOM, "nav_msgs/msg/Odometry")
         assert unfinished_bags(tmp_path) == []
         with pytest.raises(BagError, match="it is being written"):
@@ -272,7 +247,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, Recording
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
-recording = Recording(BagWriter(sys.argv[1], in_place=True), least_free=0.0)
+recording = Recording(BagWriter(sys.argv[1]), least_free=0.0)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT}, {LIMIT}))
 recording.add_topic(CMD, standard_definition(CMD_TYPE))
 for k in range(2000):
@@ -329,7 +304,7 @@ def test_a_write_that_fails_leaves_nothing_of_itself_behind(
 
 
 def test_it_ends_while_there_is_room_left_and_says_so(tmp_path: Path) -> None:
-    recording = Recording(BagWriter(tmp_path / "run", in_place=True), least_free=1e12)
+    recording = Recording(BagWriter(tmp_path / "run"), least_free=1e12)
     recording.expect(CMD)
     first = Arrival(CMD, CMD_TYPE, command(START_NS, 0.0), START_NS, START_NS)
     recording.add(first)

@@ -27,7 +27,7 @@ def recordings(folder: Path) -> None:
     at = START_NS + 10**10
     recent.add(Arrival(CMD, CMD_TYPE, command(at, 0.1), at, at))
     recent.save(folder / "run_snapshot_1")
-    growing = BagWriter(folder / "run_4", in_place=True)
+    growing = BagWriter(folder / "run_4")
     growing.write(CMD, CMD_TYPE, command(at, 0.1), log_time_ns=at, publish_time_ns=at)
     growing.close_chunk()
     growing.abandon()

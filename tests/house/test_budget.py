@@ -13,9 +13,9 @@ from tests.house.sources import sources
 
 STATEMENTS = {
     ("nlsid_core",): 17_800,
-    ("bags",): 11_515,
+    ("bags",): 11_488,
     ("nlsid_ros",): 2_599,
-    ("tests",): 21_208,
+    ("tests",): 21_055,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8

@@ -113,10 +113,18 @@ def test_a_recording_is_known_by_any_of_its_marks_and_named_by_who_had_it_first(
 
 @pytest.mark.slow
 def test_the_result_is_the_same_to_the_bit_whoever_reads(tmp_path: Path, config: Path) -> None:
+    distributed = pytest.importorskip("distributed")
     pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"
-    run(pattern, config, tmp_path / "here")
-    run(pattern, config, tmp_path / "two", Workers(2))
-    assert contents(tmp_path / "here") == contents(tmp_path / "two")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        readers = (Workers(), Workers(2), Workers(scheduler=cluster.scheduler_address))
+        for k, workers in enumerate(readers):
+            run(pattern, config, tmp_path / f"out_{k}", workers)
+    first, *others = (contents(tmp_path / f"out_{k}") for k in range(len(readers)))
+    assert others == [first, first]
+    with pytest.raises(DataError, match="name one of them"):
+        Workers(2, "tcp://host:1")
 
 
 @pytest.mark.slow
@@ -143,20 +151,6 @@ def test_storage_gives_the_same_numbers_and_digests_of_its_own(
     assert models[0] == models[1]
     digests = [[trial.digest for trial in found.trials.train] for found in (here, there)]
     assert not set(digests[0]) & set(digests[1])
-
-
-@pytest.mark.slow
-def test_a_dask_cluster_gives_the_same(tmp_path: Path, config: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"
-    run(pattern, config, tmp_path / "here")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        run(pattern, config, tmp_path / "dask", Workers(scheduler=cluster.scheduler_address))
-    assert contents(tmp_path / "here") == contents(tmp_path / "dask")
-    with pytest.raises(DataError, match="name one of them"):
-        Workers(2, "tcp://host:1")
 
 
 def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) -> None:
