@@ -159,7 +159,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     options: Any = {"Q": np.eye(2), "R": np.eye(2), "limits": [[0, -0.9, 0.9], [1, -0.6, 0.8]]}
     problem = ContinuousTracking(field, still(field, 9, 0.4), goal=4 * np.eye(2), **options)
     found = design_funnel(problem)
-    assert len(np.unique(found.found.proved.pieces.mode, axis=0)) == 9
+    assert len(np.unique(found.found.proved.pieces.cases.mode, axis=0)) == 9
     edge = found.funnel.outline(0.0, (0, 1))
     asked = -(edge - found.policy.x(0.0)) @ found.policy.K(0.0).T
     assert (np.abs(asked).max(axis=0) > [0.9, 0.8]).all()

@@ -25,39 +25,51 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
 
-SHARED = ("basis", "kappa")  # by all pieces of a proof
+OWN = ("T", "mu", "gram", "tau", "stated")  # of each piece
 CELLS = 6_000_000  # Gram entries held at once
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """basis: (k, n) exponents of v. Per piece: interval, vertex of w, part index/2^level of it.
+class Cases:
+    """What each piece is of: interval, vertex of w, part index/2^level of the interval.
 
-    T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
-    2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
-    kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
-    mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
-    y = (1, z) the multiplier of what holds in that mode. off: (B, m + n_w) δ, that the input is
-    off, and w.
-    stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
+    mode: (B, L) of the policy's modes. off: (B, m + n_w) δ, that the input is off, and w.
     """
 
-    basis: IntArray
     interval: IntArray
     vertex: IntArray
     level: IntArray
     index: IntArray
+    mode: IntArray
+    off: FloatArray
+
+    def select(self, chosen: slice | IntArray) -> "Cases":
+        """Some of them."""
+        return Cases(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """basis: (k, n) exponents of v.
+
+    T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
+    2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
+    tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with y = (1, z) the multiplier of what holds
+    in the mode. stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
+    kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
+    """
+
+    basis: IntArray
+    cases: Cases
     T: FloatArray
     mu: FloatArray
     gram: FloatArray
-    mode: IntArray
     tau: FloatArray
-    off: FloatArray
     stated: NDArray[np.object_]
     kappa: FloatArray | None = None
 
     def __len__(self) -> int:
-        return len(self.interval)
+        return len(self.T)
 
     @staticmethod
     def multiplier_size(basis: IntArray) -> int:
@@ -71,8 +83,8 @@ class Pieces:
 
     def select(self, chosen: slice | IntArray) -> "Pieces":
         """Some of the pieces."""
-        kept = {f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name not in SHARED}
-        return replace(self, **kept)
+        kept = {name: getattr(self, name)[chosen] for name in OWN}
+        return replace(self, cases=self.cases.select(chosen), **kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +105,7 @@ class InputRates:
 
     def room(self, rates: FloatArray, widths: FloatArray) -> FloatArray:
         """(B,) what R and W (intervals, m) leave to the rest, in input units per s."""
-        k = self.pieces.interval
+        k = self.pieces.cases.interval
         pushed = self.taken + (self.shoved * widths[k]).sum(axis=1)
         return np.asarray(rates[k, self.entry] - pushed)
 
@@ -120,7 +132,7 @@ def closed_loop_polynomial(
     piece; derivatives are with respect to s on the whole interval, of length h. Where inputs are
     limited, f is that of the piece's mode, and what holds in the mode is taken off.
     """
-    n, k = field.n, pieces.interval
+    n, k = field.n, pieces.cases.interval
     loop = _Loop(field, policy, funnel, pieces, end)
     P = linear(funnel.P)[k]
     rho = linear(funnel.rho)[k]
@@ -157,9 +169,11 @@ def rate_polynomial(
     room: (B,) in input units per s. τ: the first of the piece's. end: only its value at 0 or at 1.
     """
     pieces, entry = of.pieces, of.entry
-    n, k = field.n, pieces.interval
+    n, k = field.n, pieces.cases.interval
     loop = _Loop(field, policy, funnel, pieces, end)
-    case = np.column_stack([k, pieces.level, pieces.index, pieces.vertex, pieces.mode])
+    case = np.column_stack(
+        [k, pieces.cases.level, pieces.cases.index, pieces.cases.vertex, pieces.cases.mode]
+    )
     new = np.r_[True, (case[1:] != case[:-1]).any(axis=1)]
     first = np.flatnonzero(new)
     rates = _Loop(field, policy, funnel, pieces.select(first), end).field_times_h()
@@ -196,13 +210,15 @@ class _Loop:
         self.field, self.pieces, self.end = field, pieces, end
         self.policy, self.funnel = policy, funnel
         spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")
-        self.span = spans[pieces.interval]
+        self.span = spans[pieces.cases.interval]
         self._variables = self._affine_forms()
         self._known: dict[tuple[int, ...], Graded] = {}
 
     def restricted(self, control: FloatArray) -> FloatArray:
         """Bernstein control points (B, d+1, ...) as polynomials in s on each piece."""
-        return self._at_end(restrict(weighted(control), self.pieces.level, self.pieces.index))
+        return self._at_end(
+            restrict(weighted(control), self.pieces.cases.level, self.pieces.cases.index)
+        )
 
     def multiplier(self) -> Graded:
         """μ."""
@@ -220,11 +236,11 @@ class _Loop:
 
     def nominal_rate(self) -> FloatArray:
         """dx₀/ds (B, d, n)."""
-        return self.restricted(_slope(self.funnel.x.control[self.pieces.interval]))
+        return self.restricted(_slope(self.funnel.x.control[self.pieces.cases.interval]))
 
     def gap(self) -> Graded:
         """ρ - x̄'Px̄."""
-        k, n = self.pieces.interval, self.field.n
+        k, n = self.pieces.cases.interval, self.field.n
         PT = _product(self.restricted(linear(self.funnel.P)[k]), self.pieces.T)
         W: Graded = {}
         for i in range(n):
@@ -233,7 +249,7 @@ class _Loop:
 
     def field_times_h(self) -> list[Graded]:
         """h·f_i along the closed loop."""
-        h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
+        h = np.diff(self.funnel.t)[self.pieces.cases.interval][:, None, None]
         rates: list[Graded] = [{} for _ in range(self.field.n)]
         exponents, table = self.field.coefficients
         numbers = table[self.span]
@@ -249,9 +265,9 @@ class _Loop:
         if kappa is None:
             return []
         pushes = np.array([self.field.pushes(span) for span in range(len(self.field.pieces))])
-        h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
+        h = np.diff(self.funnel.t)[self.pieces.cases.interval][:, None, None]
         terms = []
-        scales = kappa[self.pieces.interval][:, :, None, None]
+        scales = kappa[self.pieces.cases.interval][:, :, None, None]
         for j, radius in enumerate((np.ptp(self.field.uncertain, axis=1) / 2).tolist()):
             scale = scales[:, j]
             along: Graded = {1: np.einsum("bkij,bi->bkj", PT, pushes[self.span, :, j])}
@@ -264,7 +280,7 @@ class _Loop:
         """τ_l q_l for every limited input: what is nonnegative in the piece's mode."""
         n, terms = self.field.n, []
         for place, (i, low, high) in enumerate(self.policy.limits.tolist()):
-            mode = self.pieces.mode[:, place][:, None, None]
+            mode = self.pieces.cases.mode[:, place][:, None, None]
             demand = self.demands[int(i)]
             above = add(demand, {0: np.full((1, 1, 1), -low)})
             below = add(negative(demand), {0: np.full((1, 1, 1), high)})
@@ -295,7 +311,7 @@ class _Loop:
         return self._known[exponent]
 
     def _affine_forms(self) -> list[Graded]:
-        k, T = self.pieces.interval, self.pieces.T
+        k, T = self.pieces.cases.interval, self.pieces.T
         x = self.restricted(self.policy.x.control[k])
         u = self.restricted(self.policy.u.control[k])
         KT = _product(self.restricted(self.policy.K.control[k]), T)
@@ -306,15 +322,15 @@ class _Loop:
             {0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)
         ]
         for i, applied in enumerate(self._clipped()):
-            forms.append(add(applied, {0: self.pieces.off[:, i][:, None, None]}))
-        forms += [{0: part[:, None, None]} for part in self.pieces.off[:, self.field.m :].T]
+            forms.append(add(applied, {0: self.pieces.cases.off[:, i][:, None, None]}))
+        forms += [{0: part[:, None, None]} for part in self.pieces.cases.off[:, self.field.m :].T]
         return forms
 
     def _clipped(self) -> list[Graded]:
         """The inputs in each piece's mode: ũ, or a limit."""
         inputs = list(self.demands)
         for place, (i, low, high) in enumerate(self.policy.limits.tolist()):
-            mode = self.pieces.mode[:, place][:, None, None]
+            mode = self.pieces.cases.mode[:, place][:, None, None]
             limit = np.where(mode < 0, low, np.where(mode > 0, high, 0.0))
             free = {q: (mode == 0) * part for q, part in self.demands[int(i)].items()}
             inputs[int(i)] = add(free, {0: limit})

@@ -13,7 +13,13 @@ from typing import Literal
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.closed_loop import CELLS, InputRates, Pieces, rate_polynomial
+from nlsid_core.design.continuous.closed_loop import (
+    CELLS,
+    Cases,
+    InputRates,
+    Pieces,
+    rate_polynomial,
+)
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.design.continuous.lstep import LSteps, at_corners, corners_of
 from nlsid_core.design.continuous.pieces import (
@@ -143,10 +149,12 @@ class Changes:
         intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
         for batch in _batches(steps, intervals, no_basis, unit, signs=(1,)):
             pieces, entry = batch.pieces, batch.entry
-            corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
-            order = np.lexsort((corner, entry, vertex, *pieces.mode.T, pieces.interval))
+            corner, vertex = np.divmod(
+                pieces.cases.vertex, (int(pieces.cases.vertex.max()) + 1) // count
+            )
+            order = np.lexsort((corner, entry, vertex, *pieces.cases.mode.T, pieces.cases.interval))
             first = order[::count]
-            stated = pieces.interval, entry, batch.taken, batch.shoved
+            stated = pieces.cases.interval, entry, batch.taken, batch.shoved
             rows.append(tuple(part[first] for part in stated))
             for end in (0, 1):
                 c, *_ = _at_end(steps, funnel, batch, end)
@@ -237,7 +245,7 @@ def prove_rates(
             rows = rate_documents(funnel, of.pieces, c)
             places = zip(of.entry.tolist(), of.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
-                place = of.pieces.interval, of.pieces.level, of.pieces.index
+                place = of.pieces.cases.interval, of.pieces.cases.level, of.pieces.cases.index
                 part = Part(*(int(e[b]) for e in place))
                 stated = None if row is None else row | {"input": entry, "sign": sign}
                 written.setdefault(part, []).append(stated)
@@ -290,16 +298,18 @@ def _batches(
         v, i, side, m = (np.tile(row, len(alike)) for row in (vertex, entry, sign, mode))
         pieces = Pieces(
             basis,
-            interval=place[:, 0],
-            vertex=v,
-            level=place[:, 1],
-            index=place[:, 2],
+            Cases(
+                interval=place[:, 0],
+                vertex=v,
+                level=place[:, 1],
+                index=place[:, 2],
+                mode=steps.modes[m],
+                off=at_corners(field, corners, widths[place[:, 0]])[np.arange(count), v],
+            ),
             T=np.tile(np.eye(n), (count, 1, 1)),
             mu=np.zeros((count, 2, 0)),
             gram=np.zeros((count, 2, len(basis), len(basis))),
-            mode=steps.modes[m],
             tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
-            off=at_corners(field, corners, widths[place[:, 0]])[np.arange(count), v],
             stated=np.empty(count, dtype=object),
         )
         gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
@@ -329,7 +339,7 @@ def _at_end(
 ) -> tuple[list[FloatArray], FloatArray]:
     """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and z by x̄, (B, n, n)."""
     pieces, n, curving = of.pieces, funnel.n, steps.multiplied
-    T, inverse = frames_of(funnel, pieces.interval, _ends(pieces)[end], curving)
+    T, inverse = frames_of(funnel, pieces.cases.interval, _ends(pieces)[end], curving)
     framed = replace(of, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)))
     c = rate_polynomial(steps.field, steps.policy, funnel, framed, np.zeros(len(pieces)), end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
@@ -344,7 +354,7 @@ def _witnessed(
     rates: FloatArray,
 ) -> InputRates:
     """The rates with τ as a proof states it, and Gram matrices in x̄ at both ends."""
-    pieces, k, curving = of.pieces, of.pieces.interval, steps.multiplied
+    pieces, k, curving = of.pieces, of.pieces.cases.interval, steps.multiplied
     tau, gram = pieces.tau.copy(), pieces.gram.copy()
     assert steps.widths is not None  # as in `prove_rates`
     room = np.diff(funnel.t)[k] * of.room(rates, steps.widths)
@@ -366,5 +376,5 @@ def _witnessed(
 
 def _ends(pieces: Pieces) -> tuple[FloatArray, FloatArray]:
     """(B,) start and end of each part, as fractions of the interval."""
-    whole = 2.0**pieces.level
-    return pieces.index / whole, (pieces.index + 1) / whole
+    whole = 2.0**pieces.cases.level
+    return pieces.cases.index / whole, (pieces.cases.index + 1) / whole

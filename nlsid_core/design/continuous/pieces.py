@@ -9,11 +9,18 @@ for the kernel, which decides.
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray, Json
-from nlsid_core.design.continuous.closed_loop import SHARED, Pieces, batches, closed_loop_polynomial
+from nlsid_core.design.continuous.closed_loop import (
+    OWN,
+    Cases,
+    Pieces,
+    batches,
+    closed_loop_polynomial,
+)
 from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
 from nlsid_core.design.continuous.lstep import Ends, LSteps, section_at
 from nlsid_core.design.continuous.witnesses import (
@@ -64,7 +71,7 @@ class Proved:
     def on(self, intervals: Collection[int]) -> "Proved":
         """The pieces of these intervals that are proved from end to end."""
         left = set(intervals) - {part.interval for part in self.unproved}
-        chosen = np.flatnonzero(np.isin(self.pieces.interval, list(left)))
+        chosen = np.flatnonzero(np.isin(self.pieces.cases.interval, list(left)))
         return Proved(self.pieces.select(chosen), self.margins[chosen], ())
 
 
@@ -87,7 +94,7 @@ def prove_pieces(
     over: set[int] = set()
     if kept is not None and len(kept.pieces):
         done = [(replace(kept.pieces, kappa=steps.kappa), kept.margins)]
-        over = set(kept.pieces.interval.tolist())
+        over = set(kept.pieces.cases.interval.tolist())
     waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1) if k not in over]
     unproved: dict[int, Part] = {}
     while waiting:
@@ -167,7 +174,7 @@ def _pieces(
             rho += [rho_here] * steps.cases
             rows += known[i, s]
         blank = draft(steps, parts, np.array(T))
-        scale = np.diff(funnel.t)[blank.interval] * rho
+        scale = np.diff(funnel.t)[blank.cases.interval] * rho
         tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
         tau = tau.reshape(len(rows), -1, n + 1, n + 1)
         blank = replace(blank, tau=np.stack([tau, tau], axis=1))
@@ -176,7 +183,7 @@ def _pieces(
         mu = np.zeros((len(rows), len(full)))
         gram = np.zeros((len(rows), len(basis), len(basis)))
         for b, solution in enumerate(rows):
-            i = int(blank.interval[b])
+            i = int(blank.cases.interval[b])
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
@@ -227,16 +234,18 @@ def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
     off = [steps.off(part.interval) for part in parts for _ in steps.modes]
     return Pieces(
         basis,
-        interval=repeated[:, 0],
-        vertex=np.tile(np.arange(steps.cases) % corners, len(parts)),
-        level=repeated[:, 1],
-        index=repeated[:, 2],
+        Cases(
+            interval=repeated[:, 0],
+            vertex=np.tile(np.arange(steps.cases) % corners, len(parts)),
+            level=repeated[:, 1],
+            index=repeated[:, 2],
+            mode=np.tile(np.repeat(steps.modes, corners, axis=0), (len(parts), 1)),
+            off=np.array(off).reshape(count, steps.corners.shape[1]),
+        ),
         T=T,
         mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
         gram=np.zeros((count, 2, len(basis), len(basis))),
-        mode=np.tile(np.repeat(steps.modes, corners, axis=0), (len(parts), 1)),
         tau=np.zeros((count, 2, limited, n + 1, n + 1)),
-        off=np.array(off).reshape(count, steps.corners.shape[1]),
         stated=np.empty(count, dtype=object),
         kappa=steps.kappa,
     )
@@ -326,16 +335,28 @@ def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Piece
         return draft(steps, [], np.zeros((0, n, n))), np.zeros(0)
     pieces = stacked([part for part, _ in done])
     margins = np.concatenate([m for _, m in done])
-    modes = list(pieces.mode.T)[::-1]  # what shares its part of time and its mode is side by side
-    order = np.lexsort((pieces.vertex, *modes, pieces.index / 2.0**pieces.level, pieces.interval))
+    modes = list(pieces.cases.mode.T)[
+        ::-1
+    ]  # what shares its part of time and its mode is side by side
+    order = np.lexsort(
+        (
+            pieces.cases.vertex,
+            *modes,
+            pieces.cases.index / 2.0**pieces.cases.level,
+            pieces.cases.interval,
+        )
+    )
     return pieces.select(order), margins[order]
 
 
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
-    keys = [f.name for f in fields(Pieces) if f.name not in SHARED]
-    whole: Json = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
-    return replace(parts[0], **whole)
+
+    def joined(rows: Sequence[Any], names: Sequence[str]) -> Json:
+        return {name: np.concatenate([getattr(row, name) for row in rows]) for name in names}
+
+    cases = joined([part.cases for part in parts], [f.name for f in fields(Cases)])
+    return replace(parts[0], cases=Cases(**cases), **joined(parts, OWN))
 
 
 def proof_of(steps: LSteps, funnel: ContinuousFunnel, proved: Proved) -> Json:

@@ -59,8 +59,8 @@ def stated_multipliers(pieces: Pieces) -> Pieces:
         for place, written in enumerate(factors):
             tau[b, :, place] = matrices(written["columns"], written["squares"])
         stated[b] = {"tau": factors} if factors else {}
-        if pieces.mode.shape[1]:
-            stated[b]["mode"] = pieces.mode[b].tolist()
+        if pieces.cases.mode.shape[1]:
+            stated[b]["mode"] = pieces.cases.mode[b].tolist()
     return replace(pieces, tau=tau, stated=stated)
 
 
@@ -145,10 +145,10 @@ def rate_documents(funnel: ContinuousFunnel, pieces: Pieces, c: Graded) -> list[
 def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:
     squares = witness(pieces.basis, fitted(pieces.basis, curves.grams[b]))
     return {
-        "interval": int(pieces.interval[b]),
-        "vertex": int(pieces.vertex[b]),
-        "level": int(pieces.level[b]),
-        "index": int(pieces.index[b]),
+        "interval": int(pieces.cases.interval[b]),
+        "vertex": int(pieces.cases.vertex[b]),
+        "level": int(pieces.cases.level[b]),
+        "index": int(pieces.cases.index[b]),
         **pieces.stated[b],
         "columns": squares["columns"],
         "squares": squares["squares"],
@@ -175,11 +175,11 @@ class _Curves:
         c = c / np.array([comb(N, j) for j in range(N + 1)])[:, None]
         grams = gram_curves(basis, c, rows, pieces.gram)
         share = np.arange(N + 1) / max(N, 1)
-        ends = funnel.rho[pieces.interval], funnel.rho[pieces.interval + 1]
-        first, last = ((pieces.index + end) / 2.0**pieces.level for end in (0, 1))
+        ends = funnel.rho[pieces.cases.interval], funnel.rho[pieces.cases.interval + 1]
+        first, last = ((pieces.cases.index + end) / 2.0**pieces.cases.level for end in (0, 1))
         at = first[:, None] + (last - first)[:, None] * share
         rho = (1 - at) * ends[0][:, None] + at * ends[1][:, None]
-        h = np.diff(funnel.t)[pieces.interval]
+        h = np.diff(funnel.t)[pieces.cases.interval]
         one = int(np.flatnonzero(~basis.any(axis=1))[0])
         return cls(grams, h[:, None] * rho, one)
 

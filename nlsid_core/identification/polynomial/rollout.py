@@ -7,15 +7,14 @@ a model that forgets its start is solved in fewer than ten. Where it does not se
 are stepped one after the other.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dtbtrs
 
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import SolverError
 from nlsid_core.models import ImplicitModel
@@ -174,22 +173,9 @@ def _stepped(model: ImplicitModel, trial: Trajectory) -> FloatArray:
 
 
 def _is_delayed(model: ImplicitModel) -> bool:
-    """ã is the first states: x stacks the past outputs."""
-    size = len(model) - model.unknowns
-    given: dict[tuple[int, ...], FloatArray] = dict(
-        _terms(model.shift.exponents, model.shift.coefficients)
-    )
-    units = np.eye(model.shift.exponents.shape[1], dtype=np.int64)[:size]
-    wanted = dict(_terms(units, np.eye(size)))
-    return given.keys() == wanted.keys() and all(
-        np.array_equal(given[key], wanted[key]) for key in wanted
-    )
-
-
-def _terms(exponents: IntArray, coefficients: FloatArray) -> Iterator[tuple[tuple[int, ...], Any]]:
-    for row, c in zip(exponents.tolist(), coefficients, strict=True):
-        if c.any():
-            yield tuple(row), c
+    """ã is the first states, as seen at a random point: x stacks the past outputs."""
+    known = np.random.default_rng(0).standard_normal((1, len(model) + len(model.inputs)))
+    return np.array_equal(model.shift(known), known[:, : len(model) - model.unknowns])
 
 
 def _product(columns: Sequence[FloatArray], powers: Sequence[int]) -> FloatArray:
