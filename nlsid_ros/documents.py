@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from std_msgs.msg import String
 
 from bags.designs import wiring
-from bags.designs.bundle import MAX_BYTES, Bundle, Check
-from nlsid_core.deciding import USUAL, Limits
+from bags.designs.bundle import MAX_BYTES, Bundle
+from nlsid_core.deciding import USUAL, Deciding, Limits
 from nlsid_core.designs import AnyDesign, Wiring
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import graph, qos
@@ -106,7 +106,7 @@ class DesignSubscription:
         self._node, self._taken, self._changed = node, taken, changed
         self._wiring, self._expected = wiring_of(node.values), expected_of(node.values)
         self._limits = limits_of(node.values)
-        self._check: Check | None = None
+        self._deciding: Deciding | None = None
         self._waiting: str | None = None
         self._used = ""  # the text of the design in use
         self._crowded = False
@@ -117,9 +117,9 @@ class DesignSubscription:
 
     def close(self) -> None:
         """Call off a check that is on."""
-        if self._check is not None:
-            self._check.close()
-            self._check = None
+        if self._deciding is not None:
+            self._deciding.close()
+            self._deciding = None
 
     def _subscribe(self) -> None:
         self._subscription = self._node.create_subscription(
@@ -172,41 +172,36 @@ class DesignSubscription:
             self.close()
         if (unheard := self._unheard()) and not self.refusal.endswith(unheard):
             self._refuse(unheard)
-        if self._check is None and self._waiting is not None:
-            text, self._waiting = self._waiting, None
-            try:
-                self._check = Check(text, self._limits)
-            except OSError as error:
-                self._refuse(f"it cannot be checked: {error}")
-                return
-            self.state = CHECKING
-            self._changed()
-        if self._check is not None and (answer := self._check.poll()) is not None:
-            text = self._check.text
-            self.close()
-            if "refused" in answer:
-                self._refuse(str(answer["refused"]))
-            else:
-                when = " (decided before on this machine)" if answer["before"] else ""
-                self._accept(text, f"{answer['proved']}{when}")
-        if self._check is not None and (seconds := self._check.seconds) > LONG:
-            self.state = (
-                f"{CHECKING} for {seconds:.0f} s now: it is slow where others want the processors"
-            )
-
-    def _accept(self, text: str, verdict: str) -> None:
         try:
-            bundle = Bundle.parse(text)
-            if self._expected and bundle.digest != self._expected:
-                self._refuse(f"its funnel is {bundle.digest}, not the expected {self._expected}")
-                return
-            if bundle.digest != self.digest:
-                self._taken(bundle.design(self._wiring), bundle.digest)
-        except NlsidError as error:
-            self._refuse(str(error))
+            if self._deciding is None and self._waiting is not None:
+                self._text, self._waiting = self._waiting, None
+                self._bundle = Bundle.parse(self._text)
+                self._deciding = self._bundle.deciding(self._limits)
+                self.state = CHECKING
+                self._changed()
+            if self._deciding is not None:
+                self._poll(self._deciding)
+        except (NlsidError, OSError) as refusal:
+            self.close()
+            self._refuse(str(refusal))
+
+    def _poll(self, deciding: Deciding) -> None:
+        """Take the design if the kernel has proved it; raises why it is not used."""
+        verdict, bundle = deciding.poll(), self._bundle
+        if verdict is None:
+            if deciding.seconds > LONG:
+                said = f"{CHECKING} for {deciding.seconds:.0f} s now"
+                self.state = f"{said}: it is slow where others want the processors"
             return
-        self._used, self._verdict, self.digest = text, verdict, bundle.digest
-        self.refusal, self.state = "", verdict
+        self.close()
+        bundle.refuse_others(verdict)
+        if self._expected and bundle.digest != self._expected:
+            raise DataError(f"its funnel is {bundle.digest}, not the expected {self._expected}")
+        if bundle.digest != self.digest:
+            self._taken(bundle.design(self._wiring), bundle.digest)
+        when = " (decided before on this machine)" if deciding.before else ""
+        self._used, self._verdict, self.digest = self._text, f"{verdict}{when}", bundle.digest
+        self.refusal, self.state = "", self._verdict
         self._changed()
 
     def _refuse(self, reason: str) -> None:

@@ -2,15 +2,24 @@
 
 import importlib
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
-from bags.recordings.definitions import types_from
+from bags.recordings.definitions import (
+    Definition,
+    read_definitions,
+    standard_definition,
+    types_from,
+)
 from nlsid_core.errors import BagError
 
 _NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)", re.ASCII)
 _SEQUENCE = re.compile(r"sequence<(.+?)(?:, (\d+))?>")
 _ARRAY = re.compile(r"(.+)\[(\d+)\]")
+HASHED: Final = "RIHS01_"  # how a known hash begins; a middleware that does not tell says INVALID
 _WRITTEN: Final = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
 
 
@@ -35,6 +44,36 @@ def installed_types(msgtype: str) -> Any:
     texts: dict[str, str] = {}
     _describe(msgtype, texts)
     return types_from(texts)
+
+
+def definition_of(msgtype: str, type_hash: str, given: Mapping[str, Definition]) -> Definition:
+    """The definition with the hash that a publisher states: given, standard or installed.
+
+    Raises BagError if none has it.
+    """
+    known = ""
+    for look in (given.__getitem__, standard_definition, _installed):
+        with suppress(KeyError, BagError):
+            found = look(msgtype)
+            if found.type_hash == type_hash or not type_hash.startswith(HASHED):
+                return found
+            known = f"published with hash {type_hash}, known is {found.type_hash}"
+    raise BagError(
+        f"message type '{msgtype}' is {known or 'not known'}; give its "
+        f"{msgtype.split('/')[-1]}.msg file or its package's share folder in the parameter "
+        "definitions"
+    )
+
+
+def _installed(msgtype: str) -> Definition:
+    """The definition by the texts of its package and of those that it uses, where they lie."""
+    texts = []
+    for name in installed_types(msgtype).fielddefs:
+        package, kind = name.split("/")[0], name.split("/")[-1]
+        code = Path(str(importlib.import_module(package).__file__))
+        places = [prefix / "share" / package / "msg" / f"{kind}.msg" for prefix in code.parents]
+        texts += [place for place in places if place.is_file()][:1]
+    return read_definitions(texts)[msgtype]
 
 
 def _describe(msgtype: str, texts: dict[str, str]) -> None:

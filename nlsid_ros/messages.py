@@ -6,7 +6,7 @@ import struct
 import time
 from collections.abc import Mapping
 from copy import deepcopy
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -27,6 +27,7 @@ from nlsid_ros import qos
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.running import ManagedNode
 
+_FLOATS: Final = re.compile(r"(sequence<)?(double|float)")
 _STAMP: Final = struct.Struct("<iI")
 _NAN: Final = struct.pack("<d", math.nan)
 ZERO: Final = "zero"
@@ -37,15 +38,6 @@ PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
 BASE_PATIENCE: Final = 0.5  # s without a command after which a base stops by itself
 OTHERS_PATIENCE: Final = 1.0  # s without a message on that topic
 SAID: Final = 6  # fields that are named
-_PYTHON: Final[dict[str, tuple[type, ...]]] = {  # what JSON has for ROS's types
-    "double": (int, float),
-    "float": (int, float),
-    "boolean": (bool,),
-    "int": (int,),
-    "uint": (int,),
-    "string": (str,),
-    "wstring": (str,),
-}
 
 
 class SignalMessage:
@@ -161,31 +153,22 @@ def _filled(kind: Any, content: Any, source: str) -> Any:
         if name not in known:
             raise BagError(f"{source}: there is no '{name}'; there are: {', '.join(known)}")
         part = getattr(empty, name)
-        nested = hasattr(part, "get_fields_and_field_types")
-        read: Any = partial(_filled, type(part)) if nested else partial(_fitting, known[name])
-        fields[name] = read(value, f"{source}: {name}")
+        if hasattr(part, "get_fields_and_field_types"):
+            fields[name] = _filled(type(part), value, f"{source}: {name}")
+        else:
+            fields[name] = _floats(value) if _FLOATS.match(known[name]) else value
     try:
-        kind(check_fields=True, **fields)  # lengths, and ranges of numbers
+        kind(check_fields=True, **fields)  # types, lengths, and ranges of numbers
     except (AssertionError, TypeError, ValueError, OverflowError) as error:
         raise BagError(f"{source}: {str(error).partition(' and each ')[0]}") from error
     return kind(**fields)
 
 
-def _fitting(kind: str, value: Any, source: str) -> Any:
-    """A value, or a list of them, for a field of this type: `double`, `sequence<double>`, ..."""
-    element = re.sub(r"^sequence<|[>\[,].*$", "", kind)
-    listed = element != kind
-    wanted = next((python for name, python in _PYTHON.items() if element.startswith(name)), ())
-    values = value if listed and isinstance(value, list) else [value]
-    fits = listed == isinstance(value, list) and all(
-        isinstance(each, wanted) and isinstance(each, bool) == (element == "boolean")
-        for each in values
-    )
-    if not fits:
-        raise BagError(f"{source} is {value!r}; it should be {kind}")
-    if float in wanted:
-        values = list(map(float, values))
-    return values if listed else values[0]
+def _floats(value: Any) -> Any:
+    """A whole number as the float that is meant, and so those in a list."""
+    if isinstance(value, list):
+        return list(map(_floats, value))
+    return float(value) if type(value) is int else value
 
 
 def _make_room(path: SignalPath, message: Any) -> None:

@@ -1,19 +1,22 @@
-"""Node `model_identifier`: identification as a service, in a worker process.
+"""Node `model_identifier`: identification as a service, by `nlsid identify` as a process.
 
-`~/identify` answers at once whether work began; progress is on /diagnostics; the model comes out on
-~/model (latched) once it is proved stable, beside the files in `out`. `~/cancel` calls it off.
-Recordings that are not closed yet are left out, and so are those without the configured topics.
+`~/identify` answers whether work began; how long it has lasted is on /diagnostics; the model comes
+out on ~/model (latched) once it is proved stable, beside the files in `out`. `~/cancel` calls it
+off. Recordings that are not closed yet are left out, and so are those without the configured
+topics.
 """
 
 import json
-from dataclasses import replace
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import String
 
-from bags.chain.background import BackgroundIdentification, Progress
 from bags.chain.config import load_config
+from bags.chain.finished import finished_bags
 from bags.designs import documents
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.proofs import check
@@ -21,11 +24,11 @@ from nlsid_ros import qos
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
-LOOK = 0.1  # s between looks at the worker
+LOOK = 0.1  # s between looks at the process
 
 
 class ModelIdentifier(ManagedNode):
-    """One identification at a time; callbacks only start, look at and end the worker."""
+    """One identification at a time; callbacks only start, look at and end it."""
 
     name = "model_identifier"
     task = "identification"
@@ -45,12 +48,13 @@ class ModelIdentifier(ManagedNode):
         """Refuse to wait for a request that could not be served."""
         if not self._bags or self._out == Path():
             raise DataError("nothing to identify from or to; set the parameters bags and out")
-        load_config(self._config)
+        self._topics = load_config(self._config).signals.topics
 
     def start(self) -> None:
         """Wait for requests."""
-        self._work: BackgroundIdentification | None = None
-        self._said = Progress("idle", 0.0)
+        self._work: subprocess.Popen[str] | None = None
+        self._began = 0.0
+        self._level, self._text = DiagnosticStatus.OK, "idle"
         self.keep_reporting(self._report)
         self._model = self.create_publisher(String, "~/model", qos.DOCUMENT)
         self.serve("identify", self._on_identify)
@@ -60,55 +64,59 @@ class ModelIdentifier(ManagedNode):
     def stop(self) -> None:
         """Call off what runs."""
         if self._work is not None:
-            self._work.cancel()
+            self._work.kill()
+            self._work.communicate()
+            self._work = None
 
     def _on_identify(self) -> tuple[bool, str]:
         if self._work is not None:
-            return False, f"busy: {self._said.what}"
-        last = self.values.last
-        self._work = BackgroundIdentification(self._bags, self._config, self._out, last=last)
-        return True, "started"
+            return False, "busy: identifying"
+        bags, others = finished_bags(self._bags, self._topics, last=self.values.last)
+        left_out = [f"; left out {path.name}: {reason}" for path, reason in others.items()]
+        command = [sys.executable, "-m", "bags.commands.main", "identify", str(self._out)]
+        self._work = subprocess.Popen(
+            [*command, *map(str, bags), "--config", str(self._config)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._began = time.monotonic()
+        self._say("identifying")
+        return True, "".join(["started", *left_out])
 
     def _on_cancel(self) -> tuple[bool, str]:
         if self._work is None:
             return False, "nothing runs"
-        self._work.cancel()
-        self._look()
+        self.stop()
+        self._say("cancelled")
         return True, "cancelled"
 
     def _look(self) -> None:
-        """Pass on the worker's progress; on success check the proof and publish the model."""
-        if self._work is None:
+        """When it has ended, check the proof and publish the model, or say why there is none."""
+        if self._work is None or self._work.poll() is None:
             return
-        progress = self._work.poll()
-        if progress.done:
-            self._work.cancel()
-            self._work = None
-            for left in progress.left_out:
-                self.get_logger().warning(f"left out: {left}")
-            if progress.what == "done":
-                progress = self._publish(progress)
-        if progress != self._said:
-            self._said = progress
-            self._report()
-
-    def _publish(self, progress: Progress) -> Progress:
+        status, (_, errors) = self._work.returncode, self._work.communicate()
+        self._work = None
         try:
+            if status:
+                said = errors.strip() or f"the process ended with status {status}"
+                raise DataError(said.removeprefix("error: "))
             verdict = check(self._out / documents.MODEL_PROOF)
             model = documents.load_stable_model(self._out / documents.MODEL)
         except (NlsidError, OSError) as error:
-            return replace(progress, what="failed", error=str(error))
+            self._say(f"failed: {error}", DiagnosticStatus.ERROR)
+            return
         self._model.publish(String(data=json.dumps(model.document())))
-        return replace(progress, what=str(verdict))
+        self._say(str(verdict))
+
+    def _say(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
+        self._level, self._text = level, text
+        self._report()
 
     def _report(self) -> None:
-        said = self._said
-        level = DiagnosticStatus.ERROR if said.error else DiagnosticStatus.OK
-        text = said.what + (f": {said.error}" if said.error else "")
-        values = {"progress": f"{said.fraction:.2f}", "out": str(self._out)}
-        if said.left_out:
-            values["left out"] = "; ".join(said.left_out)
-        self.report(level, text, values)
+        lasted = 0.0 if self._work is None else time.monotonic() - self._began
+        values = {"seconds": f"{lasted:.0f}", "out": str(self._out)}
+        self.report(self._level, self._text, values)
 
 
 main = entry_point(ModelIdentifier)

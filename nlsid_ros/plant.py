@@ -28,7 +28,7 @@ from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 
-MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
+MUJOCO = {f"mujoco_{name}": name for name in plants.FILES}
 KINDS = ("model", *MUJOCO)
 JUMP = 1.0  # s that the clock may be ahead or behind
 FOR = "for kind model"
@@ -115,10 +115,10 @@ class PlantNode(ManagedNode):
         self._plant = plant
         return response, command
 
-    def _make_robot(self, robot: plants.Robot) -> tuple[list[str], list[str]]:
+    def _make_robot(self, name: str) -> tuple[list[str], list[str]]:
         """Simulate a robot in MuJoCo; the paths of its joints."""
-        self._plant, self._noise = plants.Plant(robot, self._rng), 0.0
-        joints = range(robot.joints)
+        robot = plants.Plant(name, self._rng)
+        self._plant, self._noise, joints = robot, 0.0, range(robot.joints)
         states = [f"{STATES}:{f}[{i}]" for f in ("position", "velocity") for i in joints]
         return states, [f"{COMMANDS}:effort[{i}]" for i in joints]
 

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import rclpy
@@ -28,19 +28,19 @@ def entry_point(node: type[ManagedNode]) -> Callable[..., None]:
 
     def main(args: list[str] | None = None) -> None:
         try:
-            run_all([node], args)
+            run(node, args)
         except (NlsidError, OSError) as error:
             sys.exit(f"{node.name}: {error}")
 
     return main
 
 
-def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) -> None:
-    """Make the nodes, start each that starts itself, and spin until one is over, or until SIGINT,
+def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
+    """Make the node, start it if it starts itself, and spin until it is over, or until SIGINT,
     SIGTERM or SIGHUP (a terminal that is closed, unless `nohup` says that it does not matter).
 
     The signals are waited for here and not left to rclpy, which would end all communication before
-    the node could send a last command. Raises what made a node fail.
+    the node could send a last command. Raises what made the node fail.
     """
     woken = _wake_on_signals()
     shared_memory.avoid_what_is_stale()
@@ -48,32 +48,26 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         raise unreadable(error) from error
-    nodes: list[ManagedNode] = []
-    try:
-        for make in makes:
-            nodes.append(make())
-            if nodes[-1].autostart:
-                nodes[-1].start_itself()
+    with ExitStack() as ending:  # communication ends, also if the node cannot be stopped
+        ending.callback(try_shutdown)
+        node = make()
+        ending.callback(node.destroy_node)
+        if node.autostart:
+            node.start_itself()
         inspect.getframeinfo(sys._getframe())  # as rclpy does to log: the first takes 0.05 s
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        with _watched(nodes):
-            _spin(nodes, woken)
-    finally:
-        with ExitStack() as ending:  # each is stopped, also if another cannot be
-            ending.callback(try_shutdown)
-            for node in reversed(nodes):
-                ending.callback(node.destroy_node)
+        with _watched(node):
+            _spin(node, woken)
 
 
 @contextmanager
-def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
+def _watched(node: ManagedNode) -> Iterator[None]:
     """A watchdog beside this process, in a session of its own, where Ctrl-C does not reach it."""
-    if not all(node.is_watched for node in nodes):
+    if not node.is_watched:
         yield
         return
-    names = ", ".join(node.get_name() for node in nodes)
-    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), names]
+    command = [sys.executable, "-I", "-S", watchdog.__file__, str(os.getpid()), node.get_name()]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True) as watching:
         try:
             yield
@@ -81,15 +75,14 @@ def _watched(nodes: Sequence[ManagedNode]) -> Iterator[None]:
             watching.kill()
 
 
-def _spin(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
-    """Spin until a signal came, and what had arrived by then is handed on; or until a node is over.
+def _spin(node: ManagedNode, woken: socket.socket) -> None:
+    """Spin until a signal came, and what had arrived by then is handed on; or until it is over.
 
-    By `spin_once` with a timeout: without one the executor hears nothing. Raises what made that
-    node fail.
+    By `spin_once` with a timeout: without one the executor hears nothing. Raises what made the node
+    fail.
     """
     executor = EventsExecutor()
-    for node in nodes:
-        executor.add_node(node)
+    executor.add_node(node)
     asked = threading.Event()
 
     def wait() -> None:
@@ -97,13 +90,10 @@ def _spin(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
         executor.create_task(asked.set)  # goes to the end of the queue
 
     threading.Thread(target=wait, daemon=True).start()
-    while not asked.is_set():
+    while not (asked.is_set() or node.is_over):
         executor.spin_once(timeout_sec=0.1)
-        for node in nodes:
-            if node.is_over and node.failure is not None:
-                raise node.failure
-            if node.is_over:
-                return
+    if node.is_over and node.failure is not None:
+        raise node.failure
 
 
 def _wake_on_signals() -> socket.socket:

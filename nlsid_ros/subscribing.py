@@ -3,9 +3,8 @@
 import inspect
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from rclpy.node import Node
@@ -19,9 +18,8 @@ from bags.recordings.quality import Profile, profile_of
 from bags.signals.timing import Sequence
 from nlsid_core.errors import NlsidError
 from nlsid_ros import graph, qos
-from nlsid_ros.message_classes import installed_types, message_class
+from nlsid_ros.message_classes import definition_of, installed_types, message_class
 from nlsid_ros.messages import off_clock
-from nlsid_ros.type_descriptions import TypeDescriptions
 
 Received = Callable[[Any, dict[str, int]], None]
 STREAMED = 10  # messages, after which a topic's pace is known
@@ -195,18 +193,12 @@ class Recording(Protocol):
     def begin(self, topic: str, definition: Definition, offered: tuple[Profile, ...]) -> Received:
         """A topic's type is known, and what its publishers offered; what takes its messages."""
 
-    def lose(self, topic: str, count: int) -> None:
-        """So many messages on a topic came and could not wait."""
-
 
 class Source:
     """A topic's serialised messages with what the middleware says of each, as they came.
 
-    They wait, as many as its quality of service keeps, until there is a callback and `take`.
-
-    type_hash, offered: of the publishers that it was found by. lost: those messages that did not
-    wait until the callback was there; later ones are missing in the publisher's count of what it
-    sent.
+    They wait until `take`, as many as the topic's quality of service keeps; those that did not wait
+    are missing in the publisher's count of what it sent.
 
     The middleware's own event of lost messages is not asked for: rclpy takes it under a lock that
     Fast DDS holds while it tells of the next one, and both wait for ever.
@@ -217,25 +209,20 @@ class Source:
     ) -> None:
         self.topic = Topic(node, name, self._keep, qos.RECORDED)
         self.topic.look(msgtype, publishers)
-        self.type_hash = str(publishers[0].topic_type_hash)
-        self.offered = tuple(profile_of(publisher.qos_profile) for publisher in publishers)
-        self.callback: Received | None = None
-        self.lost = 0
         self._waiting: deque[tuple[bytes, dict[str, int]]] = deque()
 
     def _keep(self, data: bytes, info: dict[str, int]) -> None:
         """Keep a message until `take`."""
         if len(self._waiting) >= self.topic.profile.depth:
             self._waiting.popleft()
-            self.lost += self.callback is None
         self._waiting.append((data, info))
 
-    def take(self) -> None:
-        """Call back for every message that waits."""
+    def take(self, received: Received) -> None:
+        """Hand on every message that waits."""
         if self._waiting:
             self.topic.silence.end(len(self._waiting))
-        while self._waiting and self.callback is not None:
-            self.callback(*self._waiting.popleft())
+        while self._waiting:
+            received(*self._waiting.popleft())
 
     def odd(self) -> str:
         """Ask for what the publishers offer now; what is odd about them."""
@@ -249,46 +236,42 @@ class Source:
 class Subscriptions:
     """Call `look` and `take` now and then, `follow` about every second.
 
-    problems: why a topic is not recorded as wanted. warnings: what is odd about one that is.
+    given: definitions of types. problems: why a topic is not recorded as wanted. warnings: what is
+    odd about one that is.
     """
 
     def __init__(
         self,
         node: Node,
-        types: TypeDescriptions,
+        given: Mapping[str, Definition],
         recording: Recording,
         wanted: Iterable[Wanted],
     ) -> None:
         self.problems: dict[str, str] = {}
         self.warnings: dict[str, str] = {}
-        self._node, self._types, self._recording = node, types, recording
+        self._node, self._given, self._recording = node, given, recording
         self._patterns = [each.topic for each in wanted if each.is_pattern]
         self._waiting: dict[str, str] = {}
         self._sources: dict[str, Source] = {}
+        self._received: dict[str, Received] = {}
         self._known = set(UNASKED)
         for each in wanted:
             if not each.is_pattern:
                 self._expect(each.topic, each.msgtype)
 
     def look(self) -> None:
-        """Subscribe to topics that have publishers now; begin those whose type is defined."""
+        """Subscribe to topics that have publishers now."""
         for topic, _ in self._node.get_topic_names_and_types() if self._patterns else ():
             if topic not in self._known and any(fnmatchcase(topic, p) for p in self._patterns):
                 self._expect(topic, "")
         for topic in list(self._waiting):
             if publishers := self._node.get_publishers_info_by_topic(topic):
-                self._attempt(topic, partial(self._subscribe, topic, publishers))
-        for topic, source in list(self._sources.items()):
-            if source.callback is None:
-                self._attempt(topic, partial(self._begin, topic, source))
+                self._attempt(topic, publishers)
 
     def take(self) -> None:
         """Hand on what has come."""
         for topic, source in self._sources.items():
-            source.take()
-            if source.lost:
-                self._recording.lose(topic, source.lost)
-                source.lost = 0
+            source.take(self._received[topic])
 
     def follow(self) -> None:
         """Ask for what the publishers offer now, and say what is odd about a topic."""
@@ -306,19 +289,14 @@ class Subscriptions:
         self._known.add(topic)
         self._recording.expect(topic)
 
-    def _subscribe(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
+    def _attempt(self, topic: str, publishers: list[TopicEndpointInfo]) -> None:
+        """Subscribe to a topic, or give up recording it, and say why."""
         msgtype = self._waiting.pop(topic) or publishers[0].topic_type
-        self._sources[topic] = Source(self._node, topic, msgtype, publishers)
-
-    def _begin(self, topic: str, source: Source) -> None:
-        definition = self._types.find(source.topic.kind, source.type_hash)
-        if definition is not None:
-            source.callback = self._recording.begin(topic, definition, source.offered)
-
-    def _attempt(self, topic: str, work: Callable[[], None]) -> None:
-        """Do it, or give up recording the topic, and say why."""
         try:
-            work()
+            self._sources[topic] = Source(self._node, topic, msgtype, publishers)
+            kind = definition_of(msgtype, str(publishers[0].topic_type_hash), self._given)
+            offered = tuple(profile_of(each.qos_profile) for each in publishers)
+            self._received[topic] = self._recording.begin(topic, kind, offered)
         except NlsidError as error:
             if topic in self._sources:
                 self._sources.pop(topic).topic.drop()

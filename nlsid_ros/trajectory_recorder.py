@@ -32,7 +32,6 @@ from nlsid_ros.message_classes import message_class
 from nlsid_ros.running import ManagedNode, Parameter
 from nlsid_ros.starting import entry_point
 from nlsid_ros.subscribing import Received, Subscriptions, Wanted
-from nlsid_ros.type_descriptions import TypeDescriptions
 
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 WRITE = 0.05  # s between writing what has arrived
@@ -109,8 +108,7 @@ class TrajectoryRecorder(ManagedNode):
         else:
             self.get_logger().info("waiting for ~/start")
         self.keep_reporting(self._report)
-        types = TypeDescriptions(self, self._definitions)
-        self._topics = Subscriptions(self, types, self, self._wanted)
+        self._topics = Subscriptions(self, self._definitions, self, self._wanted)
         self.create_subscription(String, SAID_BY, self._on_experiment, qos.DOCUMENT)
         self.every(WRITE, self._take)
         self.every(DISCOVERY, self._topics.look)
@@ -193,11 +191,6 @@ class TrajectoryRecorder(ManagedNode):
             self._recent.add(arrival)
         if self._recording is not None:
             self._recording.add(arrival)
-
-    def lose(self, topic: str, count: int) -> None:
-        """Count messages that could not wait."""
-        if self._recording is not None:
-            self._recording.lose(topic, count)
 
     def _on_experiment(self, message: String) -> None:
         """Keep what an excitation says it does; how one ended is for the bag it was in."""

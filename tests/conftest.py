@@ -14,9 +14,8 @@ import pytest
 from typer.main import get_command
 
 from bags.chain.shipped import config_file
-from bags.designs.documents import FUNNEL, MODEL, MODEL_PROOF
+from bags.designs.documents import FUNNEL
 from nlsid import Dataset, Fit, OutputTube, Polynomial, Trajectory, f1tenth, identify
-from nlsid_core import files
 from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.models import DifferenceEquation
 from tests.verbs import nlsid
@@ -122,14 +121,6 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> OutputTubeDesign:
 def _tube(design: OutputTubeDesign) -> OutputTubeDesign:
     """The same, by a name that is not the verb's."""
     return design
-
-
-@pytest.fixture
-def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: OutputTubeDesign) -> Path:
-    """Model, policy, funnel and both proofs as files, as the command line writes them."""
-    design.save(tmp_path)
-    files.write_document(tmp_path / MODEL_PROOF, fit.proof.document(design.model, MODEL))
-    return tmp_path
 
 
 @pytest.fixture(scope="session")

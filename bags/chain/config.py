@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -92,6 +92,34 @@ class GridConfig(Section):
     def rules(self, clock: str) -> Grid:
         """The same as the reader's noun, with the clock."""
         return Grid(clock=clock, **self.model_dump())
+
+
+class RobotConfig(Section):
+    """What every configuration file says of its robot and of its messages."""
+
+    robot: Annotated[str, Key("what people call it", example="F1TENTH car, speed")]
+    clock: Annotated[
+        Clock,
+        Key(
+            "the signals' stamps: their messages' `header`, or, where some have none, `log`, the "
+            "times of logging, live of arrival",
+            example="log",
+        ),
+    ] = "header"
+    definitions: Annotated[
+        Files,
+        Key(
+            ".msg files or packages' folders that define types which the bags do not, seen from "
+            "the configuration",
+            example=["my_msgs/msg/Command.msg"],
+        ),
+    ] = ()
+    grid: Annotated[GridConfig, Key("how the numbers in messages become samples")]
+
+    def beside(self, path: Path | str) -> Self:
+        """The same with the paths in it as they are seen from its file."""
+        found = tuple(Path(path).parent / given for given in self.definitions)
+        return self.model_copy(update={"definitions": found})
 
 
 class SplitConfig(Section):
@@ -205,7 +233,7 @@ class FunnelConfig(Section):
 
 
 class MonitorConfig(Section):
-    """What the monitor compares with, and how long it waits."""
+    """What the monitor compares with."""
 
     nominal: Annotated[
         Literal["command", "profile"],
@@ -215,18 +243,6 @@ class MonitorConfig(Section):
             example="command",
         ),
     ] = "command"
-    stale_after: Annotated[
-        Positive | None,
-        Key(
-            "without a response after which the state is unknown (none: 4 periods, at least 0.1 s)",
-            unit="s",
-            example=0.1,
-        ),
-    ] = None
-    command_wait: Annotated[
-        NonNegative,
-        Key("for which a response waits for a command with its stamp", unit="s", example=0.02),
-    ] = 0.02
 
     @property
     def nominal_source(self) -> Centre:
@@ -234,28 +250,10 @@ class MonitorConfig(Section):
         return Centre(self.nominal)
 
 
-class Config(Section):
+class Config(RobotConfig):
     """One robot's configuration file."""
 
-    robot: Annotated[str, Key("what people call it", example="F1TENTH car, speed")]
     signals: Annotated[SignalsConfig, Key("which numbers are modelled, and which drive them")]
-    clock: Annotated[
-        Clock,
-        Key(
-            "the signals' stamps: their messages' `header`, or, where some have none, `log`, the "
-            "times of logging, live of arrival",
-            example="log",
-        ),
-    ] = "header"
-    definitions: Annotated[
-        Files,
-        Key(
-            ".msg files or packages' folders that define types which the bags do not, seen from "
-            "the configuration",
-            example=["my_msgs/msg/Command.msg"],
-        ),
-    ] = ()
-    grid: Annotated[GridConfig, Key("how the numbers in messages become samples")]
     split: Annotated[SplitConfig, Key("what the model is not fitted to")] = SplitConfig()
     identification: Annotated[
         Identification, Key("the class of models and the method", example={"lags": 4})
@@ -270,13 +268,10 @@ def load_config(path: Path | str) -> Config:
     What no later step could use is refused too (`refusals`). OS errors pass through.
     """
     config = read_yaml(path, Config)
-    folder = Path(path).parent
     if found := refusals(config):
         said = "\n".join(f"  {what}" for what in found)
         raise DataError(f"{path}: a later step could not use it:\n{said}")
-    return config.model_copy(
-        update={"definitions": tuple(folder / given for given in config.definitions)}
-    )
+    return config.beside(path)
 
 
 def refusals(config: Config) -> list[str]:
@@ -327,13 +322,6 @@ def _time_refusals(config: Config) -> Iterator[str]:
         yield (
             f"grid.max_gap: {max_gap:g} s is shorter than the period, {period:g} s, so that every "
             "sample would be in a gap; give at least 1.5 periods"
-        )
-    stale = config.monitor.stale_after
-    if stale is not None and stale <= period:
-        yield (
-            f"monitor.stale_after: {stale:g} s is not longer than the period, "
-            f"{period:g} s, so that the live monitor would call every response stale; give at "
-            "least 2 periods"
         )
     horizon = None if config.funnel is None else config.funnel.horizon
     if horizon is not None and round(horizon / period) < 1:

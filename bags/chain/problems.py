@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bags.monitoring.catching import Breaking, breaking
 from bags.signals.grid import read_dataset
 from bags.signals.sampling import Grid
 from nlsid_core import files
@@ -69,13 +68,12 @@ def measured(
     *,
     seconds: float | None,
     safety_factor: float,
-) -> tuple[MeasuredPush, Breaking]:
-    """What equations leave out of bags, and what would break the box around that.
+) -> MeasuredPush:
+    """What equations leave out of bags.
 
     wiring: where their states and inputs are; period 0: as the samples come. For the rest see
     `measured_push` and `read_dataset`, whose errors pass through.
     """
     grid = Grid(period=wiring.period or None)
     trials = read_dataset(bags, responses=wiring.response, excitations=wiring.command, grid=grid)
-    push = measured_push(field, trials, seconds=seconds, safety_factor=safety_factor)
-    return push, breaking(trials, lambda trial: push.used(field, trial))
+    return measured_push(field, trials, seconds=seconds, safety_factor=safety_factor)

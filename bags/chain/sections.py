@@ -11,7 +11,6 @@ from pydantic_core import ErrorDetails
 
 from bags.recordings.names import did_you_mean
 from nlsid_core.errors import DataError
-from nlsid_core.models import Signal
 
 MAX_CONFIG_BYTES = 2**20  # a configuration is a page of text
 
@@ -63,10 +62,6 @@ class SignalConfig(Section):
         ),
     ]
 
-    def signal(self) -> Signal:
-        """The same as the core's noun."""
-        return Signal(self.name, self.unit, self.path)
-
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -80,7 +75,8 @@ def read_yaml(path: Path | str, kind: type[AnySection]) -> AnySection:
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        raise DataError(f"{path}: not a valid configuration:\n{problems(error, kind)}") from error
+        wrong = "\n".join(f"  {_problem(details, kind)}" for details in error.errors())
+        raise DataError(f"{path}: not a valid configuration:\n{wrong}") from error
 
 
 def yaml_sections(path: Path | str) -> dict[str, Any]:
@@ -97,14 +93,6 @@ def yaml_sections(path: Path | str) -> dict[str, Any]:
     return content
 
 
-def problems(error: ValidationError, kind: type[Section]) -> str:
-    """A line for each wrong key: where it stands, what is allowed there, what was found.
-
-    kind: the section that the error is about, whose keys and units are then said.
-    """
-    return "\n".join(f"  {_problem(details, kind)}" for details in error.errors())
-
-
 def sections_in(annotation: Any) -> list[type[Section]]:
     """The sections that a value of this type may be, in lists and unions too."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
@@ -115,16 +103,15 @@ def sections_in(annotation: Any) -> list[type[Section]]:
 def _problem(details: ErrorDetails, kind: type[Section]) -> str:
     where = [str(part) for part in details["loc"]]
     found, message = details["input"], details["msg"].removeprefix("Value error, ")
-    if details["type"] == "extra_forbidden":
-        section, _ = _stands_in(kind, details["loc"])
-        message = no_such_key(where[-1], section.model_fields if section else ())
-    else:
-        section, key = _stands_in(kind, details["loc"])
-        if section is not None and (unit := _unit(section, key)):
-            message = f"{message}, in {unit}"
+    names = [part for part in details["loc"] if isinstance(part, str)]
+    known = _keys_at(kind, names[:-1])
+    is_unknown = details["type"] == "extra_forbidden"
+    if is_unknown:
+        message = no_such_key(names[-1], known)
+    elif names and names[-1] in known and (unit := known[names[-1]].unit):
+        message = f"{message}, in {unit}"
     said = f"{'.'.join(where)}: {message}"
-    is_of_key = message == "Field required" or details["type"] == "extra_forbidden"
-    return said if is_of_key else f"{said} (found {found!r:.60})"
+    return said if is_unknown or message == "Field required" else f"{said} (found {found!r:.60})"
 
 
 def no_such_key(key: str, known: Iterable[str]) -> str:
@@ -133,22 +120,16 @@ def no_such_key(key: str, known: Iterable[str]) -> str:
     return f"there is no such key; there are: {', '.join(known)}{did_you_mean(key, known)}"
 
 
-def _stands_in(
-    kind: type[Section] | None, where: Sequence[str | int]
-) -> tuple[type[Section] | None, str]:
-    """The section in which the last key of `where` stands, and the key; None if it is in none."""
-    section, key = kind, ""
-    for name in (part for part in where if isinstance(part, str)):
-        if key and section is not None:
-            inside = sections_in(section.model_fields[key].annotation)
-            section = inside[0] if inside else None
-        if section is None or (name not in section.model_fields and name != where[-1]):
-            return None, name
-        key = name
-    return section, key
+def _keys_at(kind: type[Section], names: Sequence[str]) -> dict[str, Key]:
+    """The keys of the section that these keys lead to, each in the one before; none if it is none.
 
-
-def _unit(section: type[Section], key: str) -> str:
-    field = section.model_fields.get(key)
-    found = [entry for entry in (field.metadata if field else ()) if isinstance(entry, Key)]
-    return found[0].unit if found else ""
+    Of several that a key may have the first.
+    """
+    section = kind
+    for name in names:
+        field = section.model_fields.get(name)
+        inside = sections_in(field.annotation) if field else []
+        if not inside:
+            return {}
+        section = inside[0]
+    return section.keys()

@@ -1,18 +1,17 @@
 """Recordings of simulated robots: repeats of an excitation, and runs of a tracking policy."""
 
-import hashlib
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bags.chain.joint_bags import write_joint_bag
-from bags.chain.plants import PERIOD, ROBOTS, Plant, Robot
+from bags.chain.plants import PERIOD, Plant
 from bags.chain.tracking_config import SimulationConfig, TrackingConfig
 from bags.chain.tracking_steps import feedback_of
 from bags.designs import documents
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.design.sampled.design import frame
 from nlsid_core.errors import DataError
 from nlsid_core.models.state_map import StateModel
@@ -21,25 +20,18 @@ from nlsid_core.running.observer import StateObserver
 
 TONES = 40  # sines of an excitation
 LOWEST, HIGHEST = 0.05, 1.5  # Hz: slower than the robots swing, and faster
+SOURCE = {"source": "MuJoCo"}  # custom data of the bags
 
 
 def simulate_excitations(config: TrackingConfig, out: Path) -> list[Path]:
     """Bags of the configured simulated robot under repeated excitations, in `out`."""
-    robot, options = _simulated(config)
-    data = record_repeats(
-        robot,
-        peak=np.array(options.peak),
-        groups=options.groups,
-        repeats=options.repeats,
-        seconds=options.seconds,
-        seed=options.seed,
-    )
-    return [write_joint_bag(out, trial, custom={"source": "MuJoCo"}) for trial in data]
+    repeats = record_repeats(_simulated(config))
+    return [write_joint_bag(out, run, custom=SOURCE) for run in repeats]
 
 
 def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]:
     """Commissioning bags: the policy of the folder `design` on the simulated robot, in `out`."""
-    robot, options = _simulated(config)
+    options = _simulated(config)
     given = documents.load_unproved(design)
     model, policy = given.model, given.policy
     norms = frame(model, policy, feedback_of(model, policy.x, policy.u, config))
@@ -49,9 +41,10 @@ def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]
         z = rng.standard_normal(len(model))
         radius = options.spread * norms.cap[0] * rng.uniform() / np.linalg.norm(z)
         start = policy.x[0] + np.linalg.solve(norms.S[0], radius * z)
-        run = run_policy(robot, model, policy, seed=int(rng.integers(2**31)), start=start)
-        run = replace(run, name=f"{robot.name}_run_{index}")
-        written.append(write_joint_bag(out, run, custom={"source": "MuJoCo"}))
+        plant = Plant(options.robot, np.random.default_rng(int(rng.integers(2**31))))
+        y, u = run_policy(plant, model, policy, start)
+        name = f"{options.robot}_run_{index}"
+        written.append(write_joint_bag(out, _trajectory(y, u, name), custom=SOURCE))
     return written
 
 
@@ -66,75 +59,51 @@ def multisine(rng: np.random.Generator, samples: int, peak: FloatArray) -> Float
     return np.stack(columns, axis=1)
 
 
-def record_repeats(
-    robot: Robot, *, peak: FloatArray, groups: int, repeats: int, seconds: float, seed: int
-) -> Dataset:
-    """`groups` excitations from rest, each `repeats` times with new sensor noise."""
-    runs = []
-    for group in range(groups):
-        u = multisine(np.random.default_rng([seed, group]), round(seconds / PERIOD), peak)
-        for repeat in range(repeats):
-            plant = Plant(robot, np.random.default_rng([seed, group, repeat]))
-            y = np.empty((len(u), 2 * robot.joints))
+def record_repeats(options: SimulationConfig) -> Iterator[Trajectory]:
+    """Excitations from rest, each repeated with new sensor noise."""
+    samples = round(options.seconds / PERIOD)
+    for group in range(options.groups):
+        rng = np.random.default_rng([options.seed, group])
+        u = multisine(rng, samples, np.array(options.peak))
+        for repeat in range(options.repeats):
+            plant = Plant(options.robot, np.random.default_rng([options.seed, group, repeat]))
+            y = np.empty((len(u), 2 * plant.joints))
             for k, torque in enumerate(u):
                 y[k] = plant.measure()
                 plant.step(torque)
-            name = f"{robot.name}_{group}_{repeat}"
-            runs.append(_trajectory(robot, y, u, name, f"excitation_{group}"))
-    return Dataset(tuple(runs))
+            name = f"{options.robot}_{group}_{repeat}"
+            yield _trajectory(y, u, name, f"excitation_{group}")
 
 
 def run_policy(
-    robot: Robot,
-    model: StateModel,
-    policy: SampledPolicy,
-    *,
-    seed: int,
-    start: FloatArray | None = None,
-) -> Trajectory:
-    """One run of the policy on the robot; N + 1 samples.
+    plant: Plant, model: StateModel, policy: SampledPolicy, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """One run of the policy on the robot: N + 1 samples of the state, and of the torques.
 
-    The estimate starts at `start` (default: the nominal), the robot a measurement error from it.
+    The estimate starts at `start`, the robot a measurement error from it.
     """
-    plant = Plant(robot, np.random.default_rng(seed))
-    first = policy.x[0] if start is None else start
-    plant.reset(first)
-    plant.reset(2 * first - plant.measure())
+    plant.reset(start)
+    plant.reset(2 * start - plant.measure())
     observer = StateObserver(model, policy.L)
-    y, u = np.empty((len(policy) + 1, len(model))), np.zeros((len(policy) + 1, robot.joints))
+    y, u = np.empty((len(policy) + 1, len(model))), np.zeros((len(policy) + 1, plant.joints))
     for k in range(len(policy) + 1):
-        y[k] = plant.measure() if k else first
+        y[k] = plant.measure() if k else start
         x = observer.update(y[k], u[k - 1] if k else None)
         if k < len(policy):
             u[k] = policy(k, x)
             plant.step(u[k])
-    return _trajectory(robot, y, u, f"{robot.name}_run_{seed}", "")
+    return y, u
 
 
-def _trajectory(robot: Robot, y: FloatArray, u: FloatArray, name: str, group: str) -> Trajectory:
-    n = robot.joints
-    content = hashlib.sha256(y.tobytes() + u.tobytes()).hexdigest()
-    return Trajectory(
-        t=np.arange(len(y)) * PERIOD,
-        y=y,
-        u=u,
-        y_names=tuple(f"{kind}_{i}" for kind in ("angle", "rate") for i in range(n)),
-        u_names=tuple(f"torque_{i}" for i in range(n)),
-        y_units=("rad",) * n + ("rad/s",) * n,
-        u_units=("N m",) * n,
-        name=name,
-        group=group,
-        digest=f"sha256:{content}",
-    )
+def _trajectory(y: FloatArray, u: FloatArray, name: str, group: str = "") -> Trajectory:
+    return Trajectory(t=np.arange(len(y)) * PERIOD, y=y, u=u, name=name, group=group)
 
 
-def _simulated(config: TrackingConfig) -> tuple[Robot, SimulationConfig]:
+def _simulated(config: TrackingConfig) -> SimulationConfig:
     options = config.simulation
     if options is None:
         raise DataError(f"{config.robot} is not simulated: its configuration has no 'simulation'")
-    if options.robot not in ROBOTS:
-        raise DataError(f"no simulated robot '{options.robot}'; there are: {', '.join(ROBOTS)}")
-    robot = ROBOTS[options.robot]
-    if len(options.peak) != robot.joints:
-        raise DataError(f"peak: {robot.name} has {robot.joints} joints, not {len(options.peak)}")
-    return robot, options
+    joints = Plant(options.robot, np.random.default_rng()).joints
+    if len(options.peak) != joints:
+        raise DataError(f"peak: {options.robot} has {joints} joints, not {len(options.peak)}")
+    return options

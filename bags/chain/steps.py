@@ -12,7 +12,7 @@ import numpy as np
 from bags.chain.config import Config, SplitConfig
 from bags.chain.sections import SignalConfig
 from bags.chain.tracking_config import TrackingConfig
-from bags.chain.training import load_held_back, load_training, save_held_back, save_training
+from bags.chain.training import load_trials, save_trials
 from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
@@ -116,7 +116,7 @@ class Identified:
 def identify_bags(
     bags: Sequence[Path], config: Config, out: Path, *, progress: Progress
 ) -> Identified:
-    """Bags in; model.json, model.proof.json, training.npz, held_back.npz and report.html in `out`.
+    """Bags in; model.json, model.proof.json, trials.npz and report.html in `out`.
 
     Raises DataError (BagError for bags) before anything is written.
     """
@@ -125,33 +125,22 @@ def identify_bags(
 
 
 def identify_trials(trials: Trials, config: Config, out: Path, *, progress: Progress) -> Identified:
-    """The same of trials that were read already."""
+    """The same of trials that were read already.
+
+    A proof file of an earlier model does not stay beside an unproved one.
+    """
     fit = config.identification.identify(
         trials.train,
         test=trials.test,
         progress=part(progress, 0.5, 0.9),
     )
-    return write_identified(fit, trials, config, out, progress=progress)
-
-
-def write_identified(
-    fit: Fit[Model], trials: Trials, config: Config, out: Path, *, progress: Progress
-) -> Identified:
-    """The files of one fit; a proof file of an earlier model does not stay beside an unproved."""
     out.mkdir(parents=True, exist_ok=True)
-    training, path, proof = (
-        out / name for name in (documents.TRAINING, documents.MODEL, documents.MODEL_PROOF)
+    kept, path, proof = (
+        out / name for name in (documents.TRIALS, documents.MODEL, documents.MODEL_PROOF)
     )
-    model: Model = replace(fit.model, training=save_training(training, trials.train))
+    model: Model = replace(fit.model, training=save_trials(kept, trials.by_use))
     files.write_document(path, model.document())
-    held_back = out / documents.HELD_BACK
-    parts = {"test": trials.test, "calibration": trials.calibration}
-    save_held_back(
-        held_back,
-        {use: data for use, data in parts.items() if data is not None},
-        model=files.digest(model.document()),
-    )
-    written = [path, training, held_back]
+    written = [path, kept]
     if fit.chosen.proof is None:
         proof.unlink(missing_ok=True)
     else:
@@ -340,8 +329,8 @@ def design_funnel_files(
     """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
     A tube around the simulation of a model of any class; with a profile around a plan of a linear
-    one as well, with the policy that tracks it, policy.json. The observer is chosen on training.npz
-    beside the model, the disturbance measured on the calibration trials of held_back.npz, without
+    one as well, with the policy that tracks it, policy.json. The observer is chosen on the
+    training trials beside the model, the disturbance measured on the calibration trials, without
     which every second training trial is one. false_alarms: see `OutputTube`. Raises DataError or
     Infeasible.
     """
@@ -371,24 +360,19 @@ def design_funnel_files(
             lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
         )
     )
-    refuse_unjudgeable(trials.calibration if test is None else test, found.funnel.settling)
+    refuse_unjudgeable(test, found.funnel.settling)
     if found.policy is None:
         (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
     found.save(out)
     return found
 
 
-def what_a_funnel_catches(
-    model_path: Path, config: Config, design: OutputTubeDesign
-) -> Catching | None:
-    """What a designed funnel catches in the test trials beside its model; None if there are none.
+def what_a_funnel_catches(model_path: Path, config: Config, design: OutputTubeDesign) -> Catching:
+    """What a designed funnel catches in the test trials beside its model.
 
     The trials are held against the model driven by the recorded commands. Raises DataError.
     """
-    model = design.model
-    trials, test = _trials_beside(model_path, config, model)
-    if test is None:
-        return None
+    trials, test = _trials_beside(model_path, config, design.model)
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
     return what_it_catches(
         design,
@@ -400,43 +384,31 @@ def what_a_funnel_catches(
 
 def _trials_beside(
     model_path: Path, config: Config, model: StableModel
-) -> tuple[CalibrationTrials, Dataset | None]:
-    """The trials that design and scale the tube of a model, and the test trials if they are kept.
+) -> tuple[CalibrationTrials, Dataset]:
+    """The trials that design and scale the tube of a model, and the test trials.
 
-    Raises DataError if those that the configuration names are not there.
+    Raises DataError if they are not those that the configuration names.
     """
-    train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
-    held_back = load_held_back(
-        model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
-    )
-    if config.split.calibration and "calibration" not in held_back:
-        raise DataError(
-            f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
-            "calibration trials; run `nlsid identify` with this configuration"
-        )
-    _refuse_another_split(model_path, held_back, config)
+    kept = load_trials(model_path.with_name(documents.TRIALS), digest=model.training)
+    _refuse_another_split(model_path, kept, config)
     assert config.funnel is not None
-    least = least_window(model, train, config.funnel.horizon)
-    trials = calibration_trials(train, held_back.get("calibration"), least=least)
-    return trials, held_back.get("test")
+    least = least_window(model, kept["training"], config.funnel.horizon)
+    trials = calibration_trials(kept["training"], kept.get("calibration"), least=least)
+    return trials, kept["test"]
 
 
-def _refuse_another_split(
-    model_path: Path, held_back: Mapping[str, Dataset], config: Config
-) -> None:
+def _refuse_another_split(model_path: Path, kept: Mapping[str, Dataset], config: Config) -> None:
     """Raise DataError if the trials beside a model are not those that the configuration names.
 
     Of many bags some may have been left out when the model was identified.
     """
     were_left_out = model_path.with_name(documents.FLEET).exists()
-    for use in ("test", "calibration") if config.split.share is None else ("calibration",):
-        if use not in held_back:
-            continue
-        named, kept = getattr(config.split, use), held_back[use].names
-        absent = [name for name in named if not _of_bags(kept, [name])]
-        others = set(kept) - set(_of_bags(kept, named))
-        if others or (absent and not were_left_out):
+    for use in USES if config.split.share is None else USES[1:]:
+        named, names = getattr(config.split, use), kept[use].names if use in kept else ()
+        absent = [name for name in named if not _of_bags(names, [name])]
+        others = set(names) - set(_of_bags(names, named))
+        if others or (absent and not (were_left_out and names)):
             raise DataError(
                 f"split.{use} names {listed(absent or named)}, and the {use} trials beside the "
-                f"model are {listed(kept)}: run `nlsid identify` with this configuration"
+                f"model are {listed(names)}: run `nlsid identify` with this configuration"
             )

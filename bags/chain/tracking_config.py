@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from bags.chain.config import Clock, GridConfig
+from bags.chain.config import RobotConfig
 from bags.chain.sections import (
     Key,
     NonNegative,
@@ -96,24 +96,16 @@ class SimulationConfig(Section):
     seed: Annotated[int, Field(ge=0), Key("of what is random", "", 0)] = 0
 
 
-class TrackingConfig(Section):
+class TrackingConfig(RobotConfig):
     """One robot's configuration file where its state is measured and it tracks a motion."""
 
-    robot: Annotated[str, Key("what people call it", example="arm")]
     signals: Annotated[StateSignals, Key("the measured state and the inputs")]
-    clock: Annotated[Clock, Key("as in the file without a motion", example="log")] = "header"
-    grid: Annotated[GridConfig, Key("as in the file without a motion")]
     identification: Annotated[StateIdentification, Key("which model of the measured state")]
     motion: Annotated[MotionConfig, Key("the motion to follow")]
     disturbance: Annotated[DisturbanceConfig, Key("what is assumed of the disturbance")] = (
         DisturbanceConfig()
     )
     simulation: Annotated[SimulationConfig | None, Key("only for a robot that is simulated")] = None
-
-    @property
-    def definitions(self) -> tuple[Path, ...]:
-        """Message types are those of the bags."""
-        return ()
 
 
 def is_tracking(path: Path | str) -> bool:
@@ -123,4 +115,4 @@ def is_tracking(path: Path | str) -> bool:
 
 def load_tracking_config(path: Path | str) -> TrackingConfig:
     """Read and check a configuration; DataError lists every wrong key with where it stands."""
-    return read_yaml(path, TrackingConfig)
+    return read_yaml(path, TrackingConfig).beside(path)

@@ -8,10 +8,9 @@ import numpy as np
 from bags.chain.steps import read_signals_of
 from bags.chain.tracking_config import TrackingConfig
 from bags.designs import documents
-from bags.monitoring.catching import Breaking, breaking
 from bags.pictures.report import report_available
 from nlsid_core import files
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import SampledTracking, design
 from nlsid_core.design.sampled.design import TrackingDesign, assume
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
@@ -20,7 +19,6 @@ from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress
-from nlsid_core.running.assumption import DisturbanceMeter, disturbance_of
 
 
 def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path) -> StateFit:
@@ -72,17 +70,6 @@ def widest_start(made: TrackingDesign, runs: Dataset) -> float:
     """How far out of the inlet's boundary, 1, the runs started at most."""
     first = [trial.y[0] - made.policy.x[0] for trial in runs]
     return max(made.funnel.norm(0, x_bar) / float(made.funnel.inlet[0]) for x_bar in first)
-
-
-def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
-    """Count by fault how many copies of these runs break the proof's assumption."""
-    meter = DisturbanceMeter(made.funnel.S, made.funnel.A)
-
-    def used(run: Trajectory) -> float:
-        sizes = disturbance_of(made.model, made.policy, run, meter)
-        return float(np.max(sizes)) / made.funnel.assumption.bound
-
-    return breaking(runs, used)
 
 
 def feedback_of(

@@ -138,13 +138,9 @@ def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> O
         catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
     show.say_tube(out, design)
+    tables.say_catching(out, catching)
     written = [folder / name for name in design.documents()]
-    if catching is None:
-        out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
-    else:
-        tables.say_catching(out, catching)
-        written += write_catching(folder, catching)
-    show.say_written(out, written)
+    show.say_written(out, [*written, *write_catching(folder, catching)])
     return design
 
 
@@ -153,7 +149,6 @@ def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path
     from bags.chain.problems import load_problem, measured
     from bags.commands import show
     from bags.designs import documents
-    from bags.pictures import tables
     from nlsid_core import files
     from nlsid_core.design import design
 
@@ -166,14 +161,13 @@ def _around_trajectory(folder: Path, given: Given, wired: Wired, bags: list[Path
         )
     if wiring is not None:
         field: Any = problem.dynamics
-        push, broken = measured(
+        push = measured(
             field,
             bags,
             wiring,
             seconds=given.seconds or None,
             safety_factor=given.safety_factor,
         )
-        out.print(tables.breaking_table(broken))
         problem = replace(problem, dynamics=field.pushed(push.box))
 
     with progress_bar("designing") as progress:
@@ -359,12 +353,7 @@ def learn(
     from bags.setup.written import yaml_text
     from nlsid_core.files import write_atomically
 
-    proposal = models_cli.proposed(folder, bags, signals, definitions, robot="robot", yes=True)
-    if proposal.doubts:
-        raise DataError(
-            f"{proposal.doubts[0]}. Name the signals with -y and -u; or, if they are right, go on "
-            f"with nlsid identify {folder}"
-        )
+    proposal = models_cli.proposed(folder, bags, signals, definitions, robot="robot")
     for left in reversed(range(MODELS)):
         settings = load_config(folder / CONFIG)
         try:

@@ -206,7 +206,6 @@ def _say_verdicts(found: FleetVerdict) -> None:
     _say_bags("outside, or what is assumed broken", bad)
     for what, title in (
         ("unjudged", "not judged whole"),
-        ("clock", "clock"),
         ("beyond", "commanded beyond training"),
         ("alarm", "only the second alarm"),
     ):

@@ -1,14 +1,12 @@
-"""`nlsid init`: a first configuration from bags, confirmed on a terminal or said by options."""
+"""`nlsid init`: a first configuration from bags, with what a person should mind."""
 
 import os
 import shlex
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -18,7 +16,7 @@ from bags.commands.options import progress_bar
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
-from bags.setup.candidates import Found, choose, look
+from bags.setup.candidates import choose, look
 from bags.setup.proposal import Proposal
 from bags.setup.proposing import Chosen, beside, propose
 from bags.setup.written import yaml_text
@@ -27,18 +25,14 @@ from nlsid_core.errors import BagError, DataError, counted, percent
 from nlsid_core.files import write_atomically
 from nlsid_core.identification import Choice
 
-SHOWN = 9  # pairs beside a question
 NAMED = 3  # bags that a command names one by one
 MANY = "BAGS"
-ROLES = ("excitation", "response")
 
 
-def run_init(
-    console: Console, bags: Sequence[Path], target: Path, given: Chosen, *, yes: bool
-) -> Proposal:
-    """Look, try it on the bags, ask what nobody said, write the YAML; DataError if `target` exists.
+def run_init(console: Console, bags: Sequence[Path], target: Path, given: Chosen) -> Proposal:
+    """Look, try it on the bags, write the YAML; DataError if `target` exists.
 
-    Without a terminal what is not said has to be accepted by `yes`.
+    Of signals that nobody named the likeliest are taken.
     """
     if target.exists():
         raise DataError(f"{target} exists already; give another folder, or remove it")
@@ -50,12 +44,6 @@ def run_init(
         responses, excitations = (
             _expanded(bag, texts) for texts in (given.responses, given.excitations)
         )
-    asked = not yes and not (responses and excitations)
-    if asked and not sys.stdin.isatty():
-        raise DataError(
-            "nobody is at a terminal to choose signals: name them with --response and "
-            "--excitation, or take the likeliest ones with --yes"
-        )
     chosen_y, chosen_u = choose(found, responses, excitations)
     chosen = replace(
         given,
@@ -66,12 +54,6 @@ def run_init(
     with progress_bar("trying models") as progress:
         proposal = propose(folders, found, chosen, widen=not excitations, progress=progress)
     proposal.walls += beside(proposal, found) if not responses else []
-    if asked:
-        drives, answers = (_paths(proposal, role) for role in ROLES)
-        _show_others(console, found, {*drives, *answers})
-        _confirm(console, f"{', '.join(drives)} drives and {', '.join(answers)} answers?")
-    for doubt in () if yes else dict.fromkeys(proposal.doubts):
-        _confirm(console, doubt)
     if given.definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
             os.path.relpath(path, target.parent) for path in given.definitions
@@ -88,13 +70,11 @@ def _expanded(bag: Bag, texts: Sequence[str]) -> list[str]:
     return [element for elements in expand for element in elements]
 
 
-def _paths(proposal: Proposal, role: str) -> list[str]:
-    return [signal["path"] for signal in proposal.content["signals"][role]]
-
-
 def _say(console: Console, proposal: Proposal, target: Path) -> None:
     """What was chosen and why, and what to mind."""
-    for text in (path for role in ROLES for path in _paths(proposal, role)):
+    signals = proposal.content["signals"]
+    for signal in (*signals["excitation"], *signals["response"]):
+        text = signal["path"]
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
     if proposal.choice is not None:
         console.print(tried_table(proposal.choice))
@@ -141,27 +121,6 @@ def tried_table(choice: Choice) -> Table:
     for row in (row for row in choice.rows if row not in judged):
         table.add_row(escape(str(row.attempt)), escape(row.refusal), style="dim")
     return table
-
-
-def _show_others(console: Console, found: Found, taken: set[str]) -> None:
-    """Which other pairs of signals were seen, the likeliest first."""
-    others = [pair for pair in found.pairs if not {pair.command.text, pair.response.text} <= taken]
-    for pair in others[:SHOWN]:
-        console.print(
-            f"  {pair.command.text} drives {pair.response.text}: {pair}",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-
-
-def _confirm(console: Console, question: str) -> None:
-    """Ask what may be wrong; DataError unless somebody says that it is right."""
-    if not sys.stdin.isatty():
-        raise DataError(f"{question} Give --yes to take it as it is")
-    console.print(question, soft_wrap=True, markup=False, style="dark_orange3")
-    if not typer.confirm("take it as it is?", default=False):
-        raise DataError("nothing was written: name what is right with --response and --excitation")
 
 
 def said_briefly(bags: Sequence[Path]) -> str:

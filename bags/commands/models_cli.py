@@ -26,6 +26,7 @@ from bags.commands.options import (
     out,
     progress_bar,
 )
+from nlsid_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,18 +42,16 @@ def init(
     signals: Signals,
     definitions: DefinitionsOption = None,
     robot: Annotated[str, typer.Option(help="The robot's name.")] = "robot",
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nothing: take the likeliest signals, doubts and all.")
-    ] = False,
 ) -> None:
     """Write a first configuration from bags, DIR/robot.yaml: signals, period, split, model, tube.
 
     It is tried on the bags, and every key says why it is as it is. What later steps will meet is
-    said first. Status 1 if nothing can be identified from these bags.
+    said first. Of signals that you do not name the likeliest are taken. Status 1: nothing can be
+    identified from these bags. Status 2: it is written, and a person has to look at it.
     """
     from bags.commands.init import say_next
 
-    proposed(folder, bags, signals, definitions, robot=robot, yes=yes)
+    proposed(folder, bags, signals, definitions, robot=robot)
     say_next(out, folder, bags)
 
 
@@ -63,9 +62,11 @@ def proposed(
     definitions: list[Path] | None,
     *,
     robot: str,
-    yes: bool,
 ) -> Proposal:
-    """Write the first configuration; Exit with status 1 if nothing can be identified."""
+    """Write the first configuration; Exit with status 1 if nothing can be identified.
+
+    Raises DataError, when it is written, if a person has to decide whether it is right.
+    """
     from bags.commands.init import run_init
     from bags.setup.candidates import Unfit
     from bags.setup.proposing import Chosen
@@ -77,10 +78,16 @@ def proposed(
         tuple(definitions or ()),
     )
     try:
-        return run_init(out, bags, folder / CONFIG, chosen, yes=yes)
+        proposal = run_init(out, bags, folder / CONFIG, chosen)
     except Unfit as reason:
         err.print(f"nothing was written: {reason}", soft_wrap=True, markup=False)
         raise typer.Exit(1) from reason
+    if proposal.doubts:
+        raise DataError(
+            f"{proposal.doubts[0]}. Name the signals with -y and -u; or, if they are right, go on "
+            f"with nlsid identify {folder}"
+        )
+    return proposal
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 """
 
 import base64
-import hashlib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -24,7 +23,6 @@ from nlsid_core import proofs
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import CertificateRejected, DocumentError, NlsidError
 from nlsid_core.funnels.tube import TubeFunnel
-from nlsid_core.kernel import Verdict
 
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -32,7 +30,6 @@ PRINT = """
 nav a { margin-right: 1rem; display: inline-block }
 figure { margin: 1rem 0 } figure img { max-width: 100% }
 section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
-td code { white-space: normal }
 @media screen and (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem }
   svg, figure img { max-width: 200% } }
 @page { size: A4; margin: 15mm }
@@ -60,11 +57,10 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
 
     Raises DocumentError if the folder has neither a proof nor a report.
     """
-    proofs = {path.name: _decided(path) for path in sorted(folder.glob("*.proof.json"))}
-    decided = "".join(_proof(name, found) for name, found in proofs.items())
+    decided = "".join(map(_proof, sorted(folder.glob("*.proof.json"))))
     is_rejected = REJECTED in decided
     model = _model_chapter(folder / documents.REPORT)
-    if not proofs and not model:
+    if not decided and not model:
         raise DocumentError(
             f"{folder}: no proof and no {documents.REPORT} to make a report of; `nlsid learn` "
             "makes both"
@@ -79,7 +75,6 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
         **(held or {}),
         "The model": model,
         "Pictures": _pictures(folder, without=in_model) + drawn,
-        "Files": _files(folder, proofs),
     }
     present = [(title, text) for title, text in chapters.items() if text]
     links = "".join(f'<a href="#c{k}">{title}</a>' for k, (title, _) in enumerate(present))
@@ -126,21 +121,15 @@ def recorded(
     }
 
 
-def _decided(path: Path) -> Verdict | str:
-    """A certificate, decided now: the verdict, or why it is none."""
+def _proof(path: Path) -> str:
+    """A proof, decided now, in words: what holds and what it assumes, or why it is none."""
+    name = escape(path.name)
     try:
-        return proofs.check(path)
+        said, *assuming = str(proofs.check(path)).split("\n")
     except (CertificateRejected, OSError) as refusal:
-        return str(refusal)
-
-
-def _proof(name: str, found: Verdict | str) -> str:
-    """What was decided of it, in words."""
-    if isinstance(found, str):
-        return f'<h3>{escape(name)}</h3><p class="not">{REJECTED}: {escape(found)}</p>'
-    said, *assuming = str(found).split("\n")
+        return f'<h3>{name}</h3><p class="not">{REJECTED}: {escape(str(refusal))}</p>'
     assumptions = "".join(f"<li>{escape(line.strip())}</li>" for line in assuming)
-    return f'<h3>{escape(name)}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
+    return f'<h3>{name}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
 
 
 def _model_chapter(report: Path) -> str:
@@ -202,28 +191,3 @@ def _drawn(folder: Path, design: AnyDesign) -> str:
 
     figure = plots.svg(tubes.draw_tube(design))
     return f"<figure>{figure}<figcaption>{FUNNEL_CAPTION}</figcaption></figure>"
-
-
-def _files(folder: Path, proofs: Mapping[str, Verdict | str]) -> str:
-    """Every file with its digest, and of which proofs it is a part, byte for byte."""
-    parts: dict[str, list[str]] = {}
-    for name, found in proofs.items():
-        for role, digest in {} if isinstance(found, str) else found.digests.items():
-            part = "decided" if role == "proof" else f"{role} of {name}"
-            parts.setdefault(digest, []).append(part)
-    rows = []
-    for path in sorted(folder.iterdir()):
-        if path.is_file() and path.stem != Path(documents.DESIGN_REPORT).stem:
-            with path.open("rb") as stream:
-                digest = f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
-            size = f"{path.stat().st_size / 1e3:,.1f}\N{NO-BREAK SPACE}kB"
-            rows.append((path.name, size, digest, parts.get(digest, [])))
-    here = {digest for _, _, digest, _ in rows}
-    rows += [("not in this folder", "-", digest, parts[digest]) for digest in parts.keys() - here]
-    body = "".join(
-        f"<tr><td>{escape(name)}</td><td>{length}</td><td>{escape('; '.join(part)) or '-'}</td>"
-        f"<td><code>{escape(digest)}</code></td></tr>"
-        for name, length, digest, part in rows
-    )
-    head = "<tr><th>file</th><th>size</th><th>part of a proof</th><th>digest</th></tr>"
-    return f'<table class="left"><thead>{head}</thead><tbody>{body}</tbody></table>'

@@ -188,7 +188,7 @@ def replay_lines(replay: Replay) -> Iterator[str]:
         yield f"{replay.name}: outside at {left.t:.3f} s, the first time"
     if (alarm := replay.first_alarm) is not None:
         yield f"{replay.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
-    for said in filter(None, (replay.beyond, replay.clock, replay.said_filled, replay.said_wide)):
+    for said in filter(None, (replay.beyond, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
     if not replay.judged:
         if not replay.paced:  # said of all such bags together

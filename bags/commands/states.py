@@ -40,9 +40,7 @@ def funnel(bags: Sequence[Path], config: TrackingConfig, folder: Path) -> Tracki
         f"the largest of {len(a.measured_on)} runs; the monitor watches it",
         soft_wrap=True,
     )
-    recorded = read_signals_of(bags, config)
-    out.print(tables.breaking_table(tracking_steps.what_breaks(made, recorded)))
-    widest = tracking_steps.widest_start(made, recorded)
+    widest = tracking_steps.widest_start(made, read_signals_of(bags, config))
     if widest < 1.0:
         tables.warn(
             out,

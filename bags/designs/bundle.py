@@ -1,7 +1,7 @@
 """A design's files as one text, which is published once and decided again by whoever receives it.
 
-What arrives is untrusted. A `Check` has it decided in a process of its own, with limits of time and
-memory, so that neither a large proof nor a hostile one holds up the loop that waits for it.
+What arrives is untrusted. It is decided in a process of its own, with limits of time and memory, so
+that neither a large proof nor a hostile one holds up the loop that waits for it.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from nlsid_core.deciding import USUAL, Deciding, Limits
 from nlsid_core.designs import AnyDesign, Design, Wiring
 from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError
 from nlsid_core.funnels import ContinuousFunnel, SampledFunnel, TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.checking import read_regular
@@ -155,46 +155,6 @@ class Bundle:
             own = files.parse_document(self.contents[stage], source=stage)
             stages.append(_design(parts, own, wiring, None))
         return replace(stages[0], certificate=proof, decision=decision, parts=tuple(stages))
-
-
-class Check:
-    """Has the kernel decide a bundle's text in a process of its own; `poll` until it answers."""
-
-    def __init__(self, text: str, limits: Limits = USUAL) -> None:
-        self.text, self._deciding = text, None
-        self._refusal = ""
-        try:
-            self._bundle = Bundle.parse(text)
-            self._deciding = self._bundle.deciding(limits)
-        except NlsidError as refusal:
-            self._refusal = str(refusal)
-
-    def poll(self) -> Json | None:
-        """None while it works; then `proved` with the sentence, or `refused` with the reason.
-
-        digest: the funnel's. before: whether this machine had decided it.
-        """
-        if self._deciding is None:
-            return {"refused": self._refusal}
-        try:
-            verdict = self._deciding.poll()
-            if verdict is None:
-                return None
-            self._bundle.refuse_others(verdict)
-        except NlsidError as refusal:
-            return {"refused": str(refusal)}
-        before = self._deciding.before
-        return {"proved": str(verdict), "digest": self._bundle.digest, "before": before}
-
-    @property
-    def seconds(self) -> float:
-        """s since it began."""
-        return 0.0 if self._deciding is None else self._deciding.seconds
-
-    def close(self) -> None:
-        """Stop the check if it runs, and release its process and files."""
-        if self._deciding is not None:
-            self._deciding.close()
 
 
 # What goes with a funnel of each kind: a policy of which type (None: or none), and which models.

@@ -15,8 +15,7 @@ from nlsid_core.running.stage import Stage
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
 MODEL_PROOF = "model.proof.json"
-TRAINING = "training.npz"
-HELD_BACK = "held_back.npz"
+TRIALS = "trials.npz"
 FLEET = "fleet.sqlite"  # what was read of many bags
 REPORT = "report.html"
 DESIGN_REPORT = "design.html"

@@ -4,7 +4,6 @@ A proved half-width bounds how far an output is from what a claim is about. So a
 this tolerance, on the same difference, does not stop a robot that keeps what the claim assumes.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +11,11 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from bags.designs import documents
 from nlsid_core import files
+from nlsid_core.arrays import Json
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import ContinuousFunnel, SampledFunnel
 from nlsid_core.kernel import Verdict, text
@@ -73,64 +75,44 @@ class Tolerances:
 
     def write(self, folder: Path) -> list[Path]:
         """The table, and the files that these signals have entries in."""
-        contents = {
-            CONTROLLER: self.controller(),
-            VALIDATOR: self.validator(),
-            TABLE: str(self) + "\n",
-        }
-        written = []
+        contents = {TABLE: f"{self}\n"}
+        for name, parameters in ((CONTROLLER, self.controller()), (VALIDATOR, self.validator())):
+            if parameters:
+                body = yaml.safe_dump(parameters, sort_keys=False, allow_unicode=True)
+                contents[name] = f"{self._source()}{body}"
         for name, content in contents.items():
-            if content:
-                files.write_atomically(folder / name, content.encode())
-                written.append(folder / name)
-        return written
+            files.write_atomically(folder / name, content.encode())
+        return [folder / name for name in contents]
 
-    def controller(self) -> str:
+    def controller(self) -> Json:
         """Constraints of ros2_control's joint_trajectory_controller; empty without a position."""
         positions = self._of(POSITIONS)
         if not positions:
-            return ""
-        lines = [*self._source(), "joint_trajectory_controller:", "  ros__parameters:"]
-        lines.append("    constraints:")
-        rates = self._of(VELOCITIES)
-        if rates:
-            widest = max(rates, key=lambda entry: float(entry.goal))
-            said = f"{widest.signal.unit}, {widest.signal.name} at the last sample, the widest"
-            lines.append(f"      stopped_velocity_tolerance: {_float(widest.goal)}  # {said}")
+            return {}
         joints = [entry.joint for entry in positions]
         if len(set(joints)) < len(joints):  # elements called alike in two messages
             joints = [entry.signal.name for entry in positions]
-        for joint, entry in zip(joints, positions, strict=True):
-            unit = entry.signal.unit
-            lines += [
-                f"      {json.dumps(joint)}:",
-                f"        trajectory: {_float(entry.path)}  # {unit}, at any sample of the claim",
-                f"        goal: {_float(entry.goal)}  # {unit}, at its last sample",
-            ]
-        return "\n".join(lines) + "\n"
+        constraints: Json = {
+            joint: {"trajectory": float(entry.path), "goal": float(entry.goal)}
+            for joint, entry in zip(joints, positions, strict=True)
+        }
+        if rates := [float(entry.goal) for entry in self._of(VELOCITIES)]:
+            constraints["stopped_velocity_tolerance"] = max(rates)
+        return {"joint_trajectory_controller": {"ros__parameters": {"constraints": constraints}}}
 
-    def validator(self) -> str:
+    def validator(self) -> Json:
         """Thresholds of Autoware's control and planning validators; empty without m or m/s.
 
-        Of one signal each, the widest, as a validator has one threshold.
+        Of one signal each, the widest, as a validator has one threshold. A ratio of 0 leaves the
+        offset alone: |v| > |target| + offset.
         """
-        speeds, distances = self._of(["m/s"]), self._of(["m"])
-        if not speeds and not distances:
-            return ""
-        lines = [*self._source(), "/**:", "  ros__parameters:", "    thresholds:"]
-        if speeds:
-            widest = max(speeds, key=lambda entry: float(entry.path))
-            lines += [
-                "      over_velocity_ratio: 0.0  # the offset is all: |v| > |target| + offset",
-                f"      over_velocity_offset: {_float(widest.path)}  # m/s, {widest.signal.name}",
-                f"      velocity_deviation: {_float(widest.path)}  # m/s, {widest.signal.name}",
-            ]
-        if distances:
-            widest = max(distances, key=lambda entry: float(entry.path))
-            lines.append(
-                f"      distance_deviation: {_float(widest.path)}  # m, {widest.signal.name}"
-            )
-        return "\n".join(lines) + "\n"
+        thresholds: Json = {}
+        if speeds := [float(entry.path) for entry in self._of(["m/s"])]:
+            names = ("over_velocity_offset", "velocity_deviation")
+            thresholds = {"over_velocity_ratio": 0.0} | dict.fromkeys(names, max(speeds))
+        if distances := [float(entry.path) for entry in self._of(["m"])]:
+            thresholds["distance_deviation"] = max(distances)
+        return {"/**": {"ros__parameters": {"thresholds": thresholds}}} if thresholds else {}
 
     def __str__(self) -> str:
         names = ["signal", *(entry.signal.name for entry in self.entries)]
@@ -153,10 +135,12 @@ class Tolerances:
             f"Compare with {self.about}.",
         ]
 
-    def _source(self) -> list[str]:
+    def _source(self) -> str:
+        """What the numbers are, as a comment."""
+        units = ", ".join(f"{entry.signal.name} in {entry.signal.unit}" for entry in self.entries)
         first = [f"BEFORE USE: {self.before_use}", ""] if self.before_use else []
-        said = [*first, "Every number is a bound of this claim, rounded up:", *self._claim()]
-        return [f"# {line}".rstrip() for line in said]
+        said = [*first, f"Every number is a bound of this claim, rounded up: {units}"]
+        return "".join(f"# {line}".rstrip() + "\n" for line in (*said, *self._claim()))
 
 
 def tolerances(folder: Path | str) -> Tolerances:
@@ -192,9 +176,3 @@ def tolerances(folder: Path | str) -> Tolerances:
     rows = zip(design.signals[0], path.tolist(), goal.tolist(), strict=True)
     entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)
     return Tolerances(tuple(entries), about, design.verdict, before_use)
-
-
-def _float(number: str) -> str:
-    """The decimal number so that YAML and ROS read a float: 2 is 2.0, 1e-05 is 1.0e-05."""
-    mantissa, e, exponent = number.partition("e")
-    return (mantissa if "." in mantissa else f"{mantissa}.0") + e + exponent

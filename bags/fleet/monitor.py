@@ -11,6 +11,7 @@ from pathlib import Path
 
 from bags.fleet.rows import Row, iso
 from bags.monitoring.replay import Definitions, Replay, replay_bag
+from bags.recordings.bag import Bag
 from bags.recordings.definitions import texts_of
 from bags.signals.reader import bag_origin
 from nlsid_core import files
@@ -46,13 +47,12 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Row:
     """What `replay` says of `bag`, which is called `name`, in a few words and numbers.
 
     said: `alarm`, the second one; `beyond`, what was commanded that no training trial had;
-    `unjudged`, the first samples that were not judged, and why, also of a bag that is bad; `clock`,
-    where its stamps go back.
+    `unjudged`, the first samples that were not judged, and why, also of a bag that is bad.
     numbers: the least `margin`; the largest part of the assumption that was `spent`, at `spent_at`
     s of the run; `bad_at`, the first bad sample; s that were `judged` of the `span`; samples that
     were `filled` in.
     """
-    said = {"beyond": replay.beyond, "clock": replay.clock, "unjudged": _unjudged(replay)}
+    said = {"beyond": replay.beyond, "unjudged": _unjudged(replay)}
     numbers: dict[str, float] = {
         "judged": replay.judged_span,
         "span": replay.span,
@@ -66,14 +66,15 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Row:
         numbers |= {"margin": max(replay.worst.margin, -1e300)}
     if replay.first_bad is not None:
         numbers["bad_at"] = replay.first_bad.t
-    marks = [bag_origin(bag)["digest"]]
+    with Bag(bag) as source:
+        start_ns, marks = source.start_ns, [bag_origin(source)["digest"]]
     if replay.judged:
-        marks.append(files.digest({"start": replay.start_ns, **said, **numbers}))
+        marks.append(files.digest({"start": start_ns, **said, **numbers}))
     return Row(
         name,
         replay.verdict,
         replay.reason,
-        start=iso(replay.start_ns),
+        start=iso(start_ns),
         marks=tuple(marks),
         said={what: text for what, text in said.items() if text},
         numbers=numbers,

@@ -7,6 +7,7 @@ the same `Monitor` as a bag or a live robot.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -37,47 +38,33 @@ OUTLIER = 4.0  # times the median trial's share of the level: twice its amplitud
 TINY = float(np.finfo(float).tiny)
 
 
-@dataclass(frozen=True, eq=False)
-class Copy:
-    """What is recorded of a trial: y (N, p), what was commanded, and when the fault sets in.
-
-    lost: samples that are not there.
-    """
-
-    t: FloatArray
-    y: FloatArray
-    u: FloatArray
-    onset: int = 0
-    lost: frozenset[int] = frozenset()
-
-
-Fault = Callable[[Trajectory, FloatArray, Any], Copy]  # of a trial, its outputs' ranges
+# What is recorded, (N, p), of a trial's outputs, whose ranges are (p,); NaN where nothing is.
+Fault = Callable[[Trajectory, FloatArray, StableModel], FloatArray]
 
 
 def _scaled(factor: float) -> Fault:
-    return lambda trial, _range, _model: Copy(trial.t, factor * trial.y, trial.u)
+    return lambda trial, _ranges, _model: factor * trial.y
 
 
-def _stuck(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
-    return Copy(trial.t, np.tile(trial.y[0], (len(trial), 1)), trial.u)
+def _stuck(trial: Trajectory, _ranges: FloatArray, _model: StableModel) -> FloatArray:
+    return np.tile(trial.y[0], (len(trial), 1))
 
 
-def _biased(trial: Trajectory, ranges: FloatArray, _model: StableModel) -> Copy:
-    return Copy(trial.t, trial.y + BIAS * ranges, trial.u)
+def _biased(trial: Trajectory, ranges: FloatArray, _model: StableModel) -> FloatArray:
+    return trial.y + BIAS * ranges
 
 
-def _delayed(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
+def _delayed(trial: Trajectory, _ranges: FloatArray, _model: StableModel) -> FloatArray:
     first = np.tile(trial.y[0], (min(DELAY, len(trial)), 1))
-    return Copy(trial.t, np.vstack([first, trial.y])[: len(trial)], trial.u)
+    return np.vstack([first, trial.y])[: len(trial)]
 
 
-def _weak(trial: Trajectory, _range: FloatArray, model: StableModel) -> Copy:
+def _weak(trial: Trajectory, _ranges: FloatArray, model: StableModel) -> FloatArray:
     """What the model says the output would have been, had 0.8 of the command arrived."""
-    lags = Stepper(model).lags
     full, less = (_simulated(model, trial, gain) for gain in (1.0, 0.8))
     y = trial.y.copy()
-    y[lags:] += less - full
-    return Copy(trial.t, y, trial.u)
+    y[len(y) - len(full) :] += less - full
+    return y
 
 
 def _simulated(model: StableModel, trial: Trajectory, gain: float) -> FloatArray:
@@ -91,9 +78,10 @@ def _simulated(model: StableModel, trial: Trajectory, gain: float) -> FloatArray
     return np.array(outputs)
 
 
-def _dropped(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
-    onset = len(trial) // 2
-    return Copy(trial.t, trial.y, trial.u, onset, frozenset(range(onset, onset + LOST)))
+def _dropped(trial: Trajectory, _ranges: FloatArray, _model: StableModel) -> FloatArray:
+    y, onset = trial.y.copy(), len(trial) // 2
+    y[onset : onset + LOST] = np.nan
+    return y
 
 
 SABOTAGES: tuple[tuple[str, Fault], ...] = (
@@ -107,37 +95,6 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
 )
 
 OF_SENSORS = frozenset(name for name, _ in SABOTAGES[:5])  # put into one output at a time
-
-
-def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
-    """What a robot records that does the same although 0.8 of its command arrives."""
-    return Copy(trial.t, trial.y, trial.u / 0.8)
-
-
-# Of recorded states: none needs a model, and the recording itself says what the robot did.
-OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _commanded_more))
-
-
-@dataclass(frozen=True)
-class Breaking:
-    """Counts by fault: in how many of the trials a copy with it breaks the assumption."""
-
-    trials: int
-    counts: dict[str, int]
-
-
-def breaking(trials: Dataset, used: Callable[[Trajectory], float]) -> Breaking:
-    """What an assumption about recordings of states (y) and inputs would tell from a sound robot.
-
-    used: the largest part of the assumption that a recording shows; above 1 it is broken. Every
-    copy is what a robot with that fault records under the same inputs at its actuators.
-    """
-    ranges = np.ptp(np.vstack([trial.y for trial in trials]), axis=0)
-    counts = {}
-    for name, fault in OF_STATES:
-        copies = [(trial, fault(trial, ranges, None)) for trial in trials]
-        counts[name] = sum(used(replace(trial, y=c.y, u=c.u)) > 1.0 for trial, c in copies)
-    return Breaking(len(trials), counts)
 
 
 @dataclass(frozen=True)
@@ -232,17 +189,6 @@ class Catching:
     restarts: tuple[str, ...] = ()
 
     @property
-    def beyond(self) -> list[str]:
-        """What to know of a tube that follows the commands beyond the output's range."""
-        return [
-            f"the half-width of {width.name} is up to {_up(width.most)} {width.unit} where the "
-            f"commands change most, beyond its range, {width.range:.3g} {width.unit}: the tube "
-            "says nothing there"
-            for width in self.widths
-            if width.most is not None and width.most > width.range
-        ]
-
-    @property
     def still(self) -> list[str]:
         """What to know of a tube that is narrow in the range and wide in most trials."""
         return [
@@ -331,8 +277,8 @@ def what_it_catches(
     factor = design.funnel.tubes[0].measured.safety_factor
     half_widths = design.funnel.half_widths.tolist()
     first = held_back.trajectories[0]
-    scaling = [_run(monitor, _untouched(trial), p) for trial in calibration]
-    clean = [_run(monitor, _untouched(trial), p) for trial in held_back]
+    scaling = [_run(monitor, trial, trial.y) for trial in calibration]
+    clean = [_run(monitor, trial, trial.y) for trial in held_back]
     judged = [run.residuals for run in scaling if len(run.t)]
     if not judged or not any(len(run.t) for run in clean):
         raise DataError("the monitor judges no sample of the trials; are they shorter than lags?")
@@ -349,17 +295,20 @@ def what_it_catches(
         except (DataError, SolverError) as reason:
             rows.append(Row(name, Caught(), {}, str(reason)))
             continue
-        onsets = [float(copy.t[copy.onset]) for copy in copies]
+        onsets = [
+            float(trial.t[np.isnan(y).any(axis=1).argmax()])
+            for trial, y in zip(held_back, copies, strict=True)
+        ]
         tried = {"": copies}
         if p > 1 and name in OF_SENSORS:
             tried = {
-                output: [_in_one(j, *pair) for pair in zip(copies, held_back, strict=True)]
+                output: [_in_one(j, *pair) for pair in zip(held_back, copies, strict=True)]
                 for j, output in enumerate(first.y_names)
             }
         found = [
             replace(_row(name, runs, onsets, detectors), output=output)
             for output, sabotaged in tried.items()
-            for runs in [[_run(monitor, copy, p) for copy in sabotaged]]
+            for runs in [list(map(partial(_run, monitor), held_back, sabotaged))]
         ]
         rows.append(min(found, key=lambda row: (row.funnel.count, -row.funnel.after)))
     errors = np.max([np.abs(run.error).max(axis=0) for run in judged], axis=0)
@@ -393,29 +342,26 @@ def _up(value: float) -> str:
     return text.above(Fraction(value), 3) if value < float("inf") else "inf"
 
 
-def _untouched(trial: Trajectory) -> Copy:
-    return Copy(trial.t, trial.y, trial.u)
-
-
-def _in_one(output: int, copy: Copy, trial: Trajectory) -> Copy:
-    """The copy with its fault in the sensor of one output only."""
+def _in_one(output: int, trial: Trajectory, faulty: FloatArray) -> FloatArray:
+    """What is recorded with the fault in the sensor of one output only."""
     y = trial.y.copy()
-    y[:, output] = copy.y[:, output]
-    return replace(copy, y=y)
+    y[:, output] = faulty[:, output]
+    return y
 
 
-def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
-    """The copy's samples through the monitor, as a bag's are."""
+def _run(monitor: Monitor, trial: Trajectory, recorded: FloatArray) -> _Run:
+    """The samples (N, p) recorded of a trial's outputs through the monitor, as a bag's are."""
     monitor.restart()
-    single = copy.y.shape[1] == copy.u.shape[1] == 1
+    p = recorded.shape[1]
+    single = p == trial.u.shape[1] == 1
     times: list[float] = []
     innovation: list[Sequence[float]] = []
     error: list[FloatArray] = []
     widths: list[Sequence[float]] = []
     bad, alarm, lost, share = None, None, False, 0.0
-    for k, (t, y, u) in enumerate(zip(copy.t.tolist(), copy.y, copy.u, strict=True)):
+    for t, y, u in zip(trial.t.tolist(), recorded, trial.u, strict=True):
         sample: tuple[Any, Any] = (float(y[0]), float(u[0])) if single else (y, u)
-        if k in copy.lost:
+        if np.isnan(y).any():
             monitor.unmeasured(t, sample[1], NOT_THERE)
             lost = True
             continue

@@ -80,35 +80,11 @@ def _joined(row: Sequence[Stretch]) -> Stretch:
     )
 
 
-class Clock:
-    """The stamps of a bag's messages, topic by topic, and where they go back."""
-
-    def __init__(self) -> None:
-        self.start_ns = 0
-        self._last: dict[str, int] = {}
-        self._back: dict[str, list[int]] = {}  # ns, of each place
-
-    def add(self, topic: str, stamp_ns: int) -> None:
-        """Take note of a message's stamp."""
-        last = self._last.get(topic, stamp_ns)
-        self._last[topic] = stamp_ns
-        if stamp_ns < last:
-            self._back.setdefault(topic, []).append(last - stamp_ns)
-
-    def __str__(self) -> str:
-        return "; ".join(
-            f"stamps of {topic} go back in {len(steps)} "
-            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
-            for topic, steps in self._back.items()
-        )
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay:
     """One bag's readings, and what a summary says of them.
 
     axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
-    noted: the stamps of the bag's messages.
     """
 
     name: str
@@ -118,7 +94,6 @@ class Replay:
     half_width: float
     period: float = 0.0
     stamps_ns: tuple[int, ...] = ()
-    noted: Clock | None = None
 
     def __repr__(self) -> str:
         worst = self.first_bad or self.worst
@@ -136,16 +111,6 @@ class Replay:
         drawn = [(middle - width, GREY), (middle + width, GREY), (y, BLUE)]
         span = np.concatenate([values for values, _ in drawn])
         return card(repr(self), *(line(t, values, colour, span) for values, colour in drawn))
-
-    @property
-    def start_ns(self) -> int:
-        """The bag's first log time; 0 if it is not known."""
-        return self.noted.start_ns if self.noted else 0
-
-    @property
-    def clock(self) -> str:
-        """What is wrong with the stamps, in words; empty if nothing."""
-        return str(self.noted or "")
 
     @property
     def span(self) -> float:
@@ -359,11 +324,10 @@ def replay_bag(
     definitions: of message types that the bag does not define. Raises BagError as
     `replay_messages`.
     """
-    clock = Clock()
-    stamped = replay_messages(design, bag, centre=centre, definitions=definitions, clock=clock)
+    stamped = replay_messages(design, bag, centre=centre, definitions=definitions)
     readings = tuple(entry.reading for entry in stamped)
     stamps_ns = tuple(entry.stamp_ns for entry in stamped)
-    return replace(_replayed(design, Path(bag).name, readings), stamps_ns=stamps_ns, noted=clock)
+    return replace(_replayed(design, Path(bag).name, readings), stamps_ns=stamps_ns)
 
 
 def replay(design: AnyDesign, run: Trajectory) -> Replay:
@@ -404,7 +368,6 @@ def replay_messages(
     *,
     centre: Centre = Centre.PROFILE,
     definitions: Definitions | None = None,
-    clock: Clock | None = None,
 ) -> list[Stamped]:
     """What the live monitor says of the messages in `bag`, one by one as they were recorded.
 
@@ -412,16 +375,13 @@ def replay_messages(
     without an announcement the first complete sample is sample 0. Raises BagError if the bag cannot
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
-    clock: takes note of the stamps.
     """
     bag = place(bag)
     planned = centre is Centre.PROFILE or not isinstance(design.funnel, TubeFunnel)
     announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)
     stamped = [
-        entry
-        for said in _fed(watch, bag, definitions, clock or Clock(), announced=announced)
-        for entry in said
+        entry for said in _fed(watch, bag, definitions, announced=announced) for entry in said
     ]
     stamped += watch.end()
     if not stamped:
@@ -443,7 +403,6 @@ def _fed(
     watch: Watch,
     bag: Path,
     definitions: Definitions | None,
-    clock: Clock,
     *,
     announced: bool,
 ) -> Iterator[list[Stamped]]:
@@ -451,7 +410,6 @@ def _fed(
     digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
-        clock.start_ns = source.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
         doubt = _doubt(watch.pairing, source)
@@ -465,7 +423,6 @@ def _fed(
                     yield watch.begin(run.start_ns)
                 continue
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
-            clock.add(message.topic, stamp_ns)
             if doubt and message.topic in watch.pairing.response_topics:
                 yield watch.refuse(stamp_ns, doubt)
                 continue

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bags.monitoring.catching import Breaking, Catching, Caught
+from bags.monitoring.catching import Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import counted, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
@@ -185,15 +185,5 @@ def say_catching(console: Console, catching: Catching) -> None:
             f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
         )
-    for line in (*catching.beyond, *catching.still, *catching.restarts, *catching.warnings()):
+    for line in (*catching.still, *catching.restarts, *catching.warnings()):
         warn(console, line)
-
-
-def breaking_table(found: Breaking) -> Table:
-    """List by fault how many copies of trials break the assumption of a proof."""
-    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
-    table.add_column("fault")
-    table.add_column("broken", justify="right")
-    for fault, count in found.counts.items():
-        table.add_row(fault, f"{count} of {found.trials}")
-    return table

@@ -11,7 +11,7 @@ from scipy.signal import welch
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.setup.proposal import Proposal, Signal
+from bags.setup.proposal import Proposal
 from bags.signals.expressions import factors
 from bags.signals.reader import Samples, read_signals
 from bags.signals.sampling import Grid
@@ -74,14 +74,14 @@ class Paces:
 
 def read_paces(
     bags: Sequence[Path],
-    chosen: Mapping[str, Sequence[Signal]],
+    chosen: Mapping[str, Sequence[str]],
     clock: str,
     types: Mapping[str, Definition] | None,
 ) -> Paces:
     """The paces of the chosen signals over all bags; BagError where a period cannot be said."""
     rules = Grid(clock=clock)
-    y_paths = [rules.path(signal.path, response=True) for signal in chosen["response"]]
-    u_texts = [rules.path(signal.path, response=False) for signal in chosen["excitation"]]
+    y_paths = [rules.path(text, response=True) for text in chosen["response"]]
+    u_texts = [rules.path(text, response=False) for text in chosen["excitation"]]
     drives = [factors(text) for text in u_texts]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
     steps, commanded, bands, u_steps = [], [], [], []

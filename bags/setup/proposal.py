@@ -13,16 +13,6 @@ POOR: Final = 50.0  # % of error in simulation, above which a model says little
 GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 
 
-@dataclass(frozen=True)
-class Signal:
-    """A chosen signal: name and unit for people, its path, its range in the bags, and why it."""
-
-    name: str
-    unit: str
-    path: str
-    why: str
-
-
 @dataclass
 class Proposal:
     """A configuration as nested keys (`content`), a reason for keys (`why`), and later walls.

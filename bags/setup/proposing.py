@@ -22,7 +22,7 @@ from bags.setup import ladder
 from bags.setup.candidates import Found, Pair, Unfit, is_named, slope_window
 from bags.setup.direction import say_direction
 from bags.setup.grid import read_paces, say_grid
-from bags.setup.proposal import GRADES, POOR, Proposal, Signal
+from bags.setup.proposal import GRADES, POOR, Proposal
 from bags.signals.columns import read_columns
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.signal import SignalPath
@@ -78,11 +78,10 @@ def propose(
     texts = [*responses, *excitations]
     if twice := next((text for text in texts if texts.count(text) > 1), None):
         raise BagError(f"{twice} is named twice")
-    signals = _named_apart([_signal(found, text, chosen.named) for text in texts])
-    sides = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
+    sides = {"response": responses, "excitation": excitations}
     proposal = Proposal({"robot": chosen.robot})
-    _say_signals(proposal, sides, found)
-    if all(any(_unwrapped(s.path) for s in side) for side in sides.values()):
+    _say_signals(proposal, sides, found, chosen.named)
+    if all(any(map(_unwrapped, side)) for side in sides.values()):
         proposal.walls.append(
             "an angle drives and an angle answers: if a trial begins near half a turn, they may "
             "begin a whole turn apart; leave such trials out, or take |derivative of both"
@@ -248,7 +247,8 @@ def _unwrapped(text: str) -> bool:
     return "|unwrap" in text and "|derivative" not in text
 
 
-def _signal(found: Found, text: str, named: Sequence[str]) -> Signal:
+def _unit_and_why(found: Found, text: str, named: Sequence[str]) -> tuple[str, str]:
+    """A signal's unit for people, and why it is taken."""
     known = next((c for c in found.candidates if is_named(c.text, text)), None)
     if known is None:
         path = text.partition("|")[0]
@@ -257,22 +257,10 @@ def _signal(found: Found, text: str, named: Sequence[str]) -> Signal:
         )
         recorded = None if len(factors(text)) > 1 else next((c.unit for c in numbers), None)
         unit = "" if recorded is None else Expression.parse(text).unit_of(recorded)
-        return Signal(
-            _name(text), unit.partition(" or ")[0], text, "named by you" if text in named else ""
-        )
+        return unit.partition(" or ")[0], "named by you" if text in named else ""
     unit = known.unit.partition(" or ")[0]
     why = f"{known.low:.4g} to {known.high:.4g} {unit}".strip()
-    return Signal(_name(text), unit, text, f"{why} at {known.rate:.4g} Hz; {known.why}")
-
-
-def _named_apart(signals: Sequence[Signal]) -> list[Signal]:
-    """With a number behind a name that an earlier signal has."""
-    names = [signal.name for signal in signals]
-    counts = [names[: k + 1].count(name) for k, name in enumerate(names)]
-    return [
-        replace(signal, name=f"{signal.name} {count}") if count > 1 else signal
-        for signal, count in zip(signals, counts, strict=True)
-    ]
+    return unit, f"{why} at {known.rate:.4g} Hz; {known.why}"
 
 
 def _name(text: str) -> str:
@@ -293,34 +281,36 @@ def _name(text: str) -> str:
     return f"{topic.strip('/').replace('/', ' ')} {words}{after}".strip()
 
 
-def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], found: Found) -> None:
-    proposal.content["signals"] = {
-        role: [{"name": s.name, "unit": s.unit, "path": s.path} for s in signals]
-        for role, signals in chosen.items()
-    }
-    proposal.why |= {s.path: s.why for signals in chosen.values() for s in signals}
-    for y in chosen["response"]:
-        pairs = [
-            p
-            for p in found.best_for(y.path)
-            if p.command.text in {u.path for u in chosen["excitation"]}
-        ]
+def _say_signals(
+    proposal: Proposal, sides: Mapping[str, Sequence[str]], found: Found, named: Sequence[str]
+) -> None:
+    names: list[str] = []
+    for role, texts in sides.items():
+        listed = proposal.content.setdefault("signals", {}).setdefault(role, [])
+        for text in texts:
+            names.append(_name(text))
+            count = names.count(names[-1])
+            name = f"{names[-1]} {count}" if count > 1 else names[-1]  # of an earlier one
+            unit, proposal.why[text] = _unit_and_why(found, text, named)
+            listed.append({"name": name, "unit": unit, "path": text})
+    for text in sides["response"]:
+        pairs = [p for p in found.best_for(text) if p.command.text in sides["excitation"]]
         if pairs:
             best = pairs[0]
-            before = f"{y.why}; " if y.why else ""
-            proposal.why[y.path] = f"{before}follows {best.command.text}: {best}"
-            washed = "|washout" in y.path
+            before = f"{proposal.why[text]}; " if proposal.why[text] else ""
+            proposal.why[text] = f"{before}follows {best.command.text}: {best}"
+            washed = "|washout" in text
             if best.response.is_position and not best.command.is_position and not washed:
                 proposal.walls.append(
-                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
+                    f"{text} is a position: if it adds up its command for ever, it is in no "
                     f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
                 )
 
 
-def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
+def _say_clock(proposal: Proposal, sides: Mapping[str, Sequence[str]], bag: Bag) -> None:
     unstamped: dict[str, str] = {}
-    for signals in chosen.values():
-        for expression in (e for signal in signals for e in parse_factors(signal.path)):
+    for texts in sides.values():
+        for expression in (e for text in texts for e in parse_factors(text)):
             msgtype, types = bag.types_on(expression.path.topic)
             expression.path.check(msgtype, types)
             named = f"{expression.path.topic} ({msgtype})"

@@ -125,13 +125,11 @@ class Recording:
         self.bag = bag
         self.ended = ""
         self._least_free = least_free  # MB
-        self._lost: dict[str, int] = {}
         self._sequence: dict[str, Sequence] = {}
         self._closed = False
 
     def expect(self, topic: str) -> None:
         """List a topic although nothing is known of it yet."""
-        self._lost.setdefault(topic, 0)
         self._sequence.setdefault(topic, Sequence())
 
     def add_topic(
@@ -153,10 +151,6 @@ class Recording:
             self.bag.write(topic, msgtype, data, **times, sequence=number)
         except OSError as error:
             self._end(str(error))
-
-    def lose(self, topic: str, count: int) -> None:
-        """Count messages that were lost before any was handed on."""
-        self._lost[topic] += count
 
     def annotate(self, custom: Mapping[str, str]) -> None:
         """Add to the bag's metadata."""
@@ -202,7 +196,7 @@ class Recording:
     def summary(self, most: int) -> dict[str, str]:
         """Sum up all topics, and then give a line to each of the `most` that lose most."""
         counts = self.counts()
-        lost = {topic: self._lost_on(topic) for topic in self._lost}
+        lost = {topic: self._lost_on(topic) for topic in self._sequence}
         values = {
             "topics": len(lost),
             "messages": sum(self.bag.counts.values()),
@@ -216,9 +210,9 @@ class Recording:
 
     def warnings(self) -> list[str]:
         """What a person should look at."""
-        silent = [topic for topic in self._lost if not self.bag.counts.get(topic)]
-        losing = [topic for topic in self._lost if self._lost_on(topic)]
-        mixed = [topic for topic in self._lost if self._sequence[topic].mixed]
+        silent = [topic for topic in self._sequence if not self.bag.counts.get(topic)]
+        losing = [topic for topic in self._sequence if self._lost_on(topic)]
+        mixed = [topic for topic in self._sequence if self._sequence[topic].mixed]
         return [
             *(f"nothing on {topic} yet" for topic in silent),
             *(f"messages lost on {topic}" for topic in losing),
@@ -226,9 +220,9 @@ class Recording:
         ]
 
     def _lost_on(self, topic: str) -> int:
-        """Before they could be handed on, and by the publisher's count since then."""
+        """How many are missing in the publisher's count."""
         sequence = self._sequence[topic]
-        return self._lost[topic] + (0 if sequence.mixed else sequence.missing)
+        return 0 if sequence.mixed else sequence.missing
 
     @contextmanager
     def _ending(self) -> Iterator[None]:

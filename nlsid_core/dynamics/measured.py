@@ -45,15 +45,6 @@ class MeasuredPush:
         trials, n = self.largest.shape
         return float(min(n / (trials + 1), 1.0))
 
-    def used(self, dynamics: VectorField, trial: Trajectory) -> float:
-        """The largest part of the box that another recording shows; above 1 it breaks it."""
-        one = Dataset((trial,))
-        found = measured_push(dynamics, one, seconds=self.seconds, safety_factor=1.0)
-        half = self.box[:, 1]
-        shown = found.largest[0]
-        parts = np.divide(shown, half, out=np.where(shown > 0, np.inf, 0.0), where=half > 0)
-        return float(parts.max())
-
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {

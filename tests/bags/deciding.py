@@ -1,15 +1,17 @@
 """What a receiver of a bundle is told."""
 
-import time
-
-from bags.designs.bundle import Check
+from bags.designs.bundle import Bundle
 from nlsid_core.arrays import Json
+from nlsid_core.errors import NlsidError
 
 
 def decide(text: str) -> Json:
     """What a receiver is told."""
-    check = Check(text)
-    while (answer := check.poll()) is None:
-        time.sleep(0.01)
-    check.close()
-    return answer
+    try:
+        bundle = Bundle.parse(text)
+        deciding = bundle.deciding()
+        verdict = deciding.wait()
+        bundle.refuse_others(verdict)
+    except NlsidError as refusal:
+        return {"refused": str(refusal)}
+    return {"proved": str(verdict), "digest": bundle.digest, "before": deciding.before}

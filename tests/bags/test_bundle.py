@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from bags.designs import bundle as bundles
 from bags.designs import documents
-from bags.designs.bundle import Bundle, Check
+from bags.designs.bundle import Bundle
 from nlsid_core import deciding, files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
@@ -144,12 +143,9 @@ def test_nothing_is_remembered_where_the_kernel_changed_meanwhile(
     monkeypatch.setattr(deciding, "KERNEL", shutil.copytree(deciding.KERNEL, tmp_path / "kernel"))
     source = tmp_path / "kernel" / "text.py"
     before = source.read_text()
-    check = Check(bundle.text())
+    begun = bundle.deciding()
     source.write_text(before + "# another one\n")
-    while (answer := check.poll()) is None:
-        time.sleep(0.01)
-    check.close()
-    assert "proved" in answer
+    assert begun.wait().statement
     assert not decide(bundle.text())["before"]
     source.write_text(before)
     assert not decide(bundle.text())["before"]
@@ -168,6 +164,6 @@ def test_a_linked_proof_is_about_the_files_beside_the_link(funnel: Path, tmp_pat
 
 
 def test_a_check_can_be_called_off(bundle: Bundle) -> None:
-    check = Check(bundle.text())
-    check.close()
-    assert check.seconds >= 0.0
+    begun = bundle.deciding()
+    begun.close()
+    assert begun.seconds >= 0.0

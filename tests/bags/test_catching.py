@@ -130,15 +130,15 @@ def test_copies_are_what_their_names_say(design: OutputTubeDesign, held_back: Da
     trial, faults = held_back.trajectories[0], dict(SABOTAGES)
     made = {name: fault(trial, np.array([2.0]), design.model) for name, fault in faults.items()}
     y = trial.y
-    np.testing.assert_array_equal(made["stuck at first value"].y, np.full_like(y, y[0, 0]))
-    np.testing.assert_array_equal(made["sensor x 0.6"].y, 0.6 * y)
-    np.testing.assert_array_equal(made["bias, 10 % of range"].y, y + 0.2)
-    late = made[f"late by {DELAY} samples"].y
+    np.testing.assert_array_equal(made["stuck at first value"], np.full_like(y, y[0, 0]))
+    np.testing.assert_array_equal(made["sensor x 0.6"], 0.6 * y)
+    np.testing.assert_array_equal(made["bias, 10 % of range"], y + 0.2)
+    late = made[f"late by {DELAY} samples"]
     np.testing.assert_array_equal(late[DELAY:], y[:-DELAY])
     np.testing.assert_array_equal(late[:DELAY], np.full((DELAY, 1), y[0, 0]))
-    lost = made[f"{LOST} samples lost"]
-    assert lost.lost == frozenset(range(len(y) // 2, len(y) // 2 + LOST))
-    assert all(np.array_equal(copy.u, trial.u) for copy in made.values()), "what was commanded"
+    kept = y.copy()
+    kept[len(y) // 2 : len(y) // 2 + LOST] = np.nan
+    np.testing.assert_array_equal(made[f"{LOST} samples lost"], kept)
 
 
 def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTubeDesign) -> None:
@@ -147,7 +147,7 @@ def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTub
     full, weak = (_simulated(design, gain * u, u) for gain in (1.0, 0.8))
     trial = Trajectory(t=PERIOD * np.arange(len(u)), y=full, u=u)
     copy = dict(SABOTAGES)["actuator x 0.8"](trial, np.ones(1), design.model)
-    np.testing.assert_allclose(copy.y[:, 0], weak, atol=1e-12)
+    np.testing.assert_allclose(copy[:, 0], weak, atol=1e-12)
 
 
 def _simulated(design: OutputTubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
@@ -295,9 +295,6 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert width.least == pytest.approx(expected.min(), rel=1e-6)
     assert width.most == pytest.approx(expected.max(), rel=1e-6)
     assert "on average" in width.said
-    assert found.beyond == []
-    narrow = replace(found, widths=(replace(width, range=0.9 * float(expected.max())),))
-    assert "where the commands change most, beyond its range" in narrow.beyond[0]
     (errors,), _ = (part.axes for part in draw(found).subfigs)
     assert len(errors.collections) == found.trials
 
@@ -411,16 +408,14 @@ def test_path_and_goal_of_a_joint_are_the_proved_half_widths_rounded_up(arm: Pat
 def test_every_file_says_the_claim_the_unit_and_what_to_compare_with(arm: Path) -> None:
     found = tolerances(arm)
     written = found.write(arm)
-    assert [path.name for path in written] == [CONTROLLER, TABLE]
+    assert {path.name for path in written} == {CONTROLLER, TABLE}
     for path in written:
         said = path.read_text()
         for line in str(designed().verdict).splitlines():
             assert line in said
         assert designed().verdict.digests["proof"] in said
         assert "Compare with the plan in policy.json" in said
-    numbers = [line for line in (arm / CONTROLLER).read_text().splitlines() if ": 0." in line]
-    assert len(numbers) == 3
-    assert all("  # rad" in line for line in numbers)
+    assert "rounded up: angle in rad, rate in rad/s" in (arm / CONTROLLER).read_text()
 
 
 def test_a_speed_has_thresholds_for_validators_and_no_joint(
@@ -476,7 +471,7 @@ def test_joints_are_called_as_in_the_messages_and_numbers_are_floats(
         replace(entry, signal=Signal(*signal), path=number, goal=number)
         for entry, signal in zip(found.entries, signals, strict=True)
     )
-    content = yaml.safe_load(replace(found, entries=entries).controller())
+    content = yaml.safe_load(yaml.safe_dump(replace(found, entries=entries).controller()))
     constraints = content["joint_trajectory_controller"]["ros__parameters"]["constraints"]
     assert set(constraints) == joints
     for values in constraints.values():
@@ -496,7 +491,7 @@ def test_the_widest_of_several_speeds_and_distances_is_the_threshold(arm: Path) 
             ("vy", "m/s", "10"),
         )
     ]
-    content = yaml.safe_load(replace(found, entries=(*made, second)).validator())
+    content = replace(found, entries=(*made, second)).validator()
     assert content["/**"]["ros__parameters"]["thresholds"] == {
         "over_velocity_ratio": 0.0,
         "over_velocity_offset": 10.0,

@@ -16,7 +16,7 @@ from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags, read_trials
-from bags.chain.training import load_training
+from bags.chain.training import load_trials, save_trials
 from bags.commands.show import paced_lines, replay_lines
 from bags.designs import documents
 from bags.designs.provenance import of_proof
@@ -77,9 +77,8 @@ def test_test_trials_do_not_influence_the_model(
     first = config.split.model_copy(update={"test": [f"trial_{TEST[0]}"]})
     settings = config.model_copy(update={"split": first})
     identify_bags(fewer, settings, tmp_path, progress=silent)
-    assert documents.load_model(tmp_path / documents.MODEL).document() == (
-        documents.load_model(chain / documents.MODEL).document()
-    )
+    one, other = (documents.load_model(each / documents.MODEL) for each in (tmp_path, chain))
+    assert replace(one, training="").document() == replace(other, training="").document()
 
 
 def test_the_model_names_the_bags_it_was_fitted_to(chain: Path) -> None:
@@ -88,8 +87,8 @@ def test_the_model_names_the_bags_it_was_fitted_to(chain: Path) -> None:
     assert len(names) == 17
     assert not {f"trial_{k}" for k in TEST} & set(names)
     assert all(digest.startswith("sha256:") for _, digest in model.bags)
-    train = load_training(chain / documents.TRAINING, digest=model.training)
-    assert train.names == tuple(names)
+    kept = load_trials(chain / documents.TRIALS, digest=model.training)
+    assert kept["training"].names == tuple(names)
 
 
 def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
@@ -158,18 +157,6 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
-    chain: Path, tmp_path: Path
-) -> None:
-    for name in (documents.MODEL, documents.TRAINING):
-        shutil.copy(chain / name, tmp_path)
-    yaml_file = edited(tmp_path, split__calibration=[])
-    arguments = ["funnel", str(tmp_path), "--config", str(yaml_file)]
-    made = nlsid(*arguments)
-    assert "what it catches is not known" in made
-
-
-@pytest.mark.slow
 def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_path: Path) -> None:
     path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
     content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
@@ -200,23 +187,12 @@ def test_a_model_of_another_class_is_named_as_configurations_name_it(
 def test_a_tube_is_not_scaled_on_training_trials_where_calibration_trials_are_named(
     config: Config, chain: Path, tmp_path: Path
 ) -> None:
-    for name in (documents.MODEL, documents.TRAINING):
-        shutil.copy(chain / name, tmp_path)
-    with pytest.raises(DataError, match=r"split\.calibration names bags, and held_back\.npz"):
-        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
-
-
-def test_trials_held_back_from_another_model_are_refused(
-    config: Config, chain: Path, tmp_path: Path
-) -> None:
-    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
-        shutil.copy(chain / name, tmp_path)
-    model = json.loads((tmp_path / documents.MODEL).read_text())
-    files.write_document(tmp_path / documents.MODEL, model | {"c": 0.0})
-    with pytest.raises(DataError, match="not trials held back from this model"):
-        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
-    (tmp_path / documents.HELD_BACK).write_bytes(b"PK")
-    with pytest.raises(DataError, match="not trials held back"):
+    model = documents.load_model(chain / documents.MODEL)
+    kept = load_trials(chain / documents.TRIALS, digest=model.training)
+    del kept["calibration"]
+    digest = save_trials(tmp_path / documents.TRIALS, kept)
+    files.write_document(tmp_path / documents.MODEL, replace(model, training=digest).document())
+    with pytest.raises(DataError, match=r"split\.calibration names .* beside the model are none"):
         design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
 
 
@@ -246,7 +222,7 @@ def test_without_a_profile_the_tube_is_around_the_models_simulation(
     chain: Path, tmp_path: Path
 ) -> None:
     path = edited(tmp_path, funnel={"safety_factor": 1.5})
-    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+    for name in (documents.MODEL, documents.TRIALS):
         shutil.copy(chain / name, tmp_path)
     assert "for ever" in nlsid("funnel", tmp_path, "--config", path)
     assert not (tmp_path / documents.POLICY).exists()
@@ -453,7 +429,7 @@ def test_with_policy_none_the_funnel_is_a_prediction_tube(
     prediction = config.model_copy(
         update={"funnel": config.funnel.model_copy(update={"policy": None})}
     )
-    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+    for name in (documents.MODEL, documents.TRIALS):
         shutil.copy(chain / name, tmp_path)
     design = design_funnel_files(tmp_path / documents.MODEL, prediction, tmp_path)
     assert design.policy is not None
@@ -466,9 +442,9 @@ def test_a_funnel_is_not_designed_on_other_data_than_the_models(
     chain: Path, config: Config, tmp_path: Path
 ) -> None:
     shutil.copy(chain / documents.MODEL, tmp_path)
-    content = (chain / documents.TRAINING).read_bytes()
-    (tmp_path / documents.TRAINING).write_bytes(content[:-1] + b"\1")
-    with pytest.raises(DataError, match="not the data the model was fitted to"):
+    content = (chain / documents.TRIALS).read_bytes()
+    (tmp_path / documents.TRIALS).write_bytes(content[:-1] + b"\1")
+    with pytest.raises(DataError, match="not the trials of this model"):
         design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
     assert not (tmp_path / documents.FUNNEL).exists()
 

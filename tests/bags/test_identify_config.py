@@ -187,7 +187,8 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
     """Two unknown keys and two wrong values in three sections, in one message."""
     sections: dict[str, Any] = {
         "grid": {"perod": 0.01, "period": -1.0, "max_gap": 0.05},
-        "monitor": {"stale_after": "soon", "nominl": "profile"},
+        "funnel": {"reaction_time": "soon"},
+        "monitor": {"nominl": "profile"},
     }
     path = write_config(tmp_path / "robot.yaml", {"lag": 4, "transient": -1}, **sections)
     with pytest.raises(DataError) as caught:
@@ -196,7 +197,7 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
     for line in (
         r"grid\.perod: there is no such key; there are: period, max_gap, .*; did you mean 'period'",
         r"grid\.period: Input should be greater than 0, in s \(found -1\.0\)",
-        r"monitor\.stale_after: Input should be a valid number, in s \(found 'soon'\)",
+        r"funnel\.reaction_time: Input should be a valid number, in s \(found 'soon'\)",
         r"monitor\.nominl: there is no such key; .*; did you mean 'nominal'\?",
         r"identification\.lags: Field required",
         r"identification\.transient: Input should be greater than or equal to 0 \(found -1\)",
@@ -210,10 +211,6 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
     ("sections", "reason"),
     [
         ({"grid": {"period": 0.2, "max_gap": 0.1}}, r"grid\.max_gap: 0\.1 s is shorter"),
-        (
-            {"monitor": {"stale_after": 0.1}, "grid": {"period": 0.2, "max_gap": 0.3}},
-            r"monitor\.stale_after: 0\.1 s is not longer",
-        ),
         ({"funnel": {"horizon": 0.001, "policy": "none"}}, r"funnel\.horizon: .* not one sample"),
         ({"inputs": 2}, "identification.model: linear has one response and one excitation"),
         (

@@ -1,6 +1,5 @@
 """The page of a design folder and the tables that commands print: every number whole."""
 
-import hashlib
 import io
 import re
 import shutil
@@ -75,14 +74,6 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     assert page.tags.count("svg") == 3
     assert "script" not in page.tags
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
-
-
-def test_every_file_has_its_digest_and_the_proofs_that_it_is_a_part_of(design: Path) -> None:
-    page = folder_page(design)
-    for path in design.glob("*.json"):
-        assert page.count(f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}") == 1, path
-    model = page[page.index("<td>model.json</td>") :].partition("</tr>")[0]
-    assert "model of funnel.proof.json; model of model.proof.json" in model
 
 
 @pytest.mark.pictures

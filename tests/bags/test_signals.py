@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 import bags
-from bags.chain.training import load_training, save_training
+from bags.chain.training import load_trials, save_trials
 from bags.recordings.message_types import header_stamp_ns, is_stamped, standard_types, types_in_bag
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression, derivative
@@ -377,6 +377,6 @@ def test_a_dataset_knows_where_it_comes_from(tmp_path: Path) -> None:
     assert trial.y_paths == ("/odom:twist.twist.linear.x",)
     for part in (trial.digest, '"a.mcap"', '"/odom:twist.twist.linear.x"', '"resample":"none"'):
         assert part in trial.provenance
-    digest = save_training(tmp_path / "training.npz", dataset)
-    again = load_training(tmp_path / "training.npz", digest=digest)
+    digest = save_trials(tmp_path / "trials.npz", {"training": dataset})
+    again = load_trials(tmp_path / "trials.npz", digest=digest)["training"]
     assert again.trajectories[1].provenance == dataset.trajectories[1].provenance

@@ -39,7 +39,7 @@ def coupled(samples: int, seed: int) -> Dataset:
 
 
 def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
-    fit = identify(noisy(1500, 1), CLASS, method=Sem(certified=True), comparators=(Sem(), Rie()))
+    fit = identify(noisy(600, 1), CLASS, method=Sem(certified=True), comparators=(Sem(), Rie()))
     free, proved = (fit.errors["train"][name] for name in ("sem", "sem_certified"))
     assert proved == pytest.approx(free, rel=1e-4)
     assert proved < 0.95 * fit.errors["train"]["rie"]

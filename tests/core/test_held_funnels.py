@@ -51,6 +51,7 @@ def largest(found: FunnelDesign, *, hold: float) -> float:
     return run.max_v
 
 
+@pytest.mark.slow
 def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> None:
     free = design(tracking(hold=1e-6))  # its gain is linear, as a held policy's is
     widths, unheld = (found.funnel.widths(found.funnel.t0) for found in (held, free))

@@ -41,6 +41,7 @@ def test_rates_in_a_smaller_funnel_follow_from_those_in_a_larger(held: FunnelDes
     assert (changes_in(held, rho).rates(widths) > 1.05 * smaller).any()
 
 
+@pytest.mark.slow
 def test_inputs_are_off_by_what_they_change_in_the_funnel_that_is_found(held: FunnelDesign) -> None:
     hold = Hold.of(HOLD, None, 2)
     assert hold is not None

@@ -18,7 +18,6 @@ from nlsid_core.identification.methods.rse import Bound
 from nlsid_core.identification.polynomial.rows import build_state_affine_rows
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
-LINEAR = Polynomial(2, (0, 1, 2))  # with delays it is a state-affine model
 SOLVER = 1e-6  # agreement with a cone solver's optimum
 
 

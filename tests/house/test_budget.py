@@ -12,14 +12,14 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_805,
-    ("bags",): 11_750,
-    ("nlsid_ros",): 2_659,
-    ("tests",): 21_154,
+    ("nlsid_core",): 17_798,
+    ("bags",): 11_488,
+    ("nlsid_ros",): 2_599,
+    ("tests",): 21_049,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 1, 11  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 1, 10  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

@@ -65,7 +65,7 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("excitation", MOVED | {"others": OTHERS}, "twist: angular: 1 should be an object"),
     ("model_identifier", IDENTIFIED | {"last": -1}, "parameter last (only the last so many of"),
     ("model_identifier", IDENTIFIED | {"config": "nowhere.yaml", "out": "out"}, "nowhere.yaml"),
-    ("plant", {"kind": "unicycle"}, "one of model, mujoco_pendulum, mujoco_arm"),
+    ("plant", {"kind": "unicycle"}, "one of model, mujoco_arm, mujoco_pendulum"),
     ("plant", {"__ns": "robot1"}, "a namespace begins with a slash: /robot1"),
     ("bag_player", {"bag": TRIAL, "wait_for": -1}, "parameter wait_for (subscribers each topic"),
     ("bag_player", {"bag": "nowhere"}, "there is no bag nowhere"),

@@ -109,7 +109,7 @@ def test_a_bag_is_read_back_bit_equal_by_three_readers(robot: Joints, tmp_path: 
     assert three_readers(bag, "/joints") == [robot.sent] * 3
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["msg file", "type description"])
+@pytest.mark.parametrize("given", [True, False], ids=["msg file", "installed"])
 def test_a_type_that_is_not_standard_is_recorded_with_its_definition(
     robot: Joints, tmp_path: Path, given: bool
 ) -> None:
@@ -119,7 +119,7 @@ def test_a_type_that_is_not_standard_is_recorded_with_its_definition(
         definition = SHARE / "nav_msgs" / "msg" / "Goals.msg"
         if not definition.is_file():
             pytest.skip("this ROS is installed elsewhere")
-        settings |= {"definitions": f"[{definition}]", "start_type_description_service": False}
+        settings |= {"definitions": f"[{definition}]"}
     with pytest.raises(BagError, match="not known"):
         standard_definition(GOALS)
     goals = robot.node.create_publisher(Goals, "/goals", qos.STREAM)
@@ -142,14 +142,13 @@ def test_a_type_that_is_not_standard_is_recorded_with_its_definition(
         assert reader.deserialize(raw.data, connection.msgtype).header.frame_id == "map"  # type: ignore[attr-defined]
 
 
-def test_a_type_nobody_describes_is_refused_by_name_and_the_others_go_on(
+def test_a_type_that_is_not_the_publishers_is_refused_by_name_and_the_others_go_on(
     robot: Joints, tmp_path: Path
 ) -> None:
     bag = tmp_path / "partly"
     robot.node.create_publisher(Goals, "/goals", qos.STREAM)
-    settings = {"topics": ["/joints", "/goals"], "start_type_description_service": False}
-    recorder = robot.records(bag=bag, **settings)
-    robot.hears(f"'{GOALS}' is not known; give its Goals.msg", RECORDER)
+    recorder = robot.records(bag=bag, topics=["/joints", "/goals:=std_msgs/msg/String"])
+    robot.hears("'std_msgs/msg/String' is published with hash RIHS01_", RECORDER)
     assert robot.levels[RECORDER] == DiagnosticStatus.ERROR
     robot.publish(3)
     time.sleep(0.3)
@@ -157,32 +156,20 @@ def test_a_type_nobody_describes_is_refused_by_name_and_the_others_go_on(
     assert three_readers(bag, "/joints") == [robot.sent] * 3
 
 
-@pytest.mark.parametrize("described", [True, False])
-def test_a_definition_that_is_not_the_publishers_is_not_used(
-    robot: Joints, tmp_path: Path, described: bool
-) -> None:
+def test_a_definition_that_is_not_the_publishers_is_not_used(robot: Joints, tmp_path: Path) -> None:
     other = tmp_path / "nav_msgs" / "msg" / "Goals.msg"
     other.parent.mkdir(parents=True)
     other.write_text("float64 x\n")
-    settings = {
-        "topics": "[/goals]",
-        "bag": tmp_path / "run",
-        "definitions": f"[{other}]",
-        "start_type_description_service": described,
-    }
+    bag = tmp_path / "run"
     goals = robot.node.create_publisher(Goals, "/goals", qos.STREAM)
-    recorder = robot.records(goals, **settings)
+    recorder = robot.records(goals, topics="[/goals]", bag=bag, definitions=f"[{other}]")
     goals.publish(Goals())
-    if described:
-        robot.received("/goals", 1)
-    else:
-        robot.hears(f"'{GOALS}' is published with hash RIHS01_", RECORDER)
+    robot.received("/goals", 1)
     stop(recorder)
-    with Bag(tmp_path / "run") as source:
-        assert source.count("/goals") == int(described)
-        if described:
-            _, types = source.types_on("/goals")
-            assert [name for name, _ in types.fielddefs[GOALS][1]] == ["header", "goals"]
+    with Bag(bag) as source:
+        assert source.count("/goals") == 1
+        _, types = source.types_on("/goals")
+    assert [name for name, _ in types.fielddefs[GOALS][1]] == ["header", "goals"]
 
 
 def test_bags_begin_and_end_when_asked_and_nothing_between_them_is_lost(

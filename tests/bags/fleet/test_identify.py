@@ -41,7 +41,7 @@ grid: {period: 0.025, max_gap: 0.1}
 split: {test: ["*_0"]}
 identification: {lags: 2, iterations: 1}
 """
-FILES = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
+FILES = (documents.MODEL, documents.MODEL_PROOF, documents.TRIALS)
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from nlsid_core.kernel.exact import inverse_forms
 from nlsid_core.kernel.polynomials import Polynomial, Ring
 from tests.core.kernel import refusals
 from tests.core.kernel.oracle_continuous import Oracle
-from tests.edits import Edit, both, changed, put, without
+from tests.edits import Edit, both, changed, put, scaled, without
 from tests.funnel_files import (
     FIELD,
     FUNNEL,
@@ -443,6 +443,7 @@ def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(fil
     refusals.refused_with_fresh_digests(files, "not_valid")
 
 
+NO_MULTIPLIER = without(f"{PART} goal_multiplier")
 HOSTILE: dict[str, tuple[Edit, str]] = {
     "level -1": (put(f"{PART} pieces 0 level", -1), "malformed"),
     "level 17": (put(f"{PART} pieces 0 level", 17), "malformed"),
@@ -465,6 +466,10 @@ HOSTILE: dict[str, tuple[Edit, str]] = {
     "kappa without pushes": (put(f"{PART} kappa", [[1.0]] * 4), "not_covered"),
     "exponent 5000": (put(f"{FIELD} pieces 0 0 exponents -1 1", 5000), "malformed"),
     "exponent -1": (put(f"{FIELD} pieces 0 0 exponents -1 1", -1), "malformed"),
+    "too wide at the last knot only": (
+        both(scaled(f"{FUNNEL} rho -1", 1e3), without(f"{PROOF} claim goal"), NO_MULTIPLIER),
+        "not_valid",
+    ),
     "no goal": (without(f"{PROOF} claim goal"), "malformed"),
     "two lines": (put(f"{FIELD} expansion", "by hand\nPROVED everything"), "malformed"),
     "a nominal that jumps": (
@@ -487,7 +492,7 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
 
 
 def test_a_claim_without_its_goal_says_nothing_of_it(files: Files) -> None:
-    both(without(f"{PROOF} claim goal"), without(f"{PART} goal_multiplier"))(files)
+    both(without(f"{PROOF} claim goal"), NO_MULTIPLIER)(files)
     assert "goal" not in proofs.decide(files[PROOF], files).statement
 
 

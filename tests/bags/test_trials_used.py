@@ -1,55 +1,22 @@
-"""Identification in the background: it gets there, says why not, and can be called off."""
+"""Which recordings are identified from, and which of them only score."""
 
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from bags.chain.background import BackgroundIdentification, Progress, finished_bags
 from bags.chain.config import SplitConfig, load_config
+from bags.chain.finished import finished_bags
 from bags.chain.shipped import config_file
 from bags.chain.steps import split
-from bags.designs.documents import MODEL, MODEL_PROOF
 from bags.recordings.writer import BagWriter
 from bags.signals.recording import Arrival, Recent
-from nlsid import check, f1tenth
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command, speed_bag
 from tests.conftest import synthetic_dataset
 
 CONFIG = config_file("f1tenth.yaml")
-PATIENCE = 60.0  # s
-
-
-def wait(work: BackgroundIdentification) -> Progress:
-    deadline = time.monotonic() + PATIENCE
-    while not (progress := work.poll()).done:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return progress
-
-
-@pytest.mark.slow
-def test_it_writes_a_model_and_its_proof(tmp_path: Path) -> None:
-    work = BackgroundIdentification(f1tenth(), CONFIG, tmp_path)
-    assert wait(work) == Progress("done", 1.0, done=True)
-    assert "PROVED" in str(check(tmp_path / MODEL_PROOF))
-    assert (tmp_path / MODEL).is_file()
-
-
-def test_what_is_wrong_with_the_bags_is_said(tmp_path: Path) -> None:
-    progress = wait(BackgroundIdentification([tmp_path / "nowhere"], CONFIG, tmp_path / "out"))
-    assert progress.done
-    assert "nowhere" in progress.error
-
-
-def test_called_off_it_ends_and_leaves_nothing(tmp_path: Path) -> None:
-    work = BackgroundIdentification(f1tenth(), CONFIG, tmp_path / "out")
-    work.cancel()
-    assert work.poll().what == "cancelled"
-    assert not (tmp_path / "out").exists()
 
 
 def recordings(folder: Path) -> None:
@@ -98,14 +65,13 @@ def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
         split(data, SplitConfig(share=0.01))
 
 
-@pytest.mark.parametrize("use", ["calibration"])
-def test_trials_of_another_use_are_left_whole(use: str) -> None:
+def test_trials_of_another_use_are_left_whole() -> None:
     data = synthetic_dataset(0.01, trials=2, samples=80)
-    trials = split(data, SplitConfig(share=0.25, **{use: data.names[:1]}))
-    assert [len(trial) for trial in trials.by_use[use]] == [80]
+    trials = split(data, SplitConfig(share=0.25, calibration=data.names[:1]))
+    assert [len(trial) for trial in trials.by_use["calibration"]] == [80]
     assert trials.train.names == trials.test.names == data.names[1:]
-    with pytest.raises(DataError, match=f"all of the bags are {use} trials"):
-        split(data, SplitConfig(share=0.25, **{use: data.names}))
+    with pytest.raises(DataError, match="all of the bags are calibration trials"):
+        split(data, SplitConfig(share=0.25, calibration=data.names))
 
 
 def test_a_configuration_names_test_bags_or_a_share_but_not_both(tmp_path: Path) -> None:
