@@ -78,8 +78,7 @@ def test_the_simplest_that_is_as_good_as_the_best_is_taken(
         Row(one, errors, (fitted(data, one, data),))
         for one, errors in ((LAGS[2], best), (LAGS[0], best * worse))
     )
-    found = simplest([large, small], np.ones(6, dtype=bool))
-    assert found is {"small": small, "large": large}[taken]
+    assert simplest([large, small], np.ones(6, bool)) is {"small": small, "large": large}[taken]
 
 
 def test_repeats_of_an_excitation_stay_together_and_others_make_the_promise() -> None:
@@ -108,16 +107,17 @@ def test_no_fold_has_all_excitations_that_vary_most() -> None:
     largest = [float(np.var(fold.judged[0][0].u)) for fold in held_out.folds]
     assert largest == sorted(largest, reverse=True)
     for fold in held_out.folds:
-        names = [group[0].name.split("[")[0] for group in fold.judged]
-        assert sum(name.endswith(" 1") for name in names) == 1
+        assert sum(group[0].name.split("[")[0].endswith(" 1") for group in fold.judged) == 1
 
 
 def test_models_that_differ_where_inputs_are_larger_count_as_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A cubic of the inputs follows from the data; above the largest input it does not."""
-    cubic = Attempt(Polynomial(2, (1,), Degrees(inputs=3)), Rse(2))
-    choice = judged(Dataset(tuple(trial(k, bend=0.1) for k in range(6))), [cubic])
+    choice = judged(
+        Dataset(tuple(trial(k, bend=0.1) for k in range(6))),
+        [Attempt(Polynomial(2, (1,), Degrees(inputs=3)), Rse(2))],
+    )
     monkeypatch.setattr(choosing, "BEYOND", ((1, 1.0),))
     recorded = choice.held_out.apart([fit.model for fit in choice.best.fits])
     assert choice.best.apart > 1.1 * recorded
@@ -130,10 +130,7 @@ def test_the_promise_has_no_lower_end_where_the_model_is_fitted_to_more() -> Non
 
 def test_what_is_promised_holds_on_new_excitations() -> None:
     choice = judged(Dataset(tuple(trial(k) for k in range(9))), LAGS)
-    best = choice.best.attempt
-    model = identify(
-        choice.held_out.data, best.model_class, method=best.method, comparators=()
-    ).model
+    model = fitted(choice.held_out.data, choice.best.attempt, choice.held_out.data).model
     errors = [choice.held_out.error(model, [trial(k)]) for k in range(20, 30)]
     assert 0.0 < choice.promise.low < 100.0 * float(np.sqrt(np.mean(errors))) < choice.promise.high
 
