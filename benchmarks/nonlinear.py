@@ -6,15 +6,17 @@ DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. Eve
 `nlsid init` makes it, at its defaults, by training data that are held out; the model is then fitted
 to all of them and simulated once over the test data. Trials are as the owners divide them.
 
-promised, promised_spread and test are in % of the training outputs' spread, of simulations from
-starts that are found on the first samples, which are not scored. score is what publications state,
-over all samples but those that they skip. seconds: of processor time, of the choice and of the fit.
+promised, promised_spread and test are in % of what the outputs vary by in the data that are judged,
+as `nlsid learn` prints them: of simulations from starts that are found on the first samples, which
+are not scored. score is what publications state, over all samples but those that they skip.
+seconds: of processor time, of the choice and of the fit.
 """
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -200,11 +202,10 @@ def measure(case: PublicSet, folder: Path) -> dict[str, Any]:
         print(f"    {row.percent:8.3g} %  {row.attempt}  {row.refusal[:60]}", flush=True)
     model = fitted_to_all(choice)
     seconds, promise = time.process_time() - started, choice.promise
-    start = choice.held_out.start
-    outputs = simulate_started(model, list(test), start)
-    squares = [choice.held_out.error(model, [trial]) for trial in test]
-    weights = [len(trial) - start for trial in test]
-    reached = 100.0 * float(np.sqrt(np.average(squares, weights=weights)))
+    outputs = simulate_started(model, list(test), choice.held_out.start)
+    spread = np.concatenate([trial.y for trial in test]).std(axis=0)
+    judge = replace(choice.held_out, spread=spread)
+    reached = 100.0 * math.sqrt(judge.error(model, list(test)))
     return {
         "promised": promise.percent,
         "promised_spread": [promise.low, promise.high],

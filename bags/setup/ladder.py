@@ -30,7 +30,7 @@ FEW_LAGS = (1, 2, 3, 4)
 STEPS = 6  # of a search while it is one of many
 MEMORIES = (1.0 / 3.0, 0.1)  # of the longest trial, beside all of it
 EVERY = 100  # least squares is quick
-DROPPED = 1.1  # times the best: what is worse on the first fold is not judged on the others
+DROPPED = 1.2  # times the best: what is worse on the first fold is not judged on the others
 LEAP = 0.25  # of the error before: where filters or a follower leave less, no others are tried
 MOST_FILTERED = 6  # states of filters: as many as lags of the best by least squares, or fewer
 SWINGS = 10.0  # % of the spread, above which a loop through a map is tried, which takes longest
@@ -215,9 +215,10 @@ def excited(data: Dataset, lags: int, degree: int) -> tuple[int, ...] | None:
 Stages = Sequence[tuple[Stage, int]]  # with how many of each are judged
 LINEAR: Stages = ((linear, EVERY), (iterated, 3))
 BEYOND: Stages = (
-    (curved, 2),
+    (curved, 3),
     (networks, 2),
     (nearby, 2),
+    (nearby, 2),  # once more, where that found a better one
     (memories, 1),
 )
 STAGES = (*LINEAR, *BEYOND)

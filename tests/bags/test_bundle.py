@@ -84,10 +84,6 @@ def test_a_name_that_is_not_plain_is_not_read(funnel: Path, tmp_path: Path, name
     assert "refused" in decide(loaded.text())
 
 
-def deep(document: Json) -> str:
-    return json.dumps(document | {"files": "[" * 100_000})
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -12,6 +12,7 @@ from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification import (
     Attempt,
     Choice,
+    Degrees,
     FilterMapFilter,
     LeastSquares,
     Network,
@@ -19,6 +20,7 @@ from nlsid_core.identification import (
     Row,
     Rse,
     Sem,
+    choosing,
     identify,
     simulation_percent,
 )
@@ -55,15 +57,16 @@ def test_one_recording_is_cut_in_time() -> None:
     for fold in choice.held_out.folds:
         together = sum(map(len, fold.fitted)) + sum(len(t) for group in fold.judged for t in group)
         assert together == 1200, "each sample is fitted or judged"
-    assert all(choice.best.percent <= 1.05 * row.percent for row in choice.rows)
+    assert all(choice.best.percent <= 1.01 * row.percent for row in choice.rows)
 
 
 @pytest.mark.parametrize(
     ("worse", "taken"),
     [
         ((1.0, 1.04, 1.0, 1.0, 1.02, 0.98), "small"),
-        ((1.04,) * 6, "large"),  # a little, but on every stretch
-        ((1.0, 1.0, 1.0, 1.0, 1.0, 4.0), "large"),  # within one standard error, but much
+        ((1.01,) * 6, "small"),
+        ((1.04,) * 6, "large"),  # a little
+        ((1.0, 1.0, 1.0, 1.0, 1.0, 4.0), "large"),  # on one stretch, but much
     ],
 )
 def test_the_simplest_that_is_as_good_as_the_best_is_taken(
@@ -109,6 +112,22 @@ def test_no_fold_has_all_excitations_that_vary_most() -> None:
         assert sum(name.endswith(" 1") for name in names) == 1
 
 
+def test_models_that_differ_where_inputs_are_larger_count_as_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A cubic of the inputs follows from the data; above the largest input it does not."""
+    cubic = Attempt(Polynomial(2, (1,), Degrees(inputs=3)), Rse(2))
+    choice = judged(Dataset(tuple(trial(k, bend=0.1) for k in range(6))), [cubic])
+    monkeypatch.setattr(choosing, "BEYOND", ((1, 1.0),))
+    recorded = choice.held_out.apart([fit.model for fit in choice.best.fits])
+    assert choice.best.apart > 1.1 * recorded
+
+
+def test_the_promise_has_no_lower_end_where_the_model_is_fitted_to_more() -> None:
+    choice = judged(Dataset((trial(0, samples=13_200),)), LAGS[2:])
+    assert str(choice.promise).startswith("at most")
+
+
 def test_what_is_promised_holds_on_new_excitations() -> None:
     choice = judged(Dataset(tuple(trial(k) for k in range(9))), LAGS)
     best = choice.best.attempt
@@ -116,7 +135,7 @@ def test_what_is_promised_holds_on_new_excitations() -> None:
         choice.held_out.data, best.model_class, method=best.method, comparators=()
     ).model
     errors = [choice.held_out.error(model, [trial(k)]) for k in range(20, 30)]
-    assert choice.promise.low < 100.0 * float(np.sqrt(np.mean(errors))) < choice.promise.high
+    assert 0.0 < choice.promise.low < 100.0 * float(np.sqrt(np.mean(errors))) < choice.promise.high
 
 
 @pytest.mark.parametrize(

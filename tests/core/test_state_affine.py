@@ -1,6 +1,5 @@
 """State-affine models: documents, simulation, several outputs, proofs, certified iterates."""
 
-import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -56,10 +55,6 @@ def documents(model: StateAffineModel) -> tuple[Json, Json]:
     proof = prove_stability(model)
     assert proof is not None
     return model.document(), proof.document(model, "model.json")
-
-
-def copied(document: Json) -> Json:
-    return json.loads(json.dumps(document))  # type: ignore[no-any-return]
 
 
 def test_the_proof_holds_on_simulations_from_two_initial_conditions(

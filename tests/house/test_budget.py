@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 17_798,
     ("bags",): 11_488,
     ("nlsid_ros",): 2_599,
-    ("tests",): 21_045,
+    ("tests",): 21_049,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
