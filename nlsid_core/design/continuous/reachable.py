@@ -18,11 +18,10 @@ from nlsid_core.design.continuous.setting import GOAL_ROOM, Setting
 PARTS = 4  # of an interval, for the integration
 SLACK = 0.24  # of log ρ over the motion: room for what is not linear
 START = 0.1  # of the goal's size, that is due to where solutions start
-SHARPNESS = (
-    4  # p of the norm tr(M^p)^(1/p) that is minimised in the place of the largest eigenvalue
-)
+SHARPNESS = 4  # p of the norm tr(M^p)^(1/p), minimised in the place of the largest eigenvalue
 SPREAD = 0.1  # of the mean: what every direction of the start counts at least
 ROUNDS, STEPS = 8, 6  # of what is lost between knots; of the norm's slope in each
+FLOOR = 0.1  # of the goal over the motion: what nothing pushes would shrink, and its P turn fast
 FAR = 3.0  # times the goal: it does not come back from there
 LOST = 1e6  # times the goal: beyond, numbers overflow
 
@@ -147,6 +146,7 @@ class _Loop:
                 end = F.T @ end @ F
             adjoint.append(end)
         n, step = len(self.goal), self.h / PARTS
+        floor = FLOOR / float(self.h.sum()) * self.goal_inverse
         least = SPREAD / n * np.trace(end @ self.goal_inverse)
         X = share / n * np.linalg.inv(end + least * self.goal)
         knots, kappas = [X], []
@@ -158,7 +158,7 @@ class _Loop:
                     pushed = pushed + np.einsum("ij,il,lj->j", G, of_end, G)
                     kappa = np.sqrt(kept / pushed)
                     growth = np.exp(step[k] * ((self.r / kappa).sum() + slack[k]))
-                    added = G * (step[k] * self.r * kappa) @ G.T
+                    added = G * (step[k] * self.r * kappa) @ G.T + step[k] * floor
                     X = knots[k]
                     for F in parts:
                         X = growth * F @ X @ F.T + added
