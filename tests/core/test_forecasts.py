@@ -180,7 +180,9 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
     assert (with_peak.high[0] <= predicted + (1.0 + 1e-7) * most).all()
 
 
-@pytest.mark.parametrize("name", ["linear", pytest.param("implicit_linear", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["linear", pytest.param("implicit_linear", marks=pytest.mark.slow)]
+)
 def test_the_reach_of_a_linear_model_is_above_the_exact_one_and_close(name: str) -> None:
     model, funnel = alone(name, peak=False)
     linear, tube = linear_form(model), funnel.tubes[0]
