@@ -3,6 +3,9 @@
 Source: Löfberg, "Pre- and post-processing sum-of-squares programs in practice", IEEE TAC 2009.
 """
 
+from itertools import accumulate
+from operator import mul
+
 import numpy as np
 
 from nlsid_core.arrays import IntArray
@@ -31,20 +34,16 @@ def drop_inconsistent(candidates: IntArray, support: IntArray) -> IntArray:
     """
     low, high = (support.min(axis=0) + 1) // 2, support.max(axis=0) // 2
     candidates = candidates[((candidates >= low) & (candidates <= high)).all(axis=1)]
-    present = {tuple(row) for row in support.tolist()}
+    # A number for each monomial, so that products are sums; 2 high + 1 is the largest exponent.
+    places = [1, *accumulate((2 * high + 2).tolist(), mul)]
+    weights = np.array(places[:-1], dtype=np.int64 if places[-1] < 2**62 else object)
+    numbers, present = candidates @ weights, support @ weights
     while True:
-        rows = candidates.tolist()
-        sums, counts = np.unique(
-            (candidates[:, None] + candidates[None]).reshape(-1, support.shape[1]),
-            axis=0,
-            return_counts=True,
-        )
-        often = {tuple(row) for row, count in zip(sums.tolist(), counts, strict=True) if count > 1}
-        squares = [tuple(2 * entry for entry in row) for row in rows]
-        keep = [square in present or square in often for square in squares]
-        if all(keep):
+        products, counts = np.unique(numbers[:, None] + numbers, return_counts=True)
+        keep = np.isin(2 * numbers, np.concatenate([present, products[counts > 1]]))
+        if keep.all():
             return candidates
-        candidates = candidates[np.array(keep)]
+        candidates, numbers = candidates[keep], numbers[keep]
 
 
 def sign_blocks(basis: IntArray, support: IntArray) -> list[IntArray]:
