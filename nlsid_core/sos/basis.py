@@ -3,9 +3,6 @@
 Source: Löfberg, "Pre- and post-processing sum-of-squares programs in practice", IEEE TAC 2009.
 """
 
-from itertools import accumulate
-from operator import mul
-
 import numpy as np
 
 from nlsid_core.arrays import IntArray
@@ -35,8 +32,8 @@ def drop_inconsistent(candidates: IntArray, support: IntArray) -> IntArray:
     low, high = (support.min(axis=0) + 1) // 2, support.max(axis=0) // 2
     candidates = candidates[((candidates >= low) & (candidates <= high)).all(axis=1)]
     # A number for each monomial, so that products are sums; 2 high + 1 is the largest exponent.
-    places = [1, *accumulate((2 * high + 2).tolist(), mul)]
-    weights = np.array(places[:-1], dtype=np.int64 if places[-1] < 2**62 else object)
+    places = np.cumprod([1, *(2 * high + 2).tolist()], dtype=object)
+    weights = places[:-1].astype(np.int64 if places[-1] < 2**62 else object)
     numbers, present = candidates @ weights, support @ weights
     while True:
         products, counts = np.unique(numbers[:, None] + numbers, return_counts=True)
