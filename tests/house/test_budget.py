@@ -12,7 +12,7 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_799,
+    ("nlsid_core",): 17_802,
     ("bags",): 11_488,
     ("nlsid_ros",): 2_599,
     ("tests",): 21_045,

@@ -15,7 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.finer import NEARBY, coarse, halved, most_knots, refusal_time
 from nlsid_core.design.continuous.problem import ContinuousTracking
-from nlsid_core.design.continuous.reachable import reached
+from nlsid_core.design.continuous.reachable import FLOOR, reached
 from nlsid_core.design.continuous.search import Found, expected, search
 from nlsid_core.design.continuous.setting import (
     MOST_KNOTS,
@@ -87,7 +87,8 @@ def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
     listed: list[Attempt] = [("as it is", lambda _: setting)]
     if problem.policy is None:
         listed += HALVINGS * [("with more knots", partial(_finer, problem))]
-    listed.append(("around what w reaches", partial(_pushed, problem)))
+    for floor in (0.0, FLOOR):
+        listed.append(("around what w reaches", partial(_pushed, problem, floor)))
     return listed
 
 
@@ -160,14 +161,14 @@ def _finer(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
     return prepare(replace(problem, nominal=motion_of(last.setting).halved(chosen)))
 
 
-def _pushed(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
+def _pushed(problem: ContinuousTracking, floor: float, tried: list[Tried]) -> Setting | None:
     """P(t) of a pushed linear loop's reach, if w stopped the last; None if it misses the goal.
 
     Where P turns fast on some intervals, there are more knots.
     """
     setting = tried[-1].setting if tried[-1].cause == "disturbance" else None
     for _ in range(HALVINGS):
-        found = None if setting is None else reached(setting)
+        found = None if setting is None else reached(setting, floor)
         if setting is None or found is None:
             return None
         if found.size < 1:

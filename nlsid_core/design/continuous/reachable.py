@@ -40,9 +40,12 @@ class Reached:
     coarse: NDArray[np.bool_]
 
 
-def reached(setting: Setting) -> Reached | None:
-    """The ellipsoids along the motion of a setting; None if w does more than push or it is LOST."""
-    loop = _Loop.of(setting)
+def reached(setting: Setting, floor: float) -> Reached | None:
+    """The ellipsoids along the motion of a setting; None if w does more than push or it is LOST.
+
+    floor: how much of the goal's ellipsoid is added over the motion, so that P does not turn fast.
+    """
+    loop = _Loop.of(setting, floor)
     if loop is None:
         return None
     lost = np.zeros(len(loop.h))
@@ -80,7 +83,7 @@ def reached(setting: Setting) -> Reached | None:
 class _Loop:
     """h: (K-1,) s. across: (K-1, PARTS, n, n). ends: (K-1, 2, n, n) A at both ends of an interval.
 
-    G: (K-1, n, n_w) what pushes. r: (n_w,). goal, goal_inverse: (n, n).
+    G: (K-1, n, n_w) what pushes. r: (n_w,). goal, goal_inverse, floor (in 1/s): (n, n).
     """
 
     h: FloatArray
@@ -90,9 +93,10 @@ class _Loop:
     r: FloatArray
     goal: FloatArray
     goal_inverse: FloatArray
+    floor: FloatArray
 
     @classmethod
-    def of(cls, setting: Setting) -> "_Loop | None":
+    def of(cls, setting: Setting, floor: float) -> "_Loop | None":
         """The closed loop along the motion, linear."""
         field, policy, expansion = setting.steps.field, setting.policy, setting.expansion
         t = policy.t
@@ -116,7 +120,9 @@ class _Loop:
         ends = np.array([[closed(k, 0.0), closed(k, 1.0)] for k in range(len(h))])
         goal = setting.goal.P
         radius = np.ptp(field.uncertain[:own], axis=1) / 2
-        return cls(h, across, ends, np.array(pushes), radius, goal, np.linalg.inv(goal))
+        inverse = np.linalg.inv(goal)
+        floors = floor / float(h.sum()) * inverse
+        return cls(h, across, ends, np.array(pushes), radius, goal, inverse, floors)
 
     def size(self, X: FloatArray) -> float:
         """The smallest copy of the goal that holds {x'X⁻¹x ≤ 1}; inf if X overflows."""
@@ -146,7 +152,6 @@ class _Loop:
                 end = F.T @ end @ F
             adjoint.append(end)
         n, step = len(self.goal), self.h / PARTS
-        floor = FLOOR / float(self.h.sum()) * self.goal_inverse
         least = SPREAD / n * np.trace(end @ self.goal_inverse)
         X = share / n * np.linalg.inv(end + least * self.goal)
         knots, kappas = [X], []
@@ -158,7 +163,7 @@ class _Loop:
                     pushed = pushed + np.einsum("ij,il,lj->j", G, of_end, G)
                     kappa = np.sqrt(kept / pushed)
                     growth = np.exp(step[k] * ((self.r / kappa).sum() + slack[k]))
-                    added = G * (step[k] * self.r * kappa) @ G.T + step[k] * floor
+                    added = G * (step[k] * self.r * kappa) @ G.T + step[k] * self.floor
                     X = knots[k]
                     for F in parts:
                         X = growth * F @ X @ F.T + added

@@ -353,7 +353,7 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
         return 503 if path == "/late.mcap" and number <= 2 else answers.get(path)
 
     with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
-        named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=1.0)
+        named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=4.0)
         found = checked(named) if verb == "check" else held_against(funnel, named).rows
     rows = {row.bag: row for row in found}
     assert [row.bag for row in found] == sorted(rows) == sorted(named)
