@@ -9,6 +9,7 @@ topics.
 import json
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -52,7 +53,7 @@ class ModelIdentifier(ManagedNode):
 
     def start(self) -> None:
         """Wait for requests."""
-        self._work: subprocess.Popen[str] | None = None
+        self._work: subprocess.Popen[bytes] | None = None
         self._began = 0.0
         self._level, self._text = DiagnosticStatus.OK, "idle"
         self.keep_reporting(self._report)
@@ -65,7 +66,7 @@ class ModelIdentifier(ManagedNode):
         """Call off what runs."""
         if self._work is not None:
             self._work.kill()
-            self._work.communicate()
+            self._work.wait()
             self._work = None
 
     def _on_identify(self) -> tuple[bool, str]:
@@ -73,12 +74,12 @@ class ModelIdentifier(ManagedNode):
             return False, "busy: identifying"
         bags, others = finished_bags(self._bags, self._topics, last=self.values.last)
         left_out = [f"; left out {path.name}: {reason}" for path, reason in others.items()]
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - a pipe could be full
         command = [sys.executable, "-m", "bags.commands.main", "identify", str(self._out)]
         self._work = subprocess.Popen(
             [*command, *map(str, bags), "--config", str(self._config)],
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
+            stderr=self._errors,
         )
         self._began = time.monotonic()
         self._say("identifying")
@@ -95,11 +96,11 @@ class ModelIdentifier(ManagedNode):
         """When it has ended, check the proof and publish the model, or say why there is none."""
         if self._work is None or self._work.poll() is None:
             return
-        status, (_, errors) = self._work.returncode, self._work.communicate()
-        self._work = None
+        status, self._work = self._work.returncode, None
         try:
             if status:
-                said = errors.strip() or f"the process ended with status {status}"
+                self._errors.seek(0)
+                said = self._errors.read().strip() or f"the process ended with status {status}"
                 raise DataError(said.removeprefix("error: "))
             verdict = check(self._out / documents.MODEL_PROOF)
             model = documents.load_stable_model(self._out / documents.MODEL)

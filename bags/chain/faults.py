@@ -6,7 +6,7 @@ from typing import Final
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns, is_stamped
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import whole_bag
 from bags.signals.signal import SignalPath
 from bags.signals.timing import seconds
 from nlsid_core.errors import BagError
@@ -43,7 +43,7 @@ def write_faulty_copy(bag: Path | str, out: Path | str, signal: str, fault: Faul
         if not is_stamped(msgtype, types):
             raise BagError(f"{bag}: messages on {path.topic} ({msgtype}) have no header stamp")
         first: int | None = None
-        with BagWriter(out, custom=source.custom) as writer:
+        with whole_bag(out, custom=source.custom) as writer:
             for message in source.messages():
                 data = message.data
                 stamp = message.log_time_ns

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from bags.recordings.message_types import standard_types
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import whole_bag
 from bags.signals.grid import REPEAT_GROUP
 from nlsid_core.data.trajectory import Trajectory
 
@@ -29,7 +29,7 @@ def write_joint_bag(
     information = dict(custom or {})
     if trajectory.group:
         information[REPEAT_GROUP] = trajectory.group
-    with BagWriter(path, custom=information) as writer:
+    with whole_bag(path, custom=information) as writer:
         for t, y, u in zip(trajectory.t.tolist(), trajectory.y, trajectory.u, strict=True):
             stamp_ns = FIRST_NS + round(t * 1e9)
             none = np.zeros(0)

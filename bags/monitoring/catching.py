@@ -189,6 +189,17 @@ class Catching:
     restarts: tuple[str, ...] = ()
 
     @property
+    def beyond(self) -> list[str]:
+        """What to know of a tube that follows the commands beyond the output's range."""
+        return [
+            f"the half-width of {width.name} is up to {_up(width.most)} {width.unit} where the "
+            f"commands change most, beyond its range, {width.range:.3g} {width.unit}: the tube "
+            "says nothing there"
+            for width in self.widths
+            if width.most is not None and width.most > width.range
+        ]
+
+    @property
     def still(self) -> list[str]:
         """What to know of a tube that is narrow in the range and wide in most trials."""
         return [

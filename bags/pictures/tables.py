@@ -185,5 +185,5 @@ def say_catching(console: Console, catching: Catching) -> None:
             f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
         )
-    for line in (*catching.still, *catching.restarts, *catching.warnings()):
+    for line in (*catching.beyond, *catching.still, *catching.restarts, *catching.warnings()):
         warn(console, line)

@@ -11,9 +11,10 @@ import fcntl
 import os
 import shutil
 import struct
+import tempfile
 import zlib
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -111,7 +112,7 @@ class BagWriter:
     It grows under its own name, and whatever happens stays readable: a recorder that is killed, or
     whose disk is full, loses only the messages after the last closed chunk (it has no metadata.yaml
     then). A killed process loses nothing of a closed chunk; a power cut may. Leaving a `with` block
-    by an exception removes the bag.
+    by an exception removes the bag. `whole_bag` writes one that has its name only when it is whole.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `close_chunk`, called
     from a timer, limits what a kill loses. `mcap` takes what is copied as it is.
@@ -291,6 +292,22 @@ class BagWriter:
             return
         self.abandon()
         shutil.rmtree(self.path)
+
+
+@contextmanager
+def whole_bag(path: Path | str, *, custom: Mapping[str, str] | None = None) -> Iterator[BagWriter]:
+    """A bag that gets its name when it is whole; nothing is left of it after an error.
+
+    Raises BagError if something is at `path`; OS errors pass through.
+    """
+    path = Path(path)
+    refuse_existing(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        with BagWriter(Path(folder) / path.name, custom=custom) as writer:
+            yield writer
+        refuse_existing(path)  # rename would replace an empty folder
+        writer.path.rename(path)
 
 
 class McapWriter:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import BagWriter, whole_bag
 from bags.signals.timing import Sequence
 
 REMEMBERED = 1000  # looks at a clock; a recorder looks 20 times a second
@@ -96,7 +96,7 @@ class Recent:
         offered: the quality of service of each topic's publishers, where it is known.
         """
         profiles = offered or {}
-        with BagWriter(path, custom={SNAPSHOT: f"{self.seconds:g} s"}) as bag:
+        with whole_bag(path, custom={SNAPSHOT: f"{self.seconds:g} s"}) as bag:
             for topic, definition in (definitions or {}).items():
                 said = profiles.get(topic, ())
                 bag.add_topic(topic, definition.msgtype, definition=definition, offered=said)

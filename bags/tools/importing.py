@@ -14,7 +14,7 @@ import numpy as np
 from bags.recordings.cdr import Step
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import whole_bag
 from bags.signals.reader import stamp_text
 from bags.signals.signal import SignalPath
 from bags.signals.units import UNITS
@@ -181,7 +181,7 @@ def import_table(
             )
         streams.append(_Stream(topic, msgtype, columns))
     said = _said_times(times, rows, unit)
-    with BagWriter(out, custom=custom) as writer:
+    with whole_bag(out, custom=custom) as writer:
         for row, stamp in enumerate(stamps.tolist()):
             for stream in streams:
                 data = stream.message(row, stamp)

@@ -71,6 +71,14 @@ def bag(tmp_path: Path) -> Path:
     return speed_bag(tmp_path / "trial", np.sin(t), np.repeat(np.arange(40.0), 10))
 
 
+def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: Path) -> None:
+    file = next(bag.glob("*.mcap"))
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    output = run("recover", damaged, "--out", tmp_path / "whole", status=1)
+    assert "what was lost is said above" in output
+
+
 def leaves(command: Any, name: str = "nlsid") -> dict[str, Any]:
     """Every verb below a command, by its whole name."""
     if not hasattr(command, "commands"):

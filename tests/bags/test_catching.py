@@ -295,6 +295,9 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert width.least == pytest.approx(expected.min(), rel=1e-6)
     assert width.most == pytest.approx(expected.max(), rel=1e-6)
     assert "on average" in width.said
+    assert found.beyond == []
+    narrow = replace(found, widths=(replace(width, range=0.9 * float(expected.max())),))
+    assert "where the commands change most, beyond its range" in narrow.beyond[0]
     (errors,), _ = (part.axes for part in draw(found).subfigs)
     assert len(errors.collections) == found.trials
 

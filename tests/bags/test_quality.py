@@ -26,7 +26,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.message_types import decode
 from bags.recordings.quality import LATCHED, Profile, offered, offered_text, profile_of
-from bags.recordings.writer import BagWriter
+from bags.recordings.writer import BagWriter, whole_bag
 from bags.tools.copies import Into
 from bags.tools.recover import recover
 from nlsid_core.errors import BagError
@@ -97,10 +97,23 @@ def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == [tmp_path / "trial"]
 
 
-def test_an_exception_leaves_nothing_of_a_bag(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="is not known"), BagWriter(tmp_path / "trial") as bag:
+@pytest.mark.parametrize("write", [BagWriter, whole_bag])
+def test_an_exception_leaves_nothing_of_a_bag(tmp_path: Path, write: Any) -> None:
+    with pytest.raises(BagError, match="is not known"), write(tmp_path / "trial") as bag:
         bag.write("/x", "no/msg/Type", b"", log_time_ns=1, publish_time_ns=1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_whole_bag_has_its_name_in_the_end_and_replaces_nothing(tmp_path: Path) -> None:
+    with whole_bag(tmp_path / "run") as bag:
+        bag.write(CMD, CMD_TYPE, command(1, 0.5), log_time_ns=1, publish_time_ns=1)
+        bag.close_chunk()
+        assert not (tmp_path / "run").exists()
+    assert _stamps_on_disk(tmp_path / "run") == [1]
+    with pytest.raises(BagError, match="late exists already"), whole_bag(tmp_path / "late"):
+        (tmp_path / "late").mkdir()
+    assert list((tmp_path / "late").iterdir()) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "late"}
 
 
 def test_a_second_type_on_a_topic_is_refused(tmp_path: Path) -> None:
