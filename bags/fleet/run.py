@@ -13,13 +13,15 @@ from concurrent.futures import (
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
+
+TRIES_ALONE: Final = 2  # of a bag that was read when a worker died
 
 
 class Task(Protocol):
@@ -60,8 +62,9 @@ def ask(
     All are there before the first is given. Until then the manifest holds what they say, so that
     memory does not.
 
-    A bag of which the worker dies is asked of again, alone, and given up when it dies again. Raises
-    DataError if the workers are gone for good; what was answered by then is in the manifest.
+    Bags that were read when a worker died are asked of again, each alone: another of them may have
+    been the cause. One is given up when its worker dies twice then. Raises DataError if the workers
+    are gone for good; what was answered by then is in the manifest.
     """
     answers: dict[str, Answer] = {}
     asked: dict[str, tuple[Path, str]] = {}
@@ -94,15 +97,19 @@ def _asked(
 ) -> Generator[Answer, None, None]:
     """An answer for each bag (where it is, its key), as they come.
 
-    Those that were read when a worker died are asked of again, each alone.
+    Those that were read when a worker died are asked of again, each alone, at most twice.
     """
     died: list[str] = []
     if bags:
         yield from _answers(task, bags, workers, died)
     for name in died:
-        again: list[str] = []
-        yield from _answers(task, {name: bags[name]}, workers, again)
-        if again:
+        alone: list[str] = []
+        for _ in range(TRIES_ALONE):
+            before = len(alone)
+            yield from _answers(task, {name: bags[name]}, workers, alone)
+            if len(alone) == before:
+                break
+        else:
             yield Answer(bags[name][0], name, reason="its worker died twice")
 
 

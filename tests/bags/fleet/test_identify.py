@@ -291,16 +291,19 @@ def test_what_is_answered_is_on_the_disk_and_not_in_memory(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("count", "once"), [(1, "d"), (2, "e")])  # d: c dies, then d once itself
+def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(
+    tmp_path: Path, count: int, once: str
+) -> None:
     bags = {}
     for name in "abcdef":
         bags[name] = tmp_path / name
         bags[name].write_text(name)
     with Manifest(tmp_path / MANIFEST) as manifest:
-        answers = [*ask(Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest)]
+        answers = [*ask(Deadly(tmp_path, always="c", once=once), bags, Workers(count), manifest)]
     assert [a.name for a in answers] == list("abcdef")
     assert [a.name for a in answers if a.reason] == ["c"]
-    assert "its worker died" in answers[2].reason
+    assert answers[2].reason == "its worker died twice"
     assert [a.content.decode() for a in answers if not a.reason] == list("abdef")
 
 
