@@ -30,7 +30,6 @@ from nlsid_core.errors import DataError
 from nlsid_core.proofs import check
 from nlsid_core.running.reading import Status
 
-LIVE_MODULE = "nlsid_ros.demo.live"  # started as a process: bags knows nothing of ROS
 OTHERS_PLOT = "others.png"
 EXCITATIONS, RUNS = "excitations", "runs"  # folders of bags of simulated robots
 
@@ -210,8 +209,8 @@ def _live(console: Console, shown: Shown, out: Path) -> bool:
     recording = out / "live"
     shutil.rmtree(recording, ignore_errors=True)
     trial = next(bag for bag in shown.bags if bag.name == shown.live)
-    command = [
-        *(sys.executable, "-m", LIVE_MODULE, "--funnel", str(out / documents.FUNNEL)),
+    command = [  # a process: bags knows nothing of ROS
+        *(sys.executable, "-m", "nlsid_ros.demo.live", "--funnel", str(out / documents.FUNNEL)),
         *("--bag", str(trial), "--out", str(recording)),
     ]
     with progress_bar("playing"):

@@ -13,15 +13,13 @@ from concurrent.futures import (
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Protocol
 
 from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
-
-TRIES_ALONE: Final = 2  # of a bag that was read when a worker died
 
 
 class Task(Protocol):
@@ -102,15 +100,12 @@ def _asked(
     died: list[str] = []
     if bags:
         yield from _answers(task, bags, workers, died)
+    for _ in range(2):
+        asked, died = died, []
+        for name in asked:
+            yield from _answers(task, {name: bags[name]}, workers, died)
     for name in died:
-        alone: list[str] = []
-        for _ in range(TRIES_ALONE):
-            before = len(alone)
-            yield from _answers(task, {name: bags[name]}, workers, alone)
-            if len(alone) == before:
-                break
-        else:
-            yield Answer(bags[name][0], name, reason="its worker died twice")
+        yield Answer(bags[name][0], name, reason="its worker died twice")
 
 
 def _answers(
