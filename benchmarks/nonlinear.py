@@ -225,15 +225,17 @@ def main() -> None:
     """Print the figures, and with --json one JSON object as the last line."""
     options = parser(__doc__, data=True)
     options.add_argument("--out", type=Path, help="a file for the results, as they come")
-    options.add_argument("names", nargs="*", help="parts of names; all by default")
+    known = [case.folder for case in SETS]
+    options.add_argument("names", nargs="*", help=f"of {', '.join(known)}; all by default")
     arguments = options.parse_args()
-    wanted = [s for s in SETS if not arguments.names or any(n in s.name for n in arguments.names)]
+    if unknown := set(arguments.names) - set(known):
+        options.error(
+            f"no set is called {', '.join(sorted(unknown))}; there are {', '.join(known)}"
+        )
+    wanted = [case for case in SETS if case.folder in (arguments.names or known)]
     rows = {}
     for case in wanted:
         print(case.name, flush=True)
-        if not (arguments.data / case.folder).is_dir():
-            print(f"    no folder {case.folder}")
-            continue
         rows[case.name] = measure(case, arguments.data)
         if arguments.out is not None:
             files.write_atomically(arguments.out, (json.dumps(rows, indent=1) + "\n").encode())
