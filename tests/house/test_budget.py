@@ -15,11 +15,22 @@ STATEMENTS = {
     ("nlsid_core",): 17_801,
     ("bags",): 11_498,
     ("nlsid_ros",): 2_601,
-    ("tests",): 21_063,
+    ("tests",): 21_062,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 0, 10  # functions and classes above the caps
+RECORDS = {  # their fields are the members of a file, the columns of a table, or options
+    "ContinuousTracking",
+    "LStep",
+    "MonotoneEquation",
+    "OutputTube",
+    "Reading",
+    "Scalar",
+    "StateAffineModel",
+    "StateModel",
+    "Trajectory",
+    "Tube",
+}
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
@@ -56,24 +67,23 @@ def test_a_room_stays_within_its_budget(folders: tuple[str, ...]) -> None:
     assert counted <= STATEMENTS[folders]
 
 
-def test_no_more_functions_take_many_arguments() -> None:
-    many = [
+def test_no_function_takes_many_arguments() -> None:
+    assert not [
         f"{source}:{node.lineno} {node.name} takes {arguments(node)}"
         for source in sources(*EVERYTHING)
         for node in nodes(source.tree)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and arguments(node) > ARGUMENTS
     ]
-    assert len(many) <= MORE_ARGUMENTS, "\n".join(many)
 
 
-def test_no_more_classes_have_many_fields() -> None:
-    many = [
-        f"{source}:{node.lineno} {node.name} has {fields(node)}"
+def test_no_other_class_has_many_fields() -> None:
+    many = {
+        node.name
         for source in sources(*EVERYTHING)
         for node in nodes(source.tree)
         if isinstance(node, ast.ClassDef) and fields(node) > FIELDS
-    ]
-    assert len(many) <= MORE_FIELDS, "\n".join(many)
+    }
+    assert many == RECORDS
 
 
 def test_no_line_is_kept_from_the_formatter() -> None:
