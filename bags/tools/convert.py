@@ -151,7 +151,7 @@ def _channels(
             )
     names: dict[str, str] = {}
     for text in what.rename or ():
-        old, equals, new = text.partition("=")
+        old, equals, new = text.replace(":=", "=", 1).partition("=")  # as ROS writes it, too
         if not equals or not new or old not in there or new in {*there, *names.values()}:
             raise BagError(
                 f"--rename {text}: expected /old=/new, the name of a topic and one that none has"

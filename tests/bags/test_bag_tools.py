@@ -358,9 +358,9 @@ def test_a_moment_is_s_or_a_date_and_an_event_a_moment_or_a_topic(
 
 def test_names_and_times_change_and_what_does_not_fit_is_refused(bag: Path, tmp_path: Path) -> None:
     speed = SPEED.replace(ODOM, "/robot/odom")
-    named = ["--rename", f"{ODOM}=/robot/odom"]
+    named = ["--rename", f"{ODOM}=/robot/odom", "--rename", f"{CMD}:=/robot/cmd"]
     run("convert", bag, "--out", tmp_path / "moved", "--restamp", "+10", *named)
-    moved = read_signals(tmp_path / "moved", [speed])[speed]
+    moved = read_signals(tmp_path / "moved", [speed, "/robot/cmd:twist.linear.x"])[speed]
     before = read_signals(bag, [SPEED])[SPEED]
     np.testing.assert_array_equal(moved.values, before.values)
     np.testing.assert_array_equal(moved.stamp_ns, before.stamp_ns + 10 * 10**9)
