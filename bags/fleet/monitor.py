@@ -61,7 +61,7 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Row:
     if replay.first_alarm is not None:
         said["alarm"] = replay.first_alarm.alarm
     if (most := most_spent(replay.judged)) is not None:
-        numbers |= {"spent": most.assumption, "spent_at": most.t}
+        numbers |= {"spent": min(most.assumption, 1e300), "spent_at": most.t}
     if replay.worst is not None:
         numbers |= {"margin": max(replay.worst.margin, -1e300)}
     if replay.first_bad is not None:
@@ -92,7 +92,7 @@ def _unjudged(replay: Replay) -> str:
 
 def most_spent(readings: Sequence[Reading]) -> Reading | None:
     """The reading that uses most of the assumption; None if none measures it."""
-    measured = [reading for reading in readings if math.isfinite(reading.assumption)]
+    measured = [reading for reading in readings if not math.isnan(reading.assumption)]
     return max(measured, key=lambda reading: reading.assumption, default=None)
 
 

@@ -76,11 +76,9 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     bags, config = f1tenth()[0].parent, tmp_path / "robot.yaml"
     said = nlsid("init", config.parent, bags, *options)
     settings = load_config(config)
-    assert settings.signals.response[0].path == response
-    assert settings.signals.excitation[0].path == excitation
-    assert settings.grid.period == 0.025
-    assert settings.clock == "header"
-    assert len(settings.split.test) == 8
+    signals = settings.signals
+    assert (signals.response[0].path, signals.excitation[0].path) == (response, excitation)
+    assert (settings.grid.period, settings.clock, len(settings.split.test)) == (0.025, "header", 8)
     assert f"{response}: " in said
     assert whole_way(bags, config, tmp_path / "out").count("inside") == 8
 
@@ -204,8 +202,9 @@ def test_a_delay_that_is_known_is_found(tmp_path: Path) -> None:
 
 def test_one_side_that_is_named_gets_the_other_that_goes_with_it_best() -> None:
     found = look(f1tenth())
-    assert choose(found, responses=[SPEED]) == ([SPEED], [CMD])
-    assert choose(found, excitations=[CMD]) == ([SPEED], [CMD])
+    assert [choose(found, responses=[SPEED]), choose(found, excitations=[CMD])] == 2 * [
+        ([SPEED], [CMD])
+    ]
     assert choose(found, [SPEED], ["/steering_command:position[name=steering]"])[0] == [SPEED]
 
 
