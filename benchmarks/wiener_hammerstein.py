@@ -23,6 +23,7 @@ from nlsid_core.identification import (
     FilterMapFilter,
     Network,
     Polynomial,
+    Search,
     identify,
     prove_stability,
 )
@@ -98,7 +99,7 @@ def cascade(u: FloatArray, y: FloatArray) -> Keys:
         found = identify(
             single("train", u[CASCADE_TRAIN], y[CASCADE_TRAIN], PERIOD),
             CASCADE,
-            transient=200,
+            search=Search(transient=200),
             progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
         )
     model, proof = found.model, found.proof

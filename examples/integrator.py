@@ -65,7 +65,7 @@ def designed(drives: list[Drive], *, velocity: bool = False) -> OutputTubeDesign
     """The proved tube: half of the drives make the model and the observer, the others its level."""
     trials = [one.velocity() if velocity else one.washed_out() for one in drives]
     train, calibration = Dataset(tuple(trials[::2])), Dataset(tuple(trials[1::2]))
-    model = identify(train, Polynomial(LAGS), comparators=()).model
+    model = identify(train, Polynomial(LAGS)).model
     return design(OutputTube(model, train, calibration, level="constant"))
 
 

@@ -36,6 +36,7 @@ from nlsid_core.identification import (
     Method,
     Model,
     ModelClass,
+    Search,
     identify,
     methods_of,
 )
@@ -56,20 +57,12 @@ Wrong = tuple[tuple[int | str, ...], object, str]  # where, what was found, what
 
 @dataclass(frozen=True, eq=False)
 class IdentificationConfig:
-    """What to identify, and how. transient: samples at the start of each trial not scored.
-
-    max_rate: the slowest rate a sample of the models that are searched (None: the time constant is
-    the length of the longest training trial).
-    allow_unproved: write a model without a proof of stability too; nothing is certified then.
-    given: the section itself, as a mapping.
-    """
+    """What to identify, and how. given: the section itself, as a mapping."""
 
     model_class: ModelClass
     method: Method
     given: Mapping[str, object]
-    transient: int = 0
-    max_rate: float | None = None
-    allow_unproved: bool = False
+    search: Search
 
     def identify(
         self,
@@ -84,9 +77,7 @@ class IdentificationConfig:
             self.model_class,
             method=self.method,
             test=test,
-            transient=self.transient,
-            max_rate=self.max_rate,
-            allow_unproved=self.allow_unproved,
+            search=self.search,
             progress=progress,
         )
 
@@ -145,7 +136,7 @@ def _read(section: object) -> IdentificationConfig:
     if method.name not in [one.name for one in methods]:
         what = f"should be {str(not method.certified).lower()} for this model class"
         raise _error((("certified",), method.certified, what))
-    return IdentificationConfig(model_class, method, section, **_of(given, OWN))
+    return IdentificationConfig(model_class, method, section, Search(**_of(given, OWN)))
 
 
 Identification = Annotated[IdentificationConfig, PlainValidator(_read)]

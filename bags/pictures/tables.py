@@ -102,7 +102,7 @@ def in_unit(data: Dataset, *percents: float) -> str:
     if len(spread) > 1:
         return ""
     ends = " to ".join(f"{spread[0] * part / 100.0:.2g}" for part in percents)
-    return f" ({ends} {data.trajectories[0].y_units[0]}".rstrip() + ")"
+    return f" ({ends} {data.trajectories[0].y_units[0] or 'in its unit'})"
 
 
 def stability_sentence(chosen: Candidate[Model]) -> str:

@@ -3,7 +3,7 @@
 from nlsid_core.identification.choosing import Attempt, Choice, Promise, Row
 from nlsid_core.identification.families import ModelClass, describe, methods_of
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
-from nlsid_core.identification.identify import identify
+from nlsid_core.identification.identify import Search, identify
 from nlsid_core.identification.methods.options import (
     METHODS,
     LeastSquares,
@@ -58,6 +58,7 @@ __all__ = [
     "Rie",
     "Row",
     "Rse",
+    "Search",
     "Sem",
     "StabilityProof",
     "Step",

@@ -27,7 +27,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.families import ModelClass, describe
 from nlsid_core.identification.fit import Fit
-from nlsid_core.identification.identify import identify
+from nlsid_core.identification.identify import Search, identify
 from nlsid_core.identification.methods.options import Method, Rse
 from nlsid_core.identification.polynomial.options import Polynomial
 from nlsid_core.identification.prediction import Model, simulate_started, simulate_trial
@@ -286,8 +286,7 @@ def fitted(train: Dataset, attempt: Attempt, whole: Dataset) -> Fit[Model]:
         train,
         attempt.model_class,
         method=attempt.method,
-        comparators=(),
-        max_rate=rate_of_memory(whole, attempt.memory),
+        search=Search(comparators=(), max_rate=rate_of_memory(whole, attempt.memory)),
     )
 
 

@@ -15,7 +15,7 @@ from nlsid_core.identification.trail import Task, Trail
 ModelClass = Polynomial | Network[Any]
 
 
-def search(train: Dataset, model_class: ModelClass, task: Task) -> Trail[Any]:
+def searched(train: Dataset, model_class: ModelClass, task: Task) -> Trail[Any]:
     """Candidates of the methods that are asked for."""
     if isinstance(model_class, Polynomial):
         return polynomials.search(train, model_class, task)

@@ -32,7 +32,6 @@ RANK_TOLERANCE = 1e-12  # of a pivot: what a point adds that is needed is 1e-2, 
 MAX_ITERATIONS = 60  # 8 to 12 are usual
 STEP_TO_BOUNDARY = 0.95  # of the way to where X or Z would be singular; 0.99 loses the centre
 REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
-REFINEMENTS = 1  # a second one was never seen to change the number of iterations
 CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
 CERTIFY_FROM = 1e-6  # of the spread; from here rounding may undo what an iteration gains
 WARM_GAP = 0.03  # of the spread: what an iterate for another g has where that differs much
@@ -360,12 +359,13 @@ def _factor_or_regularise(M: FloatArray, work: FloatArray) -> FloatArray | None:
 
 
 def _solve(M: FloatArray, factor: FloatArray, rhs: FloatArray) -> FloatArray:
-    """M⁻¹rhs with refinement: M has condition 1e16 near the end, and the equalities need it."""
+    """M⁻¹rhs refined once: M has condition 1e16 near the end, and the equalities need it.
+
+    A second refinement was never seen to change the number of iterations.
+    """
     x = lapack.dpotrs(factor, rhs, lower=1)[0]
-    for _ in range(REFINEMENTS):
-        residual = blas.dsymv(-1.0, M, x, beta=1.0, y=rhs, lower=1)
-        x = x + lapack.dpotrs(factor, residual, lower=1)[0]
-    return np.asarray(x)
+    residual = blas.dsymv(-1.0, M, x, beta=1.0, y=rhs, lower=1)
+    return np.asarray(x + lapack.dpotrs(factor, residual, lower=1)[0])
 
 
 def _symmetric(A: FloatArray) -> FloatArray:

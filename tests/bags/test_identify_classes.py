@@ -23,7 +23,7 @@ from nlsid import (
 )
 from nlsid_core import files
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import simulate_trial, simulation_percent, validate
+from nlsid_core.identification import Search, simulate_trial, simulation_percent, validate
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from tests import repeated
 from tests.conftest import synthetic_dataset
@@ -45,7 +45,7 @@ def cascade() -> Fit[BlockCascade]:
         Dataset((saturated(500, 0), saturated(700, 1))),
         CASCADE,
         test=Dataset((saturated(600, 3),)),
-        transient=60,
+        search=Search(transient=60),
     )
 
 
@@ -78,7 +78,7 @@ def test_moments_stand_beside_the_biased_rie_and_least_squares(
 ) -> None:
     pairs = [*repeated.pair(2000, 1), *repeated.pair(1500, 2)]
     alone = Dataset(tuple(replace(trial, group="") for trial in pairs))
-    biased = identify(alone, repeated.CLASS, comparators=())
+    biased = identify(alone, repeated.CLASS, search=Search(comparators=()))
     assert tuple(monotone.errors["train"]) == ("least_squares", "rie")
     assert repeated.percent(monotone.model) < 0.4 * repeated.percent(biased.model)
     assert monotone["least_squares"].proof is not None, "every candidate is offered to the prover"
@@ -93,7 +93,7 @@ def test_a_comparator_that_fails_is_left_out_and_logged(
         Dataset(tuple(renamed)),
         Polynomial(2, set="3.8"),
         method=LeastSquares(),
-        allow_unproved=True,
+        search=Search(allow_unproved=True),
     )
     assert tuple(fit.errors["train"]) == ("least_squares",)
     assert "are not repeats" in caplog.text
@@ -196,7 +196,9 @@ def test_a_range_that_refuses_its_own_training_data_is_refused(train: Dataset) -
     narrow = Polynomial(2, input_range=((0.2, 0.5),), on_out_of_range="refuse")
     with pytest.raises(DataError, match=r"which the model refuses; declare a wider range"):
         identify(train, narrow)
-    clipped = identify(train, replace(narrow, on_out_of_range="clip"), comparators=())
+    clipped = identify(
+        train, replace(narrow, on_out_of_range="clip"), search=Search(comparators=())
+    )
     assert clipped.model.u_range.tolist() == [[0.2, 0.5]]
     with pytest.raises(DataError, match="on_out_of_range is 'warn'"):
         StateAffineModel.from_document(clipped.model.document() | {"on_out_of_range": "warn"})
@@ -229,7 +231,9 @@ def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
     train: Dataset, model_class: Polynomial
 ) -> None:
     before = Rse(4, certified=not model_class.is_linear)
-    fit = identify(train, model_class, method=Sem(4, certified=True), comparators=[before])
+    fit = identify(
+        train, model_class, method=Sem(4, certified=True), search=Search(comparators=[before])
+    )
     errors = {c.method.name: simulation_percent(c.model, train) for c in fit.candidates}
     assert fit.proof.rate < 1.0
     assert errors["sem_certified"] <= errors[before.name] * (1 + 1e-9)
@@ -243,9 +247,12 @@ def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_u
     assert identify(data, Polynomial(1), method=Rse(certified=True)).proof.rate < 1.0
     quadratic = Polynomial(1, (0,), Degrees(leading=2))
     with pytest.raises(ShapeError, match=r"degree 1 at most.*minimise the robust simulation error"):
-        identify(data, quadratic, method=Rse(certified=True), comparators=())
+        identify(data, quadratic, method=Rse(certified=True), search=Search(comparators=()))
     beside = identify(
-        data, quadratic, method=Rse(2), comparators=[Rse(2, certified=True)], allow_unproved=True
+        data,
+        quadratic,
+        method=Rse(2),
+        search=Search(comparators=[Rse(2, certified=True)], allow_unproved=True),
     )
     assert tuple(beside.errors["train"]) == ("rse",)
 
@@ -259,6 +266,6 @@ def test_products_of_lags_and_five_inputs_are_certified() -> None:
     measured = y + 0.05 * np.std(y) * rng.standard_normal(400)
     data = Dataset((Trajectory(t=0.1 * np.arange(400), y=measured, u=u),))
     model_class = Polynomial(1, degrees=Degrees(lagged=1))
-    fit = identify(data, model_class, method=Rse(3, certified=True), comparators=())
+    fit = identify(data, model_class, method=Rse(3, certified=True), search=Search(comparators=()))
     assert fit.proof.rate < 1.0
     assert fit.errors["train"]["rse_certified"] < 7.0

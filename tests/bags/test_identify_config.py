@@ -109,9 +109,9 @@ def test_each_section_says_a_method_with_its_options(
 def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Path) -> None:
     section = {"lags": 2, "transient": 5, "allow_unproved": True}
     config = load_config(write_config(tmp_path / "robot.yaml", section)).identification
-    assert (config.transient, config.allow_unproved) == (5, True)
+    assert (config.search.transient, config.search.allow_unproved) == (5, True)
     plain = load_config(write_config(tmp_path / "robot.yaml", {"lags": 2})).identification
-    assert (plain.transient, plain.allow_unproved) == (0, False)
+    assert (plain.search.transient, plain.search.allow_unproved) == (0, False)
 
 
 @pytest.mark.parametrize(

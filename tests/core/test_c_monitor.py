@@ -54,7 +54,7 @@ def trials() -> Dataset:
 @pytest.fixture(scope="module")
 def made(trials: Dataset) -> OutputTubeDesign:
     """Two tubes of constant width."""
-    model = identify(trials, Polynomial(6), comparators=()).model
+    model = identify(trials, Polynomial(6)).model
     return design_output_tube(OutputTube(model, trials, level="constant"))
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from nlsid import Dataset, Degrees, LeastSquares, Polynomial, Rie, Sem, Trajectory, identify
 from nlsid_core import proofs
+from nlsid_core.identification import Search
 from nlsid_core.identification.polynomial.implicit_descent import ImplicitSet
 from nlsid_core.identification.polynomial.implicit_rie import least_squares_coefficients
 from nlsid_core.identification.polynomial.implicit_rows import build_implicit_rows
@@ -39,7 +40,9 @@ def coupled(samples: int, seed: int) -> Dataset:
 
 
 def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
-    fit = identify(noisy(600, 1), CLASS, method=Sem(certified=True), comparators=(Sem(), Rie()))
+    fit = identify(
+        noisy(600, 1), CLASS, method=Sem(certified=True), search=Search(comparators=(Sem(), Rie()))
+    )
     free, proved = (fit.errors["train"][name] for name in ("sem", "sem_certified"))
     assert proved == pytest.approx(free, rel=1e-4)
     assert proved < 0.95 * fit.errors["train"]["rie"]
@@ -50,7 +53,9 @@ def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
 def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> None:
     data = resonant(1500, 0)
     model_class = Polynomial(2, (0,), Degrees(left=3), set="3.8")
-    fit = identify(data, model_class, method=Sem(certified=True), comparators=(Sem(), Rie()))
+    fit = identify(
+        data, model_class, method=Sem(certified=True), search=Search(comparators=(Sem(), Rie()))
+    )
     errors = fit.errors["train"]
     assert errors["sem"] < errors["sem_certified"] < 0.98 * errors["rie"]
     assert fit["sem"].proof is None, "the truth is outside the set"
@@ -88,7 +93,10 @@ def test_every_set_of_implicit_models_has_a_proved_minimum_below_its_bounds(
     model_class: Polynomial,
 ) -> None:
     fit = identify(
-        noisy(500, 1), model_class, method=Sem(certified=True), comparators=(LeastSquares(), Rie())
+        noisy(500, 1),
+        model_class,
+        method=Sem(certified=True),
+        search=Search(comparators=(LeastSquares(), Rie())),
     )
     errors = fit.errors["train"]
     assert errors["sem_certified"] < min(errors["rie"], errors["least_squares"]) * (1 + 1e-9)
@@ -104,7 +112,7 @@ def test_linear_models_of_several_measured_states_are_found_and_proved() -> None
         data,
         Polynomial(1, (1,), set="2.19"),
         method=Sem(certified=True),
-        comparators=(LeastSquares(),),
+        search=Search(comparators=(LeastSquares(),)),
         test=test,
     )
     for name in ("train", "test"):
@@ -168,6 +176,6 @@ def test_of_a_random_walk_there_is_a_stable_model_too() -> None:
         data,
         Polynomial(1, (0,), Degrees(left=3), set="3.8"),
         method=Sem(certified=True),
-        comparators=(),
+        search=Search(comparators=()),
     )
     assert fit.proof.rate <= fit.max_rate

@@ -19,6 +19,7 @@ from nlsid_core.identification import (
     Polynomial,
     Row,
     Rse,
+    Search,
     Sem,
     choosing,
     identify,
@@ -94,7 +95,7 @@ def test_repeats_of_an_excitation_stay_together_and_others_make_the_promise() ->
         held = {t.name.split("[")[0] for group in fold.judged for t in group}
         assert len({name.split()[0] for name in held}) == 1, "one excitation, whole"
         assert not held & set(fold.fitted.names)
-    mixed = identify(Dataset(tuple(runs[::2])), Polynomial(2), comparators=())
+    mixed = identify(Dataset(tuple(runs[::2])), Polynomial(2), search=Search(comparators=()))
     assert choice.promise.percent > 1.5 * mixed.chosen.error_percent(Dataset(tuple(runs[1::2])))
 
 
@@ -153,7 +154,10 @@ def test_a_simulation_starts_where_the_first_samples_are_nearest(
 ) -> None:
     """The same state in scoring and in what runs; the noise of raw starts would be carried on."""
     chosen = identify(
-        Dataset(tuple(trial(k) for k in range(4))), model_class, method=method, comparators=()
+        Dataset(tuple(trial(k) for k in range(4))),
+        model_class,
+        method=method,
+        search=Search(comparators=()),
     ).chosen
     model, raw, started = chosen.model, 0.0, 0.0
     for first in range(100, 180, 8):

@@ -25,7 +25,7 @@ from nlsid import (
 )
 from nlsid_core import documents, files
 from nlsid_core.errors import CertificateRejected, DataError
-from nlsid_core.identification import Method, ModelClass, describe, methods_of
+from nlsid_core.identification import Method, ModelClass, Search, describe, methods_of
 from nlsid_core.identification.prediction import (
     history,
     learns,
@@ -84,9 +84,7 @@ def fitted(name: str, method: Method) -> Fit[Any]:
         recordings(name),
         FAMILIES[name],
         method=method,
-        comparators=(),
-        transient=START,
-        allow_unproved=True,
+        search=Search(comparators=(), transient=START, allow_unproved=True),
     )
 
 
@@ -166,7 +164,7 @@ def test_data_that_say_nothing_are_refused(name: str) -> None:
         first.rows(slice(3)),
     ):
         with pytest.raises(DataError):
-            identify(Dataset((wrong,)), FAMILIES[name], comparators=())
+            identify(Dataset((wrong,)), FAMILIES[name], search=Search(comparators=()))
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -175,11 +173,9 @@ def test_a_method_of_another_class_is_refused_and_only_what_is_asked_for_runs(na
     known = [method.name for method in methods_of(model_class)]
     assert len(set(known)) == len(known)
     assert [*fitted(name, methods_of(model_class)[0]).errors["train"]] == known[:1]
-    with pytest.raises(DataError, match="is no method"):
-        identify(recordings(name), model_class, method="magic")  # type: ignore[arg-type]
-    if "rie" not in known:
-        with pytest.raises(DataError, match="is not for this model class; it has"):
-            identify(recordings(name), model_class, method=Rie())
+    for wrong in ("magic", *(method for method in (Rie(),) if method.name not in known)):
+        with pytest.raises(DataError, match="is no method for this model class; it has"):
+            identify(recordings(name), model_class, method=wrong)  # type: ignore[arg-type]
 
 
 def test_a_class_is_described_by_what_is_not_the_default() -> None:

@@ -36,6 +36,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.identification import (
     METHODS,
+    Search,
     methods_of,
     prove_stability,
     validate,
@@ -113,7 +114,9 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
     data = unstable_recordings()
     with pytest.raises(Infeasible, match="no proof of stability"):
         identify(data, Polynomial(1), method=LeastSquares())
-    unproved = identify(data, Polynomial(1), method=LeastSquares(), allow_unproved=True)
+    unproved = identify(
+        data, Polynomial(1), method=LeastSquares(), search=Search(allow_unproved=True)
+    )
     with pytest.raises(Infeasible, match="has no proof"):
         _ = unproved.proof
     stable = identify(data, Polynomial(1), method=Rse(certified=True))
@@ -335,7 +338,7 @@ def test_an_integrator_is_answered_by_the_slowest_rate_that_is_allowed(
     fit = identify(data, Polynomial(2), method=method)
     assert fit.proof.rate <= rate_of_memory(data) < 1.0
     assert radii_of(fit).max() == pytest.approx(searched_rate(rate_of_memory(data)), abs=2e-3)
-    unheard = identify(data, Polynomial(2), method=method, max_rate=1.0 - 1e-7)
+    unheard = identify(data, Polynomial(2), method=method, search=Search(max_rate=1.0 - 1e-7))
     assert radii_of(unheard).max() > 0.9975, "the limit is what kept the pole"
 
 
@@ -347,7 +350,7 @@ def test_an_integrator_is_answered_by_the_slowest_rate_that_is_allowed(
 )
 def test_every_search_keeps_a_rate_that_is_asked_for(rate: float, method: Rse | Sem) -> None:
     data = Dataset((drifting([0.95, 0.3]),))
-    fit = identify(data, Polynomial(2), method=method, comparators=(), max_rate=rate)
+    fit = identify(data, Polynomial(2), method=method, search=Search(comparators=(), max_rate=rate))
     assert fit.proof.rate <= rate
     assert fit.errors["train"][method.name] < 100.0
 
@@ -355,22 +358,27 @@ def test_every_search_keeps_a_rate_that_is_asked_for(rate: float, method: Rse | 
 def test_models_with_products_of_lags_and_inputs_keep_it_too() -> None:
     data = Dataset((drifting([0.9], 200),))
     model_class = Polynomial(1, degrees=Degrees(leading=1, lagged=1))
-    fit = identify(data, model_class, method=Rse(3, certified=True), comparators=(), max_rate=0.8)
+    fit = identify(
+        data,
+        model_class,
+        method=Rse(3, certified=True),
+        search=Search(comparators=(), max_rate=0.8),
+    )
     assert fit.proof.rate <= 0.8
 
 
 def test_bounds_on_the_identification_error_keep_it() -> None:
     data = Dataset((drifting([0.95, 0.3]),))
-    states = identify(data, Polynomial(1, (1,), set="2.19"), max_rate=0.8)
+    states = identify(data, Polynomial(1, (1,), set="2.19"), search=Search(max_rate=0.8))
     known = np.zeros((1, 1))
     assert abs(states.model.jacobian(known, known, known)[0, 0, 0]) <= 0.8
     implicit = Polynomial(2, set="2.11")
     for rate in (0.6, 0.999):
-        found = identify(data, implicit, method=Rie(), comparators=(), max_rate=rate)
+        found = identify(data, implicit, method=Rie(), search=Search(comparators=(), max_rate=rate))
         none = np.zeros((1, 2))
         A = found.model.jacobian(none, none, np.zeros((1, 3)))[0, :, :2]
         assert np.abs(np.linalg.eigvals(A)).max() <= rate
-    monotone = identify(Dataset(pair(1500, 1)), CLASS, method=Rie(), max_rate=0.5)
+    monotone = identify(Dataset(pair(1500, 1)), CLASS, method=Rie(), search=Search(max_rate=0.5))
     assert monotone.proof.rate <= 0.5
 
 
@@ -382,9 +390,7 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
         data,
         Polynomial(1),
         method=LeastSquares(),
-        comparators=(),
-        max_rate=0.9,
-        allow_unproved=True,
+        search=Search(comparators=(), max_rate=0.9, allow_unproved=True),
     )
     assert fit.chosen.proof is None
     assert fit.chosen.remark == (
@@ -392,11 +398,13 @@ def test_a_proof_that_is_too_slow_is_said_to_be_and_does_not_count() -> None:
     )
     assert fit.chosen.remark in str(fit)
     with pytest.raises(Infeasible, match=r"proved only at 0\.9715"):
-        identify(data, Polynomial(1), method=LeastSquares(), comparators=(), max_rate=0.9)
+        identify(
+            data, Polynomial(1), method=LeastSquares(), search=Search(comparators=(), max_rate=0.9)
+        )
     assert identify(data, Polynomial(1), method=LeastSquares()).proof.rate < 0.972
 
 
 @pytest.mark.parametrize("rate", [0.0, 1.0, float("nan")])
 def test_a_rate_that_is_none_is_refused(rate: float) -> None:
     with pytest.raises(OptionError, match="max_rate"):
-        identify(Dataset((drifting([0.5]),)), Polynomial(1), max_rate=rate)
+        identify(Dataset((drifting([0.5]),)), Polynomial(1), search=Search(max_rate=rate))

@@ -13,6 +13,7 @@ from nlsid_core.identification import (
     Degrees,
     LeastSquares,
     Polynomial,
+    Search,
     identify,
     simulate_trial,
 )
@@ -114,7 +115,7 @@ def test_the_linear_bound_is_the_best_there_is_of_first_order() -> None:
 @pytest.mark.parametrize("name", ["2.11", "2.13"])
 def test_a_cubic_spring_without_noise_is_found(name: StableSet) -> None:
     data = Dataset((spring(300, 0, noise=0.0),))
-    fit = identify(data, replace(SPRING, set=name), comparators=())
+    fit = identify(data, replace(SPRING, set=name), search=Search(comparators=()))
     np.testing.assert_allclose(slopes(fit.model), [1.0, 0.5, -0.6, -1.0], atol=2e-3)
     assert fit.errors["train"]["rie"] < 0.05
 
@@ -136,7 +137,7 @@ def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> Non
         identify(
             Dataset((spring(200, 0, noise=0.01, gain=g, mean=m),)),
             replace(SPRING, set=name),
-            comparators=(),
+            search=Search(comparators=()),
         ).errors["train"]["rie"]
         for g, m in ((1.0, 0.0), (1e3, 4e3), (1e-3, -5e-3))
     )
@@ -147,7 +148,7 @@ def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> Non
 def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_squares_not_proved() -> (
     None
 ):
-    fit = identify(decay(1.02, 100, 0.0), SPRING, comparators=[LeastSquares()])
+    fit = identify(decay(1.02, 100, 0.0), SPRING, search=Search(comparators=[LeastSquares()]))
     assert fit["least_squares"].proof is None
     assert fit.errors["train"]["least_squares"] < 0.1 < fit.errors["train"]["rie"]
     assert fit.proof.rate == 1.0
@@ -159,7 +160,9 @@ def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_square
 
 
 def test_the_document_keeps_signals_and_refuses_a_wrong_window() -> None:
-    model = identify(Dataset((spring(200, 0, noise=0.01),)), CLASSES[3], comparators=()).model
+    model = identify(
+        Dataset((spring(200, 0, noise=0.01),)), CLASSES[3], search=Search(comparators=())
+    ).model
     document = model.document()
     again = ImplicitModel.from_document(document)
     assert (again.y, again.u, again.window) == (model.y, model.u, ((0, 0), (0, 1)))
@@ -190,7 +193,9 @@ def two_inputs(samples: int) -> Dataset:
 def test_many_terms_of_the_inputs_alone_cost_a_search_little() -> None:
     data = two_inputs(2000)
     fit = identify(
-        data, Polynomial(4, degrees=Degrees(left=3, inputs=3), set="2.11"), comparators=()
+        data,
+        Polynomial(4, degrees=Degrees(left=3, inputs=3), set="2.11"),
+        search=Search(comparators=()),
     )
     assert fit.chosen.proof is not None
     assert len(fit.model.h.exponents) > 285

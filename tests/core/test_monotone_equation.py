@@ -94,9 +94,7 @@ def test_a_resonance_is_identified_by_a_linear_equation() -> None:
     """Least squares finds it, and what it found is proved, although it is no minimiser of (3.8)."""
     resonant = replace(truth(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]), c=0.0)
     u = np.random.default_rng(2).uniform(-1.0, 1.0, 1500)
-    trial = Trajectory(t=0.01 * np.arange(1500), y=resonant.simulate(u), u=u)
-    fit = identify(
-        Dataset((trial,)), Polynomial(2, (0,), set="3.8"), method=LeastSquares(), comparators=()
-    )
+    data = Dataset((Trajectory(t=0.01 * np.arange(1500), y=resonant.simulate(u), u=u),))
+    fit = identify(data, Polynomial(2, (0,), set="3.8"), method=LeastSquares())
     assert fit.errors["train"]["least_squares"] < 1e-6
     assert fit.proof.rate < 0.98

@@ -27,7 +27,7 @@ from nlsid import (
 from nlsid_core import documents, proofs
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import CertificateRejected, DataError, DocumentError, ShapeError
-from nlsid_core.identification import prove_stability, simulate_trial
+from nlsid_core.identification import Search, prove_stability, simulate_trial
 from nlsid_core.identification.network.cells import Row
 from nlsid_core.identification.network.feedback import Layout
 from nlsid_core.identification.network.filters import Cascade
@@ -179,7 +179,9 @@ def rms(model: Any, data: Dataset, skipped: int = 60) -> float:
 
 @pytest.mark.slow
 def test_a_cascade_is_found_to_the_noise_and_proved() -> None:
-    found = identify(Dataset((recording(2500, 0), recording(1500, 1))), CASCADE, transient=60)
+    found = identify(
+        Dataset((recording(2500, 0), recording(1500, 1))), CASCADE, search=Search(transient=60)
+    )
     assert rms(found.model, Dataset((recording(1500, 9, noise=0.0),))) < 0.002
     assert found.history.steps[-1].value == pytest.approx(0.002, rel=0.15)
 
@@ -254,7 +256,7 @@ def test_a_servo_with_a_limit_of_speed_is_found_and_proved() -> None:
     spread = float(servo(2).trajectories[0].y.std())
     assert rms(made.model, servo(2), 20) < 0.04 * spread
     assert made.proof.rate < made.max_rate < 1.0
-    linear = identify(servo(1), Polynomial(4), method=LeastSquares(), comparators=())
+    linear = identify(servo(1), Polynomial(4), method=LeastSquares(), search=Search(comparators=()))
     assert rms(linear.model, servo(2), 20) > 0.25 * spread
 
 
@@ -269,7 +271,9 @@ def test_a_duffing_oscillator_is_found_and_proved(oscillator: Fit[CellNetwork]) 
     fresh, louder = duffing.trials([0.12, 0.22], seed=1), duffing.trials([0.28], seed=2)
     assert oscillator.chosen.error_percent(fresh) < 5.0
     assert oscillator.chosen.error_percent(louder) < 12.0
-    straight = identify(duffing.trials(AMPLITUDES), Polynomial(3), method=Sem(), comparators=())
+    straight = identify(
+        duffing.trials(AMPLITUDES), Polynomial(3), method=Sem(), search=Search(comparators=())
+    )
     assert straight.chosen.error_percent(fresh) > 20.0
     first, second = (step.value for step in oscillator.history.steps)
     assert second < 0.7 * first
@@ -283,7 +287,9 @@ def test_a_duffing_oscillator_is_found_and_proved(oscillator: Fit[CellNetwork]) 
 def test_a_well_damped_loop_is_proved_as_it_is() -> None:
     """x'' + 2x' + x + x³ = u contracts over all of its range: nothing is unrolled."""
     made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, lags=2))
-    found = identify(duffing.trials([0.2, 0.4, 0.6], damping=2.0), made, comparators=())
+    found = identify(
+        duffing.trials([0.2, 0.4, 0.6], damping=2.0), made, search=Search(comparators=())
+    )
     assert len(found.model.maps) == 1
     fresh = duffing.trials([0.5], damping=2.0, seed=1)
     assert found.chosen.error_percent(fresh) < 200 * duffing.NOISE
@@ -294,7 +300,7 @@ def test_a_tube_of_many_maps_is_proved() -> None:
     """Three maps, eight corners: one matrix stands for them in the search; the kernel decides."""
     train = duffing.trials(AMPLITUDES)
     made = replace(OSCILLATOR, structure=replace(OSCILLATOR.structure, stages=3))
-    found = identify(train, made, comparators=())
+    found = identify(train, made, search=Search(comparators=()))
     assert len(found.model.maps) == 3
     tube = design(OutputTube(found.model, train, duffing.trials(AMPLITUDES, seed=3)))
     assert "for ever" in str(tube.verdict)
@@ -406,4 +412,4 @@ def test_networks_have_one_output(structure: Any) -> None:
     t, u = np.arange(300.0), np.random.default_rng(0).normal(size=300)
     two = Dataset((Trajectory(t=t, y=np.column_stack([u, u**2]), u=u),))
     with pytest.raises(ShapeError, match="one"):
-        identify(two, Network(structure), comparators=())
+        identify(two, Network(structure), search=Search(comparators=()))

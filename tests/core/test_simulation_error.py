@@ -11,7 +11,7 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid import Dataset, Degrees, Polynomial, Rse, Sem, Trajectory, identify
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification import prove_stability, simulation_percent, trail, validate
+from nlsid_core.identification import Search, prove_stability, simulation_percent, trail, validate
 from nlsid_core.identification.methods import newton, rse
 from nlsid_core.identification.methods.rse import Bound, robust_simulation_error
 from nlsid_core.identification.methods.simulation_error import SimulationError
@@ -186,7 +186,7 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     stacked = build_state_affine_rows(data, model_class)
     *_, stuck = robust_simulation_error(stacked.rows)
     assert simulation_percent(stacked.model(stuck.theta, stuck.p), data) > 90.0
-    fit = identify(data, model_class, method=Rse(), comparators=())
+    fit = identify(data, model_class, method=Rse(), search=Search(comparators=()))
     assert fit.errors["train"]["rse"] < least
     assert fit.proof.rate < 1.0
 
@@ -194,9 +194,9 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
 @pytest.mark.slow
 def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
     data = two_resonances(1, noise=0.1)
-    whole = identify(data, Polynomial(4), method=Rse(), comparators=())
+    whole = identify(data, Polynomial(4), method=Rse(), search=Search(comparators=()))
     monkeypatch.setattr(rse, "WORK", 1.0)
-    short = identify(data, Polynomial(4), method=Rse(), comparators=())
+    short = identify(data, Polynomial(4), method=Rse(), search=Search(comparators=()))
     assert len(whole.history.steps) > trail.FEWEST_BOUNDS == len(short.history.steps)
     longer, shorter = (simulation_percent(fit.model, data) for fit in (whole, short))
     assert longer < shorter < 18.0

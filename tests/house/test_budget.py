@@ -12,14 +12,14 @@ import pytest
 from tests.house.sources import sources
 
 STATEMENTS = {
-    ("nlsid_core",): 17_802,
-    ("bags",): 11_500,
+    ("nlsid_core",): 17_801,
+    ("bags",): 11_498,
     ("nlsid_ros",): 2_601,
-    ("tests",): 21_064,
+    ("tests",): 21_063,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
-MORE_ARGUMENTS, MORE_FIELDS = 1, 10  # functions and classes above the caps
+MORE_ARGUMENTS, MORE_FIELDS = 0, 10  # functions and classes above the caps
 EVERYTHING = ("nlsid_core", "bags", "nlsid_ros", "benchmarks", "examples", "tests")
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

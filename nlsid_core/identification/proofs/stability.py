@@ -10,7 +10,7 @@ result. Source: docs/certificate_stability.md.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -478,10 +478,9 @@ def _leaves(tree: Tree) -> list[Leaf]:
     return [leaf for part in tree.parts for leaf in _leaves(part)]
 
 
-def _replaced(tree: Tree, changed: dict[int, Any]) -> Tree:
+def _replaced(tree: Tree, changed: Mapping[int, Tree]) -> Tree:
     if isinstance(tree, Leaf):
-        replacement: Tree = changed.get(id(tree), tree)
-        return replacement
+        return changed.get(id(tree), tree)
     first, second = (_replaced(part, changed) for part in tree.parts)
     return Split(tree.variable, (first, second))
 
