@@ -94,9 +94,9 @@ def stability(candidate: Candidate[Model]) -> str:
 
 
 def in_unit(data: Dataset, *percents: float) -> str:
-    """The same as parts of what the output of `data` varies by, with its unit; of several, nothing.
+    """State percentages of the spread of one output in its unit; several outputs have no such text.
 
-    Percentages of two sets of trials compare by it: the calmer trials have the larger ones.
+    Two sets of trials compare by it: the calmer trials have the larger percentages.
     """
     _, spread = signal_scale(data, "y")
     if len(spread) > 1:
