@@ -306,8 +306,8 @@ class Excitation(ManagedNode):
             self._bags["stop"].call_async(Trigger.Request())
 
     def _on_start(self) -> tuple[bool, str]:
-        if self._busy:
-            return False, "it runs already"
+        if self._busy or self._input != self._shape.rest:
+            return False, "it runs already, or is on its way to rest"
         if lacking := self._command.lacking():
             return False, lacking
         if not self._has_recorder():

@@ -59,6 +59,12 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.WARN,
 }
+JUDGED = {  # `inside` of ~/margin
+    Status.INSIDE: 1.0,
+    Status.ASSUMPTION_VIOLATED: 0.0,
+    Status.OUTSIDE: 0.0,
+    Status.UNKNOWN: math.nan,
+}
 
 
 class FunnelMonitor(ManagedNode):
@@ -392,7 +398,12 @@ class FunnelMonitor(ManagedNode):
             latency_ns = now_ns(self.get_clock()) - stamp_ns
             self._slowest_ns = max(self._slowest_ns, latency_ns)
             self._judged += 1
-            numbers = reading.numbers | self._widths.of(reading) | {"latency": latency_ns * 1e-9}
+            numbers = {
+                **reading.numbers,
+                **self._widths.of(reading),
+                "inside": JUDGED[reading.status],
+                "latency": latency_ns * 1e-9,
+            }
             self._margin.publish(numbers_at(stamp_ns, numbers, self._judging))
 
     @property
@@ -428,12 +439,17 @@ class FunnelMonitor(ManagedNode):
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN, at_once=True)
 
     def _say(self, reading: Reading, state: State, *, at_once: bool = False) -> None:
-        """Publish diagnostics if the state or what it assumes changed; remember what to repeat.
+        """Publish diagnostics if the state, what it assumes or a second alarm changed; remember
+        what to repeat.
 
         An alarm is repeated until ~/restart, whatever comes after it.
         """
         (earlier, before), self._said = self._said, (reading, state)
-        if not at_once and (state, reading.assuming) == (before, earlier.assuming):
+        if not at_once and (state, reading.assuming, bool(reading.alarm)) == (
+            before,
+            earlier.assuming,
+            bool(earlier.alarm),
+        ):
             return
         severity = SEVERITY.get(state, 0)
         news = self._latched is None or severity > SEVERITY[self._latched[0]]

@@ -90,13 +90,15 @@ class SignalMessage:
             )
 
     def _on_other(self, message: Any) -> None:
-        """Take the fields of a message, if all that are numbers are finite."""
+        """Take the fields of a message, if all that are numbers are finite; else keep those before,
+        with which the robot is brought to rest.
+        """
         numbers = {name: SignalPath.parse(f"/others:{name}").value(message) for name in self.rest}
         unfit = [
             f"{name} is {value}" for name, value in numbers.items() if not math.isfinite(value)
         ]
         self._unfit = f"on {self._topic}, {', '.join(unfit)}" if unfit else ""
-        self._base, self._heard = message, time.monotonic()
+        self._base, self._heard = self._base if unfit else message, time.monotonic()
 
     def lacking(self) -> str:
         """Why the other fields are not known, empty if they are."""

@@ -195,7 +195,6 @@ class TrackingController(ManagedNode):
         """Listen for the funnel; it names the signals."""
         self._patience = self.data_clock
         self._design: AnyDesign | None = None
-        self._controller = None
         self._stopping = self._text = ""
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
@@ -235,11 +234,10 @@ class TrackingController(ManagedNode):
         if not self._is_on:
             return
         assert self._design is not None
-        period = self._design.period
         self._halt("the node stops")
         while not self._limits.at_rest(self._input):
             self._on_step()
-            time.sleep(period)
+            time.sleep(self._design.period)
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def _on_design(self, design: AnyDesign, digest: str) -> None:
@@ -382,8 +380,10 @@ class TrackingController(ManagedNode):
         age_ns = now_ns(self.get_clock()) - self._answered_ns
         self._oldest_ns = max(self._oldest_ns, age_ns)
         if age_ns > self._hold_ns:
-            proved = f"proved for {self._hold_ns * 1e-9:g} s"
-            self._halt(f"the input answers a state that is {age_ns * 1e-9:.3g} s old; {proved}")
+            self._halt(
+                f"the input answers a state that is {age_ns * 1e-9:.3g} s old; proved for "
+                f"{self._hold_ns * 1e-9:g} s"
+            )
             return
         arm(self._expiry, self._hold_ns - age_ns + 1)
 
@@ -413,12 +413,12 @@ class TrackingController(ManagedNode):
         if self._run is None or message.header.frame_id != self._run.name:
             return
         numbers = dict(zip(message.name, message.position, strict=False))
-        margin, assumption = (numbers.get(key, math.nan) for key in ("margin", "assumption"))
+        margin, inside = (numbers.get(key, math.nan) for key in ("margin", "inside"))
         if margin < 0.0:
             self._halt(f"outside: {monitor} says margin {margin:.3g}")
-        elif assumption > 1.0:
-            self._halt(f"assumption violated: {monitor} says {assumption:.3g} of it is used")
-        elif 0.0 <= margin <= 1.0:
+        elif inside == 0.0:
+            self._halt(f"assumption violated: {monitor} says so, and why on /diagnostics")
+        elif inside == 1.0 and 0.0 <= margin <= 1.0:
             self._judged = self._now
 
     def _look(self) -> None:
@@ -431,7 +431,9 @@ class TrackingController(ManagedNode):
             return
         now = self._now
         unsent = 2.0 * (self._patient_for + self._design.period)
-        if now - self._heard > self._patient_for:
+        if now < self._heard:
+            self._halt(f"this node's clock went back by {self._heard - now:.3g} s")
+        elif now - self._heard > self._patient_for:
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")

@@ -58,10 +58,10 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Row:
     }
     if replay.first_alarm is not None:
         said["alarm"] = replay.first_alarm.alarm
-    measured = [reading for reading in replay.judged if math.isfinite(reading.assumption)]
+    measured = [reading for reading in replay.judged if not math.isnan(reading.assumption)]
     if measured:
         most = max(measured, key=lambda reading: reading.assumption)
-        numbers |= {"spent": most.assumption, "spent_at": most.t}
+        numbers |= {"spent": min(most.assumption, 1e300), "spent_at": most.t}
     if replay.worst is not None:
         numbers |= {"margin": max(replay.worst.margin, -1e300)}
     if replay.first_bad is not None:

@@ -455,8 +455,11 @@ def _check(sampler: Sampler, source: Bag, bag: Path) -> None:
 
 
 def _run_topics(source: Bag) -> list[str]:
-    topics = [topic for topic in source.topics if topic.endswith(RUN_TOPIC)]
-    return [topic for topic in topics if source.types_on(topic)[0] == STRING]
+    return [
+        topic
+        for topic in source.topics
+        if topic.endswith(RUN_TOPIC) and source.types_on(topic)[0] == STRING
+    ]
 
 
 def _run(message: Any, source: Bag) -> Run:

@@ -121,8 +121,9 @@ class Sampler:
     """Messages or numbers in, samples out; see the module.
 
     incomplete: times of samples before the first complete one. late: values that came after a
-    sample they belong to was given. late_responses, duplicate_responses: responses that came after
-    a later one was given, or with the stamp of another; they give no sample.
+    sample they belong to was given. late_responses: values of a response whose stamps went back
+    behind a sample that was given; duplicate_responses: of the first one, those with the stamp of
+    another. They give no sample.
 
     Raises BagError for signals that are no expressions, on several clocks, or of which some
     responses are samples as they come and others on a grid.
@@ -257,7 +258,7 @@ class Sampler:
             elif stamp_ns == self._kept[k].newest_ns:
                 self.duplicate_responses += k == 0
             else:
-                self.late_responses += k == 0
+                self.late_responses += 1
             return
         self.add(k, stamp_ns, running.update(stamp_ns, value))
 
@@ -275,6 +276,7 @@ class Sampler:
             self._waiting.insert(at, stamp_ns)
         elif stamp_ns <= self._released_ns:
             self.late += 1
+            self.late_responses += k < len(self.responses) and stamp_ns < kept.newest_ns
         kept.add(stamp_ns, value)
 
     def _release(self, until_ns: float) -> list[Sample]:

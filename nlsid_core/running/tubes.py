@@ -111,9 +111,8 @@ class TubeRun:
         if fault := self._take(t):
             return self._unknown(t, measured, fault)
         if fault := self._fault(t, measured, applied):
-            return self._unknown(t, measured, self._without(applied, fault) or fault)
-        self._beyond = self._beyond or self._beyond_training(t, applied)
-        self._u_before = applied
+            return self._unknown(t, measured, self._without(t, applied, fault) or fault)
+        self._compare_with_training(t, applied)
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
@@ -130,7 +129,7 @@ class TubeRun:
     def unmeasured(self, t: float, u: Any, reason: str) -> Reading:
         """The reading at t (s) where nobody measured the outputs: a step with e = 0 under u."""
         nothing = [math.nan] * len(self._names)
-        fault = self._take(t) or self._without(_floats(u), reason)
+        fault = self._take(t) or self._without(t, _floats(u), reason)
         return self._unknown(t, nothing, fault or reason)
 
     def forecast(self, u: FloatArray) -> Forecast:
@@ -220,23 +219,25 @@ class TubeRun:
                 return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
-    def _beyond_training(self, t: float, u: list[float]) -> str:
-        """Which input leaves the range or the pace that it had in training; empty if none does."""
+    def _compare_with_training(self, t: float, u: list[float]) -> None:
+        """Remember the first input that leaves the range or the pace that it had in training."""
         signals, before = self._stepper.u, self._u_before or u
+        self._u_before = u
         for signal, now, last, (least, most, fastest) in zip(
             signals, u, before, self._trained, strict=False
         ):
             room, change = CLEARLY * (most - least), abs(now - last)
             inside = least - room <= now <= most + room
-            if inside and change <= fastest + room:
+            if self._beyond or (inside and change <= fastest + room):
                 continue
             said = f"changed by {change:.4g} in a sample" if inside else f"{now:.4g}"
             trained = f"{least:.4g} to {most:.4g}, changes to {fastest:.4g}"
-            return f"; {BEYOND} from t = {t:g} s on: {signal.name} {said}, in training {trained}"
-        return ""
+            self._beyond = (
+                f"; {BEYOND} from t = {t:g} s on: {signal.name} {said}, in training {trained}"
+            )
 
-    def _without(self, u: list[float], fault: str) -> str:
-        """A step with e = 0 under the input u, or a new run if that is not known.
+    def _without(self, t: float, u: list[float], fault: str) -> str:
+        """A step with e = 0 under the input u at t (s), or a new run if that is not known.
 
         fault: why nothing was measured. Why the model ends the run, empty if it does not.
         """
@@ -244,6 +245,7 @@ class TubeRun:
         if self._x is None or not known:
             self._begin(fault)
             return ""
+        self._compare_with_training(t, u)
         _, after, refused = self._advance(self._stepper, self._x, u)
         if refused:
             self._begin(refused)

@@ -315,12 +315,11 @@ def test_the_stretches_that_were_not_judged_begin_and_end(chain: Path) -> None:
     stamps = [*range(14), *range(20, 25)]  # six samples never came
     readings = tuple(r._replace(t=float(t)) for r, t in zip(said, stamps, strict=True))
     found = replace(whole, readings=readings, period=1.0)
-    first, second = found.unjudged
-    assert (first.start, first.end, first.samples) == (5.0, 8.0, 4)
-    assert first.why == "no speed at t = 2 s; then 3 to start a new run"
-    assert (second.start, second.end, second.samples) == (14.0, 20.0, 7)
-    assert second.why == "6 samples are missing; then no speed at t = 2 s"
-    assert found.span - found.judged_span == first.samples + second.samples == 11
+    assert [(part.start, part.end, part.samples, part.why) for part in found.unjudged] == [
+        (5.0, 8.0, 4, "no speed at t = 2 s; then 3 to start a new run"),
+        (14.0, 20.0, 7, "6 samples are missing; then no speed at t = 2 s"),
+    ]
+    assert found.span - found.judged_span == 4 + 7
 
 
 def test_bags_of_another_period_are_said_once_with_both_periods(chain: Path) -> None:

@@ -348,12 +348,13 @@ def test_identification_refuses_it_as_it_does_header_stamps(bag: Path) -> None:
     assert (np.diff(asked_for.stamp_ns) >= 0).all()
 
 
+@pytest.mark.parametrize("resampled", ["", "|linear(0.1 s)", "|hold(0.1 s)"])
 def test_the_monitor_says_it_and_does_not_blame_the_robot(
-    bag: Path, fit: Fit[DifferenceEquation], train: Dataset
+    bag: Path, fit: Fit[DifferenceEquation], train: Dataset, resampled: str
 ) -> None:
     model = replace(
         fit.model,
-        y=Signal("speed", "m/s", f"{SPEED}|clock(log)"),
+        y=Signal("speed", "m/s", f"{SPEED}|clock(log){resampled}"),
         u=Signal("command", "m/s", f"{COMMAND}|clock(log)"),
     )
     design = design_output_tube(OutputTube(model, train))

@@ -95,9 +95,12 @@ def test_a_path_that_leads_to_no_number_says_why(text: str, message: str) -> Non
 def test_values_come_from_nested_fields_fixed_arrays_and_dynamic_arrays() -> None:
     types = standard_types()
     message = types.deserialize_cdr(odometry(START_NS, 0.375), ODOM_TYPE)
-    assert SignalPath.parse("/odom:twist.twist.linear.x").value(message) == 0.375
-    assert SignalPath.parse("/odom:pose.covariance[35]").value(message) == 0.0
-    assert SignalPath.parse("/odom:header.stamp.sec").value(message) == START_NS // 10**9
+    for path, value in {
+        "/odom:twist.twist.linear.x": 0.375,
+        "/odom:pose.covariance[35]": 0.0,
+        "/odom:header.stamp.sec": START_NS // 10**9,
+    }.items():
+        assert SignalPath.parse(path).value(message) == value
     position = SignalPath.parse("/joint_states:position[1]")
     position.check(JOINT_TYPE, types)
     arm = types.deserialize_cdr(joints(START_NS, [0.5, -0.25]), JOINT_TYPE)
@@ -128,9 +131,8 @@ def test_a_custom_type_defined_in_the_bag_is_used() -> None:
     drive = types.types["my_robot/msg/Drive"](np.array([1.0, 2.0]), 7, [gear])
     data = types.serialize_cdr(drive, "my_robot/msg/Drive")
     decoded = types.deserialize_cdr(data, "my_robot/msg/Drive")
-    assert SignalPath.parse("/drive:torque[1]").value(decoded) == 2.0
-    assert SignalPath.parse("/drive:from").value(decoded) == 7.0
-    assert SignalPath.parse("/drive:gears[0].ratio").value(decoded) == 2.5
+    for path, value in (("torque[1]", 2.0), ("from", 7.0), ("gears[0].ratio", 2.5)):
+        assert SignalPath.parse(f"/drive:{path}").value(decoded) == value
 
 
 @pytest.mark.parametrize(
@@ -170,8 +172,7 @@ def test_every_element_is_one_signal_each(tmp_path: Path) -> None:
     named = "/arm:position[name=joint_1]"
     read = read_signals(arm_bag(tmp_path / "arm"), ["/arm:position[*]", named])
     assert list(read) == [*(f"/arm:position[{k}]" for k in range(3)), named]
-    assert set(read[named].values) == {-1.0}
-    assert set(read["/arm:position[1]"].values) == {-1.0}
+    assert {*read[named].values, *read["/arm:position[1]"].values} == {-1.0}
     assert read["/arm:position[0]"].unit == "rad or m"
 
 
@@ -284,11 +285,13 @@ def test_standard_types_imply_units() -> None:
         path: implied_unit(owners)
         for path, _, owners in numeric_paths("nav_msgs/msg/Odometry", types)
     }
-    assert units["twist.twist.linear.x"] == "m/s"
-    assert units["twist.twist.angular.z"] == "rad/s"
-    assert units["pose.pose.position.y"] == "m"
-    assert units["pose.pose.orientation.w"] == ""
-    assert units["pose.covariance[*]"] == ""
+    assert units.items() >= {
+        ("twist.twist.linear.x", "m/s"),
+        ("twist.twist.angular.z", "rad/s"),
+        ("pose.pose.position.y", "m"),
+        ("pose.pose.orientation.w", ""),
+        ("pose.covariance[*]", ""),
+    }
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3, 7.0])

@@ -125,6 +125,11 @@ def test_a_command_beyond_those_of_training_is_said_from_then_on(name: str) -> N
     larger[100:, -1] = most[-1] + 0.02 * (most[-1] - least[-1])
     readings = run(made.monitor(), replace(trial, u=larger))
     assert [BEYOND in r.assuming for r in readings] == [False] * 100 + [True] * 200
+    monitor, lost = made.monitor(), trial.y.copy()
+    lost[95:105] = np.nan
+    rows = zip(trial.t.tolist(), lost, larger, strict=True)
+    *_, after = [monitor.update(*row) for row in rows]
+    assert f"from t = {trial.t[100]:g} s on" in after.assuming, "of a sample without a measurement"
     known = replace(made.funnel, commands=None)
     plain = run(Monitor([Stage(made.model, None, known)]), replace(trial, u=larger))
     assert [r.status for r in plain] == [r.status for r in readings]

@@ -48,6 +48,7 @@ class Driven(Robot):
         super().__init__(stack, folder)
         self.commands: dict[int, float] = {}
         self.run = f"{self.bundle.digest} {WAITING}"  # as a monitor's verdict names it
+        self.inside = 1.0  # as it says
         self.listen(TwistStamped, "/cmd_vel", self._command)
         self.listen(String, f"/{NAME}/run", self._begun, qos.DOCUMENT)
 
@@ -101,7 +102,7 @@ class Driven(Robot):
             self.odom.publish(message)
             if margin_at is not None:
                 of_ns = stamp_ns + round(margin_at * 1e9)
-                numbers = {"margin": 0.5, "assumption": math.nan}
+                numbers = {"margin": 0.5, "assumption": math.nan, "inside": self.inside}
                 self.margin.publish(numbers_at(of_ns, numbers, judging or self.run))
             due = began + (k + 1) * PERIOD_NS * 1e-9
             self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
@@ -239,6 +240,14 @@ def test_verdicts_of_another_funnel_or_run_end_it_before_it_moves(
     robot.feed(80, margin_at=0.0, judging=judging.format(digest=robot.bundle.digest))
     robot.expect_stop(because)
     assert set(robot.commands.values()) <= {0.0}
+
+
+def test_a_verdict_that_an_assumption_is_violated_ends_it(robot: Driven) -> None:
+    """Of the input, say: then the margin is good, and all is used of nothing."""
+    robot.watch()
+    robot.inside = 0.0
+    robot.feed(80, margin_at=0.0)
+    robot.expect_stop("assumption violated: funnel_monitor says so")
 
 
 def test_a_second_node_that_publishes_verdicts_ends_it(robot: Driven) -> None:

@@ -97,8 +97,8 @@ def test_repeats_are_the_same_signal_within_the_limits(stack: ExitStack) -> None
     ]
     assert {each["repeat_group"] for each in said} == {said[0]["repeat_group"]}
     assert said[0]["repeat_group"].startswith("/cmd_vel:twist.linear.x, multisine, sha256:")
-    assert (said[0]["kind"], said[0]["repeats"]) == ("multisine", 2)
-    assert said[0]["limits"]["highest"] == 0.4
+    named = said[0]["kind"], said[0]["repeats"], said[0]["limits"]["highest"]
+    assert named == ("multisine", 2, 0.4)
 
 
 @pytest.mark.parametrize("kind", ["chirp", "prbs", "steps"])
@@ -124,13 +124,14 @@ def test_every_kind_stays_within_the_limits(kind: str, stack: ExitStack) -> None
 
 
 def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed(stack: ExitStack) -> None:
-    robot = Excited(stack, kind="steps", period=0.02, pause=0.0)
+    robot = Excited(stack, kind="steps", period=0.02, pause=0.0, hold=1.0, slew=0.2)
     robot.begin(above=0.2)
     assert robot.call("/excitation/stop").success
+    assert "on its way to rest" in robot.call("/excitation/start").message
     robot.end()
     assert json.loads(robot.did[-1])["ended"] == "stopped when asked to"
     assert json.loads(robot.did[-1])["repeat_group"] == "", "half a repeat is none"
-    assert np.abs(np.diff(robot.inputs())).max() <= 2.0 * 0.02 * (1 + 1e-9)
+    assert np.abs(np.diff(robot.inputs())).max() <= 0.2 * 0.02 * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -201,8 +202,8 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
     bench.start("plant", model=field, state="'0.0'", **wiring)
     recorder = bench.start("trajectory_recorder", topics=topics, bag=bags / "trial", at_once=False)
     bench.start("excitation", **(JOINTS | SIGNAL), repeats=3, recorder="trajectory_recorder")
-    bench.spin_until(lambda: bench.node.count_subscribers("/joint_states") == 1)
-    bench.spin_until(lambda: bench.node.count_subscribers("/joint_commands") == 2)
+    wanted = {"/joint_states": 1, "/joint_commands": 2}
+    bench.spin_until(lambda: {t: bench.node.count_subscribers(t) for t in wanted} == wanted)
     bench.hears("idle", "excitation")
     bench.spin_until(lambda: bench.call("/excitation/start").success)
     bench.hears("done", "excitation")

@@ -45,6 +45,15 @@ def test_the_other_fields_are_as_the_template_says() -> None:
     assert not made.lacking()
 
 
+def test_a_number_that_is_none_is_never_sent_beside_the_signal() -> None:
+    made, fit, unfit = SignalMessage(SPEED, TWIST, "/teleop"), TwistStamped(), TwistStamped()
+    fit.twist.angular.z, unfit.twist.angular.z = 0.7, math.nan
+    for message in (fit, unfit):
+        made._on_other(message)
+    assert made.lacking() == "on /teleop, twist.angular.z is nan"
+    assert made.make(5, 0.25).twist.angular.z == 0.7, "on the way to rest"
+
+
 @pytest.mark.parametrize(
     ("others", "said"),
     [

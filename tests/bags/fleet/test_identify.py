@@ -84,11 +84,13 @@ def contents(out: Path) -> list[bytes]:
 
 def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> None:
     folder = fleet(tmp_path / "fleet", 3)
-    pattern = folder / "*" / "drive_*.mcap"
-    assert list(named_bags([pattern])) == ["robot_0/drive_0", "robot_0/drive_2", "robot_1/drive_1"]
-    assert list(named_bags([folder / "robot_*" / "*_1.mcap"])) == ["robot_1/drive_1"]
-    assert list(named_bags([folder / "robot_0"])) == ["drive_0", "drive_2"]
-    assert list(named_bags([folder / "robot_0" / "drive_2.mcap"])) == ["drive_2"]
+    for pattern, names in {
+        "*/drive_*.mcap": ["robot_0/drive_0", "robot_0/drive_2", "robot_1/drive_1"],
+        "robot_*/*_1.mcap": ["robot_1/drive_1"],
+        "robot_0": ["drive_0", "drive_2"],
+        "robot_0/drive_2.mcap": ["drive_2"],
+    }.items():
+        assert list(named_bags([folder / pattern])) == names
     with pytest.raises(DataError, match="two bags are called 'drive_0'"):
         named_bags([folder / "robot_0", drive(tmp_path / "drive_0.mcap")])
 
@@ -105,10 +107,13 @@ def test_a_folder_whose_folders_hold_bags_says_the_pattern(tmp_path: Path) -> No
 
 def test_a_recording_is_known_by_any_of_its_marks_and_named_by_who_had_it_first() -> None:
     known = Recordings()
-    assert known.first("a", ["digest a", "samples 1"]) == "a"
-    assert known.first("b", ["digest b", "samples 1"]) == "a"
-    assert known.first("c", ["digest b"]) == "a"
-    assert known.first("d", ["digest d"]) == "d"
+    for name, marks, first in (
+        ("a", ["digest a", "samples 1"], "a"),
+        ("b", ["digest b", "samples 1"], "a"),
+        ("c", ["digest b"], "a"),
+        ("d", ["digest d"], "d"),
+    ):
+        assert known.first(name, marks) == first
 
 
 @pytest.mark.slow

@@ -1,9 +1,11 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
+import math
 import os
 import re
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
 from bags.fleet.check import CheckBag
-from bags.fleet.monitor import FleetVerdict, JudgeBag
+from bags.fleet.monitor import FleetVerdict, JudgeBag, judged_of
 from bags.fleet.rows import Row, read_rows
 from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
@@ -62,6 +64,8 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(funnel: Path) -> None:
         assert row.numbers["spent_at"] == most.t
         start = datetime.fromtimestamp(alone.stamps_ns[0] // 10**9, UTC)
         assert row.start == start.isoformat()
+    worse = replace(alone, readings=(*alone.judged, alone.judged[0]._replace(assumption=math.inf)))
+    assert judged_of(worse, path, "worse").numbers["spent"] == 1e300, "it is not left out"
 
 
 @pytest.mark.slow
