@@ -435,7 +435,10 @@ def box_of(function: Callable[..., Any], uncertain: ArrayLike | None) -> FloatAr
     if len(box) and not takes:
         raise DataError("uncertain has rows, but the dynamics have no argument w")
     if takes and not len(box):
-        raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
+        raise DataError(
+            "the dynamics have an argument w: give its bounds as `uncertain`; a motion is planned "
+            "without, such as of lambda x, u: rate(x, u, [0.0])"
+        )
     return box
 
 
