@@ -313,8 +313,9 @@ class FunnelMonitor(ManagedNode):
         heard.silence.end(1)
         try:
             stamp_ns = watch.pairing.stamp(data, clock_ns)
-            if watch.pairing.measures(topic, data):
-                heard.numbers.update(info["publication_sequence_number"])
+            if not watch.pairing.measures(topic, data):
+                return  # of other transforms: it does not even say that the signals still come
+            heard.numbers.update(info["publication_sequence_number"])
             responds = topic in watch.pairing.response_topics
             if not responds:
                 most = max(self._oldest, math.inf if logged else LATEST_COMMAND)
@@ -521,9 +522,11 @@ class FunnelMonitor(ManagedNode):
     def _numbers(self) -> dict[str, str]:
         """The reading's numbers, and counts, as diagnostics have them."""
         (reading, state), watch = self._said, self._watch
-        numbers = list(reading.numbers.items())  # ~/margin has all
         return {
-            **{name.replace("_", " "): f"{n:.6g}" for name, n in numbers[:MOST_NUMBERS]},
+            **{  # ~/margin has all
+                name.replace("_", " "): f"{n:.6g}"
+                for name, n in list(reading.numbers.items())[:MOST_NUMBERS]
+            },
             "now": state.value,
             "worst axis": reading.worst_axis,
             "assuming": reading.assuming,

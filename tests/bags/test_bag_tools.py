@@ -513,8 +513,10 @@ def test_a_frame_keeps_large_integers_where_rows_come_before_them(tmp_path: Path
                 put(writer, k, f"/{kind}", msgtype, serialised(msgtype, message))
     rows = frame(tmp_path / "late", [COMMAND, "/Int64", "/Bool"], clock="log")
     assert rows["/Int64:data"].isna().tolist() == [True, True, False, False]
-    assert rows["/Int64:data"].dropna().tolist() == list(large.values())
-    assert rows["/Bool:data"].dropna().tolist() == [True, False]
+    assert [rows[f"/{name}:data"].dropna().tolist() for name in ("Int64", "Bool")] == [
+        list(large.values()),
+        [True, False],
+    ]
     assert (
         frame(tmp_path / "late", ["/Int64", COMMAND], clock="log")["/Int64:data"].dtype == "int64"
     )

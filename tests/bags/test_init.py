@@ -76,11 +76,9 @@ def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     bags, config = f1tenth()[0].parent, tmp_path / "robot.yaml"
     said = nlsid("init", config.parent, bags, *options)
     settings = load_config(config)
-    assert settings.signals.response[0].path == response
-    assert settings.signals.excitation[0].path == excitation
-    assert settings.grid.period == 0.025
-    assert settings.clock == "header"
-    assert len(settings.split.test) == 8
+    signals = settings.signals
+    assert (signals.response[0].path, signals.excitation[0].path) == (response, excitation)
+    assert (settings.grid.period, settings.clock, len(settings.split.test)) == (0.025, "header", 8)
     assert f"{response}: " in said
     assert whole_way(bags, config, tmp_path / "out").count("inside") == 8
 

@@ -284,11 +284,14 @@ def test_a_displacement_is_told_of_samples_that_are_washed_out_messages() -> Non
         Signal("x", "m", path)
         for path in ("/a:x|washout(0.5 s)", "/a:y|washout(2 s)", "/b:z|washout(1 s)", "/a:x")
     )
-    assert washouts_of([x, y]) == [Fraction(1, 2), Fraction(2)]
-    assert washouts_of([plain, y]) == [None, Fraction(2)]
-    assert washouts_of([Signal("x", "m")]) == [None]
-    # Of /b only the messages at the stamps of /a are samples, and others may come between them.
-    assert washouts_of([x, other]) == [Fraction(1, 2), None]
+    for signals, washouts in (
+        ([x, y], [Fraction(1, 2), Fraction(2)]),
+        ([plain, y], [None, Fraction(2)]),
+        ([Signal("x", "m")], [None]),
+        # Of /b only the messages at the stamps of /a are samples; others may come between them.
+        ([x, other], [Fraction(1, 2), None]),
+    ):
+        assert washouts_of(signals) == washouts
 
 
 @pytest.mark.slow

@@ -48,8 +48,7 @@ def test_the_margin_is_clarabels(n: int, seed: int) -> None:
 
 def test_the_number_of_points_is_the_number_of_equalities() -> None:
     program = SphereProgram(6)
-    assert program.points.shape == (182, 6)
-    assert program.basis.shape == (27, 6)
+    assert (program.points.shape, program.basis.shape) == ((182, 6), (27, 6))
     assert np.linalg.norm(program.points, axis=1) == pytest.approx(1.0)
 
 

@@ -69,11 +69,13 @@ def test_a_diverging_model_scores_infinity_without_warnings() -> None:
 
 
 def test_numbers_that_are_compared_read_differently_where_they_are_different() -> None:
-    just_below = float(np.nextafter(-1.0, -2.0))
-    assert apart(just_below, -1.0, 1.65) == ("-1.0000000000000002", "-1.0", "1.65")
-    assert apart(-1.00000001, -1.0) == ("-1.00000001", "-1")
-    assert apart(0.5, 0.5, 2.0) == ("0.5", "0.5", "2")
-    assert apart(math.nan, 1.0) == ("nan", "1")
+    for numbers, said in {
+        (float(np.nextafter(-1.0, -2.0)), -1.0, 1.65): ("-1.0000000000000002", "-1.0", "1.65"),
+        (-1.00000001, -1.0): ("-1.00000001", "-1"),
+        (0.5, 0.5, 2.0): ("0.5", "0.5", "2"),
+        (math.nan, 1.0): ("nan", "1"),
+    }.items():
+        assert apart(*numbers) == said
 
 
 def test_an_error_beyond_all_sense_is_said_in_words() -> None:

@@ -74,10 +74,13 @@ def test_a_node_that_started_itself_is_taken_over_by_a_manager_which_wrong_reque
     running = bench.start(name, **settings_of(name, funnel, tmp_path))
     assert asked(bench, name, ACTIVATE) == (False, ACTIVE), "it is active already"
     assert asked(bench, name, CONFIGURE) == (True, INACTIVE), "as a manager does"
-    assert asked(bench, name, CONFIGURE) == (False, INACTIVE)
-    assert asked(bench, name, ACTIVATE) == (True, ACTIVE)
-    assert asked(bench, name, ACTIVATE) == (False, ACTIVE)
-    assert asked(bench, name, CONFIGURE) == (False, ACTIVE)
+    for transition, answer in (
+        (CONFIGURE, (False, INACTIVE)),
+        (ACTIVATE, (True, ACTIVE)),
+        (ACTIVATE, (False, ACTIVE)),
+        (CONFIGURE, (False, ACTIVE)),
+    ):
+        assert asked(bench, name, transition) == answer
     assert asked(bench, name, 99) == (False, ACTIVE), "there is no such transition"
     said = SAYS[name]
     for _ in range(2):

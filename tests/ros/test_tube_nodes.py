@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from visualization_msgs.msg import Marker, MarkerArray
 
 from bags.chain.config import FunnelConfig, load_config
 from bags.chain.joint_bags import COMMANDS, STATES
@@ -32,6 +33,7 @@ from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import Signal
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
+from nlsid_core.running.plants import ModelPlant
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of, stamp_of
 from tests import implicit_models
@@ -149,6 +151,27 @@ class Sprung(Car):
             self.odom.publish(state)
             self.spin_until(lambda stamp=stamp: stamp in self.margins)  # type: ignore[misc]
         return np.array([self.margins[stamp] for stamp in stamps])
+
+
+def test_a_named_part_that_no_longer_comes_is_missed_though_others_go_on(
+    stack: ExitStack, tmp_path: Path
+) -> None:
+    """As of transforms that share a topic."""
+    model = MODELS["linear"]()
+    place = "/markers:markers[ns=base].pose.position.x|clock(log)|linear(0.5 s)"
+    y = replace(model.y, path=place)
+    u = replace(model.u, path="/cmd_vel:twist.linear.x|clock(log)")
+    model = replace(model, y=y, u=u)
+    design(OutputTube(model, dataset(model, 0), dataset(model, 100))).save(tmp_path)
+    robot, parts = Robot(stack, tmp_path), [Marker(ns="other"), Marker(ns="base")]
+    parts[1].pose.position.x = float(ModelPlant(model).measure(np.zeros(1))[0])
+    markers = robot.node.create_publisher(MarkerArray, "/markers", qos.STREAM)
+    robot.node.create_timer(model.period, lambda: markers.publish(MarkerArray(markers=parts)))
+    robot.node.create_timer(model.period, lambda: robot.command.publish(TwistStamped()))
+    robot.watched(stale_after=1.0)
+    robot.spin_until(lambda: robot.said["funnel_monitor"][-1][1]["now"] == "inside")
+    parts.pop()
+    robot.spin_until(lambda: robot.has_said("no speed for 1 s"))
 
 
 def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
