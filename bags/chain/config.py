@@ -152,10 +152,6 @@ class LqrConfig(Section):
     input_weight: Annotated[Positive, Key("of the input's squared deviation", example=1.0)] = 1.0
 
 
-def _none_word(value: object) -> object:
-    return None if value == "none" else value
-
-
 class FunnelConfig(Section):
     """The tube that `nlsid funnel` designs: around the model's simulation, and around a plan."""
 
@@ -200,7 +196,7 @@ class FunnelConfig(Section):
     ] = 0.0
     policy: Annotated[
         LqrConfig | None,
-        BeforeValidator(_none_word),
+        BeforeValidator(lambda value: None if value == "none" else value),
         Key("with `profile`: weights of an LQR, or `none` for K = 0", example="none"),
     ] = LqrConfig()
     profile: Annotated[

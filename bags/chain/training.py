@@ -61,16 +61,13 @@ def decoded(content: bytes, *, source: str) -> dict[str, Dataset]:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             for index, entry in enumerate(json.loads(arrays["labels"].tobytes())):
                 signals = {letter: arrays[f"{letter}{index}"] for letter in "tyu"}
-                trial = Trajectory(**signals, **_labels(entry))
+                labels: dict[str, Any] = {key: str(entry[key]) for key in NAMES}
+                labels |= {key: tuple(map(str, entry[key])) for key in LABELS}
+                trial = Trajectory(**signals, **labels)
                 parts.setdefault(str(entry["use"]), []).append(trial)
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise DataError(f"{source}: {error}") from error
     return {use: Dataset(tuple(trials)) for use, trials in parts.items()}
-
-
-def _labels(entry: dict[str, Any]) -> dict[str, Any]:
-    texts = {key: str(entry[key]) for key in NAMES}
-    return texts | {key: tuple(map(str, entry[key])) for key in LABELS}
 
 
 def _digest(content: bytes) -> str:

@@ -90,9 +90,11 @@ def funnel(
     from bags.recordings.folders import expand_bags
 
     if given.compose:
+        from bags.designs.documents import FUNNEL_PROOF
         from nlsid_core.design import compose_funnels
 
-        path = compose_funnels([_proof_in(stage) for stage in given.compose], folder)
+        proofs = [p / FUNNEL_PROOF if p.is_dir() else p for p in given.compose]
+        path = compose_funnels(proofs, folder)
         out.print(f"wrote {path} and {4 * len(given.compose)} files of its stages", soft_wrap=True)
         return
     if given.problem is not None:
@@ -110,13 +112,6 @@ def funnel(
     from bags.commands import states
 
     states.funnel(expand_bags(bags), load_tracking_config(path), folder)
-
-
-def _proof_in(path: Path) -> Path:
-    """The proof of a design's folder, or the file that was named."""
-    from bags.designs import documents
-
-    return path / documents.FUNNEL_PROOF if path.is_dir() else path
 
 
 def tube(folder: Path, settings: Config, false_alarms: float | None = None) -> OutputTubeDesign:
@@ -365,7 +360,9 @@ def learn(
             if not taken:
                 raise
             write_atomically(folder / CONFIG, yaml_text(proposal).encode())
-            said = f"no tube of it: {refusal}; the next best is taken: {taken}"
+            said = (
+                f"no tube of it: {refusal}; the next best is taken: {taken}; {proposal.expectation}"
+            )
             out.print(said, soft_wrap=True, markup=False)
     status = decided([folder], deciding.USUAL)
     report(folder)

@@ -70,8 +70,11 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     design = None if is_rejected else _loaded(folder)
     drawn = "" if design is None else _drawn(folder, design)
+    short = ""
+    if design is not None and isinstance(design.funnel, TubeFunnel):
+        short = f"<p>{escape(show.promise(design))}</p>"
     chapters = {
-        "What is proved": _in_short(design) + decided,
+        "What is proved": short + decided,
         **(held or {}),
         "The model": model,
         "Pictures": _pictures(folder, without=in_model) + drawn,
@@ -167,13 +170,6 @@ def _loaded(folder: Path) -> AnyDesign | None:
         return documents.load(folder)
     except (NlsidError, OSError):
         return None
-
-
-def _in_short(design: AnyDesign | None) -> str:
-    """What a tube promises, without its formulas."""
-    if design is None or not isinstance(design.funnel, TubeFunnel):
-        return ""
-    return f"<p>{escape(show.promise(design))}</p>"
 
 
 def _drawn(folder: Path, design: AnyDesign) -> str:

@@ -57,9 +57,10 @@ def say_identified(console: Console, result: Identified) -> None:
 
 def worth(result: Identified) -> str:
     """How well the model simulates, and what is proved of it."""
-    error = percent(result.fit.errors["test"][result.fit.method.name])
+    error = result.fit.errors["test"][result.fit.method.name]
+    size = f"{percent(error)}{tables.in_unit(result.test, error)}"
     return (
-        f"The model simulates {counted(len(result.test), 'test trial')} with an error of {error}. "
+        f"The model simulates {counted(len(result.test), 'test trial')} with an error of {size}. "
         f"{tables.stability_sentence(result.fit.chosen)}"
     )
 
@@ -225,8 +226,8 @@ def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
 def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample.
 
-    COLUMNS wide or less: where a row is longer it goes on in the next line between words; numbers
-    never do.
+    The nearest bound is left out where all have the same. COLUMNS wide or less: where a row is
+    longer it goes on in the next line between words; numbers never do.
     """
     table = Table(
         title="held against the funnel",
@@ -239,38 +240,44 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         padding=0,
     )
     rows = [_replay_row(replay) for replay in replays]
-    names = ("bag", "verdict", "margin", "at", "axis", "used", "bad from", "judged")
-    cells = zip(names, *rows, strict=True)
-    widths = [max(len(Text.from_markup(cell)) for cell in column) for column in cells]
-    kept = dict(zip(names, widths, strict=True))
-    if sum(widths) + len(widths) > COLUMNS:
-        words = [word for row in rows for word in row[names.index("axis")].split()]
-        kept |= {"verdict": 10, "axis": max(4, *map(len, words)), "judged": 8}
-        kept["bag"] = max(COLUMNS + kept["bag"] - sum(kept.values()) - len(kept), 8)
+    axes = {row["axis"] for row in rows if row["axis"] != "-"}
+    names = [name for name in rows[0] if name != "axis" or len(axes) > 1]
+    cells = {name: [name, *(row[name] for row in rows)] for name in names}
+    kept = {k: max(len(Text.from_markup(cell)) for cell in cells[k]) for k in names}
+    least = {
+        "verdict": 10,
+        "axis": max(len(word) for row in rows for word in ("axis", *row["axis"].split())),
+        "judged": 8,
+        "bag": 8,
+    }
+    for name in (name for name in least if name in kept):
+        over = max(sum(kept.values()) + len(kept) - COLUMNS, 0)
+        kept[name] = max(kept[name] - over, min(kept[name], least[name]))
     for name in names:
-        left = name in ("bag", "verdict", "axis")
         table.add_column(
-            name, justify="left" if left else "right", width=kept[name], overflow="fold"
+            name,
+            justify="left" if name in ("bag", "verdict", "axis") else "right",
+            width=kept[name],
+            overflow="fold",
         )
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(row[name] for name in names))
     return table
 
 
-def _replay_row(replay: Replay) -> list[str]:
+def _replay_row(replay: Replay) -> dict[str, str]:
     worst, bad = replay.worst, replay.first_bad
-    colour = COLOURS[replay.verdict]
     alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
-    return [
-        escape(replay.name),
-        f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
-        "-" if worst is None else f"{worst.margin:.3f}",
-        "-" if worst is None else f"{worst.t:.3f} s",
-        "-" if worst is None else escape(worst.worst_axis),
-        "-" if worst is None else _percent(replay.assumption),
-        "-" if bad is None else f"{bad.t:.3f} s",
-        f"{replay.judged_span:.1f} of {replay.span:.1f} s",
-    ]
+    return {
+        "bag": escape(replay.name),
+        "verdict": f"[{COLOURS[replay.verdict]}]{replay.verdict}[/]{alarm}",
+        "margin": "-" if worst is None else f"{worst.margin:.3f}",
+        "at": "-" if worst is None else f"{worst.t:.3f} s",
+        "axis": "-" if worst is None else escape(worst.worst_axis),
+        "used": "-" if worst is None else _percent(replay.assumption),
+        "bad from": "-" if bad is None else f"{bad.t:.3f} s",
+        "judged": f"{replay.judged_span:.1f} of {replay.span:.1f} s",
+    }
 
 
 def _percent(part: float) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from bags.chain.config import Config
 from bags.chain.steps import read_signals_of
@@ -60,7 +60,23 @@ class CheckBag:
         else:
             marks += samples_digest(own)
             numbers["moves"] = float(any((trial.u != trial.u[0]).any() for trial in own))
-        findings = list(self._findings(bag, name, definitions, taken=not refused))
+        (fitness,) = check_fitness(
+            [bag],
+            excitations=[signal.path for signal in self.config.signals.excitation],
+            responses=[signal.path for signal in self.config.signals.response],
+            clock=self.config.clock,
+            definitions=definitions,
+        )
+        findings = [
+            replace(
+                found,
+                level=Level.GOOD if decided or _is_of_others(found) else found.level,
+                what=without_name(found.what, bag, name),
+            )
+            for found in fitness.findings
+            for decided in [not refused and found.check in ("regularity", "samples")]
+            if refused or found.check != "samples" or found.level is Level.GOOD
+        ]
         counts = [text for key, text in custom.items() if key.endswith(LOST)]
         if counts:
             numbers["lost"] = float(sum(int(text) for text in counts if text.isdigit()))
@@ -83,29 +99,6 @@ class CheckBag:
             numbers=numbers,
         )
         return row.content()
-
-    def _findings(self, bag: Path, name: str, definitions: Any, *, taken: bool) -> list[Finding]:
-        """What `nlsid bag check` finds, of one bag among others.
-
-        taken: `nlsid identify` takes its samples, with the configured grid.
-        """
-        (fitness,) = check_fitness(
-            [bag],
-            excitations=[signal.path for signal in self.config.signals.excitation],
-            responses=[signal.path for signal in self.config.signals.response],
-            clock=self.config.clock,
-            definitions=definitions,
-        )
-        return [
-            replace(
-                found,
-                level=Level.GOOD if _is_of_others(found) or (taken and decided) else found.level,
-                what=without_name(found.what, bag, name),
-            )
-            for found in fitness.findings
-            for decided in [found.check in ("regularity", "samples")]
-            if not (taken and found.check == "samples" and found.level is not Level.GOOD)
-        ]
 
 
 def _is_of_others(found: Finding) -> bool:

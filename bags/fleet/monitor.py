@@ -3,7 +3,6 @@
 import hashlib
 import math
 import pickle
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -17,7 +16,6 @@ from bags.signals.reader import bag_origin
 from nlsid_core import files
 from nlsid_core.designs import AnyDesign
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Reading
 
 RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
 
@@ -60,7 +58,9 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Row:
     }
     if replay.first_alarm is not None:
         said["alarm"] = replay.first_alarm.alarm
-    if (most := most_spent(replay.judged)) is not None:
+    measured = [reading for reading in replay.judged if not math.isnan(reading.assumption)]
+    if measured:
+        most = max(measured, key=lambda reading: reading.assumption)
         numbers |= {"spent": min(most.assumption, 1e300), "spent_at": most.t}
     if replay.worst is not None:
         numbers |= {"margin": max(replay.worst.margin, -1e300)}
@@ -88,12 +88,6 @@ def _unjudged(replay: Replay) -> str:
     first, *more = replay.unjudged
     said = f"{first.where}: {first.why}"
     return f"{said} (and later in {len(more)} more places)" if more else said
-
-
-def most_spent(readings: Sequence[Reading]) -> Reading | None:
-    """The reading that uses most of the assumption; None if none measures it."""
-    measured = [reading for reading in readings if not math.isnan(reading.assumption)]
-    return max(measured, key=lambda reading: reading.assumption, default=None)
 
 
 @dataclass(frozen=True, eq=False)

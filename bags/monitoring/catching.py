@@ -153,7 +153,7 @@ class Width:
     def said(self) -> str:
         """The half-width with its unit, rounded up, and how it changes with the commands."""
         mean = f"{_up(self.half_width)} {self.unit}".strip()
-        if self.least is None or self.most is None:
+        if self.least is None or self.most is None or _up(self.least) == _up(self.most):
             return mean
         span = f"{_up(self.least)} to {_up(self.most)}"
         return f"{mean} on average over the calibration trials, {span} as their commands go"

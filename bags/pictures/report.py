@@ -78,21 +78,16 @@ def write_catching(folder: Path, catching: Catching) -> list[Path]:
     _, ends, after = rest.partition(FUNNEL_ENDS)
     if not ends:
         return [picture]
-    section = _catching(catching, plots.svg(figure))
-    files.write_atomically(report, f"{before}{begins}{section}{ends}{after}".encode())
-    return [picture, report]
-
-
-def _catching(catching: Catching, drawn: str) -> str:
-    """The section of the report."""
     said = tables.html(lambda console: tables.say_catching(console, catching))
-    return f"""
+    section = f"""
 <h2>The funnel: what it can catch</h2>
 {said}
-<p class="note">The trials had no part in the model nor in the funnel, and are sabotaged. CUSUM and
-3σ watch the innovation, the box the difference from the nominal.</p>
-{drawn}
+<p class="note">The trials had no part in the model or in the funnel; each fault was put into a copy
+of each. CUSUM and 3σ watch the innovation, the box the difference from the nominal.</p>
+{plots.svg(figure)}
 """
+    files.write_atomically(report, f"{before}{begins}{section}{ends}{after}".encode())
+    return [picture, report]
 
 
 def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
@@ -104,7 +99,12 @@ def page(fit: Fit[Model], parts: Mapping[str, Dataset], *, robot: str) -> str:
     drawn = {c.method.title: c.model for c in (*fit.candidates[:1], chosen)}
     simulated = "".join(plots.svg(model_plots.simulations(test, drawn, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
-    listed = "".join(_recordings(data, use) for use, data in parts.items())
+    listed = "".join(
+        f"<tr><td>{escape(t.name)}</td><td>{len(t)}</td><td>{use}</td><td>{escape(t.group)}</td>"
+        f"<td><code>{escape(t.digest[:19])}…</code></td></tr>"
+        for use, data in parts.items()
+        for t in data
+    )
     counts = ", ".join(f"{len(data)} {use}" for use, data in parts.items())
     methods = tables.methods_table(fit, test, columns)
     model, proved = chosen.model, tables.stability_sentence(chosen)
@@ -154,11 +154,3 @@ def _residuals(chosen: Candidate[Model], test: Dataset) -> str:
 independent of the input. White noise on the measurement leaves the simulation residual white, white
 noise in the equation the one-step residual; if neither is white, the model leaves dynamics
 unexplained, the noise is coloured, or there is noise of both kinds.</p>"""
-
-
-def _recordings(dataset: Dataset, use: str) -> str:
-    return "".join(
-        f"<tr><td>{escape(t.name)}</td><td>{len(t)}</td><td>{use}</td><td>{escape(t.group)}</td>"
-        f"<td><code>{escape(t.digest[:19])}…</code></td></tr>"
-        for t in dataset
-    )

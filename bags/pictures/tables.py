@@ -15,6 +15,7 @@ from bags.monitoring.catching import Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import counted, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
+from nlsid_core.identification.regressors import signal_scale
 from nlsid_core.models import StateAffineModel
 
 STABILITY = "proved rate a sample (time constant)"
@@ -90,6 +91,18 @@ def stability(candidate: Candidate[Model]) -> str:
     if candidate.proof is None:
         return f"[dark_orange3]{candidate.unproved}"
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
+
+
+def in_unit(data: Dataset, *percents: float) -> str:
+    """State percentages of the spread of one output in its unit; several outputs have no such text.
+
+    Two sets of trials compare by it: the calmer trials have the larger percentages.
+    """
+    _, spread = signal_scale(data, "y")
+    if len(spread) > 1:
+        return ""
+    ends = " to ".join(f"{spread[0] * part / 100.0:.2g}" for part in percents)
+    return f" ({ends} {data.trajectories[0].y_units[0] or 'in its unit'})"
 
 
 def stability_sentence(chosen: Candidate[Model]) -> str:

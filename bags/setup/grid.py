@@ -14,7 +14,7 @@ from bags.recordings.definitions import Definition
 from bags.setup.proposal import Proposal
 from bags.signals.expressions import factors
 from bags.signals.reader import Samples, read_signals
-from bags.signals.sampling import Grid
+from bags.signals.sampling import BRIDGED, MOST_FILLED, Grid
 from bags.signals.timing import held
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
@@ -34,7 +34,8 @@ class Steps:
     """The responses' steps in s.
 
     on_grid: the share of them that is near the period. off_grid: periods by which the stamps of a
-    run stray from one grid of the period. repeated: stamps that are the one before.
+    run stray from one grid of the period. repeated: stamps that are the one before. wide: longer
+    ones, without the gaps, are half as much of the time as a monitor lets be filled in.
     """
 
     period: float
@@ -42,6 +43,7 @@ class Steps:
     off_grid: float
     repeated: int
     longest: float
+    wide: float
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,12 @@ def read_paces(
     median = float(np.median(every))
     near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
     period, off_grid = _grid(steps, median)
+    between = np.sort(every[every <= FEW_GAPS * median])
+    wide = np.searchsorted(np.cumsum(between), (1.0 - 0.5 * MOST_FILLED) * between.sum())
     return Paces(
-        Steps(period, float(near.mean()), off_grid, repeated, float(every.max())),
+        Steps(
+            period, float(near.mean()), off_grid, repeated, float(every.max()), float(between[wide])
+        ),
         Ages(
             period=float(np.median(u_every)) if len(u_every) else math.inf,
             longest=max(each.longest for each in commanded),
@@ -217,9 +223,8 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
             f"samples are {steps.period:.4g} s apart, {1.0 / steps.period:.2g} Hz; if times in "
             "milliseconds were taken for seconds, read them again with their unit"
         )
-    factor = 1
-    if read.band > 0:
-        factor = max(int(1.0 / (DYNAMICS * read.band) / steps.period), 1)
+    enough = DYNAMICS * read.band * steps.period  # of a sample, that a step is
+    factor = max(int(1.0 / enough), 1) if enough > 0.0 else 1
     if factor > 1:
         grid["period"] = float(f"{factor * steps.period:.4g}")
         why["period"] = (
@@ -239,6 +244,12 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
             f"takes {TOLERANCE:g}": True,
         }
         why["resample"] = next(reason for reason, holds in reasons.items() if holds)
+    if not regular and steps.wide > BRIDGED * grid["period"]:
+        grid["period"] = _up(steps.wide / BRIDGED)
+        why["period"] = (
+            f"responses come up to {steps.wide:.3g} s apart; a sample is measured where it has "
+            f"messages at most {BRIDGED:g} periods apart"
+        )
     most = FEW_GAPS * steps.period
     grid["max_gap"] = _up(max(min(1.2 * steps.longest, most), 2.0 * grid["period"]))
     why["max_gap"] = f"the longest step of a response is {steps.longest:.3g} s"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bags.chain.config import Config
+from bags.pictures.tables import in_unit
 from nlsid_core.identification import Choice
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
@@ -39,7 +40,9 @@ class Proposal:
                 "nothing is promised: no model could be held against data that it was not fitted to"
             )
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
-        said = f"expect an error in simulation of {self.choice.promise}: {grade}"
+        promise = self.choice.promise
+        size = in_unit(self.choice.held_out.data, promise.low, promise.high)
+        said = f"expect an error in simulation of {promise}{size}: {grade}"
         return f"{said}, if the question above is answered" if self.doubts else said
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:

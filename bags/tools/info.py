@@ -18,7 +18,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
 from bags.recordings.quality import Profile
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.errors import BagError
+from nlsid_core.errors import BagError, counted
 from nlsid_core.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Messages:
         is_zero = self.stamps is not None and stamps.clock is None
         odd = {
             "every header stamp is 0: its publisher does not fill it in; use log time": is_zero,
-            f"header stamps go back in {stamps.backward} places": stamps.backward,
+            f"header stamps go back in {counted(stamps.backward, 'place')}": stamps.backward,
             f"{stamps.duplicates} header stamps repeat the one before": (
                 stamps.duplicates and not is_zero
             ),

@@ -21,6 +21,7 @@ from nlsid_core.models.signal import FORMAT, Recorded, Signal, head, recorded, t
 KIND = "monotone_equation"
 NEWTON_STEPS = 100  # far from the solution a cubic takes a third off the distance a step
 BRACKET_ROOM = 1.0 + 1e-9  # for rounding in the bracket's ends
+POSITIVE = 1e-9  # of the larger eigenvalue of a slope's matrix: what solvers round by
 ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it is found
 
 
@@ -133,9 +134,20 @@ class MonotoneEquation(Recorded):
 def is_increasing(e: FloatArray) -> bool:
     """e'(v) = e₁ + 2 e₂ v + 3 e₃ v² > 0 for every v, decided exactly."""
     first, second, third = (Fraction(float(entry)) for entry in e)
-    if second == 0 and third == 0:
-        return first > 0
-    return third > 0 and 3 * first * third > second**2
+    return first > 0 and (second == third == 0 or 3 * first * third > second**2)
+
+
+def increasing(e: FloatArray) -> FloatArray:
+    """The nearest e (3,) that increases everywhere, of one that a solver keeps there to rounding.
+
+    e'(v) = [1 v] G [1 v]', and what is negative in G's eigenvalues is made positive.
+    """
+    if is_increasing(e):
+        return e
+
+    values, vectors = np.linalg.eigh([[e[0], e[1]], [e[1], 3.0 * e[2]]])
+    G = vectors * np.maximum(values, POSITIVE * values[-1]) @ vectors.T
+    return np.array([G[0, 0], G[0, 1], G[1, 1] / 3.0])
 
 
 def solve_increasing(e: tuple[float, ...], target: float, guess: float) -> float:

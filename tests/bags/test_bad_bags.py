@@ -515,10 +515,6 @@ def _read(file: Path, _: Path) -> None:
                 read_signals(bag, [f"{topic}:{entry[0]}"])
 
 
-def _recover(file: Path, out: Path) -> None:
-    recover(file, out)
-
-
 def _convert(file: Path, out: Path) -> None:
     with Bag(file, unfinished=True) as bag:
         convert([bag], out)
@@ -526,7 +522,7 @@ def _convert(file: Path, out: Path) -> None:
     rmtree(out)
 
 
-STEPS: Final[tuple[Callable[[Path, Path], None], ...]] = (_info, _read, _convert, _recover)
+STEPS: Final[tuple[Callable[[Path, Path], object], ...]] = (_info, _read, _convert, recover)
 
 
 def _too_long(_signal: int, _frame: object) -> None:

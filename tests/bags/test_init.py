@@ -410,16 +410,28 @@ def test_a_command_that_never_varies_is_an_answer_and_no_configuration(
     assert not config.exists()
 
 
+def stamped(bags: Path, steps_ms: FloatArray) -> None:
+    """Three runs of a speed that follows its command, with these 300 steps between stamps."""
+    stamps = START_NS + np.cumsum(1_000_000 * steps_ms.astype(int))
+    for k in range(3):
+        rng = np.random.default_rng(k)
+        command = stairs(rng, -1.0, 1.0, 20, 15)
+        speed = followed(command, 0.2) + 0.01 * rng.standard_normal(300)
+        speed_bag(bags / f"run_{k}", speed, command, stamps_ns=stamps.tolist())
+
+
+@pytest.mark.slow
+def test_stamps_that_jitter_by_forty_percent_of_a_period_are_judged(tmp_path: Path) -> None:
+    """Steps of 4 to 36 ms: on a grid of 20 ms a tenth of the samples were said to be filled in."""
+    stamped(tmp_path / "bags", 20.0 + np.diff(np.random.default_rng(0).uniform(-8.0, 8.0, 301)))
+    nlsid("init", tmp_path, tmp_path / "bags", "-u", CMD, "-y", SPEED)
+    assert "inside" in whole_way(tmp_path / "bags", tmp_path / "robot.yaml", tmp_path / "out")
+
+
 @pytest.mark.slow
 def test_a_period_is_one_that_the_stamps_of_a_whole_run_keep_to(tmp_path: Path) -> None:
     """Steps of 20, 22 and 22 ms in turn: on a grid of the median a monitor judges 4 samples."""
-    stamps = START_NS + np.cumsum([20_000_000, 22_000_000, 22_000_000] * 100)
-    for k in range(3):
-        rng = np.random.default_rng(k)
-        command = np.repeat(rng.uniform(-1.0, 1.0, 20), 15)
-        speed = np.convolve(command, 0.2 * 0.8 ** np.arange(60))[:300]
-        speed += 0.01 * rng.standard_normal(300)
-        speed_bag(tmp_path / "bags" / f"run_{k}", speed, command, stamps_ns=stamps.tolist())
+    stamped(tmp_path / "bags", np.array([20.0, 22.0, 22.0] * 100))
     config = tmp_path / "robot.yaml"
     nlsid("init", config.parent, tmp_path / "bags", "-u", CMD, "-y", SPEED)
     grid = load_config(config).grid

@@ -149,11 +149,10 @@ def test_responses_without_a_common_signal_are_refused() -> None:
 
 @pytest.mark.slow
 def test_the_error_falls_with_more_data() -> None:
-    def mean_error(samples: int) -> float:
-        fits = [without_bias(*pair(samples, seed, noise=0.2)) for seed in range(4)]
-        return float(np.mean([percent(found.model) for found in fits]))
-
-    errors = [mean_error(samples) for samples in (400, 4000, 20_000)]
+    errors = [
+        np.mean([percent(without_bias(*pair(n, seed, noise=0.2)).model) for seed in range(4)])
+        for n in (400, 4000, 20_000)
+    ]
     assert errors[2] < 0.5 * errors[1] < 0.3 * errors[0]
 
 

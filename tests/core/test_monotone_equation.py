@@ -11,7 +11,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification import LeastSquares, Polynomial, identify, prove_stability
 from nlsid_core.identification.polynomial.implicit_rie import ImplicitFit
 from nlsid_core.models import MonotoneEquation
-from nlsid_core.models.monotone_equation import is_increasing, solve_increasing
+from nlsid_core.models.monotone_equation import increasing, is_increasing, solve_increasing
 from tests.repeated import pair, percent, truth, without_bias
 
 
@@ -38,6 +38,14 @@ def test_a_function_that_is_not_increasing_is_refused() -> None:
     for e in ([0.0, 0.0, 0.0], [1.0, 0.1, 0.0], [1.0, 0.0, -1.0]):
         with pytest.raises(DataError, match="increasing"):
             replace(truth(), e=np.array(e))
+
+
+@pytest.mark.parametrize("e", [(1.0, 0.0, -5e-13), (1.0, 1e-9, -1e-12), (1.0, -1e-7, 0.0)])
+def test_what_a_solver_keeps_increasing_to_rounding_increases(
+    e: tuple[float, float, float],
+) -> None:
+    assert is_increasing(increasing(np.array(e)))
+    np.testing.assert_allclose(increasing(np.array(e)), e, atol=2e-7)
 
 
 def test_simulation_solves_the_equation_and_documents_round_trip() -> None:
@@ -78,15 +86,14 @@ def test_a_lightly_damped_linear_equation_is_proved_as_the_linear_model_it_equal
     proof = prove_stability(model)
     assert proof is not None
     assert np.sqrt(0.95) < proof.rate < 0.98, "poles of radius √0.95"
-    with_ray = replace(model, e=np.array([2.0, 0.0, 1e-3]))
-    assert prove_stability(with_ray) is None, "with a slope without bound it is not positive real"
+    unbounded = prove_stability(replace(model, e=np.array([2.0, 0.0, 1e-3])))
+    assert unbounded is None, "with a slope without bound it is not positive real"
 
 
 def test_a_resonance_is_identified_by_a_linear_equation() -> None:
     """Least squares finds it, and what it found is proved, although it is no minimiser of (3.8)."""
-    rng = np.random.default_rng(2)
     resonant = replace(truth(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]), c=0.0)
-    u = rng.uniform(-1.0, 1.0, 1500)
+    u = np.random.default_rng(2).uniform(-1.0, 1.0, 1500)
     data = Dataset((Trajectory(t=0.01 * np.arange(1500), y=resonant.simulate(u), u=u),))
     fit = identify(data, Polynomial(2, (0,), set="3.8"), method=LeastSquares())
     assert fit.errors["train"]["least_squares"] < 1e-6

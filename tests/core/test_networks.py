@@ -51,11 +51,6 @@ STRUCTURES = ("follower", "top", "friction", "none", "loop", "stages", "measured
 Example = tuple[Signals, FloatArray, Trial]
 
 
-def one_filter() -> BlockCascade:
-    """No second filter."""
-    return replace(wiener(), b2=wiener().b2[:, :1])
-
-
 def trial(signals: Signals, *, held: bool = False) -> Trial:
     """60 samples of random inputs, with random first samples of every signal."""
     rng = np.random.default_rng(5)
@@ -141,7 +136,7 @@ def test_the_network_simulates_what_was_fitted(name: str) -> None:
 
 
 @pytest.mark.parametrize("begin", ["measured", "rest"])
-@pytest.mark.parametrize("model", [truth(), two_phases(), one_filter()])
+@pytest.mark.parametrize("model", [truth(), two_phases(), replace(wiener(), b2=wiener().b2[:, :1])])
 def test_a_cascade_simulates_what_was_fitted(model: BlockCascade, begin: str) -> None:
     u, y = np.random.default_rng(1).standard_normal((2, 300))
     held, start = begin == "measured", y[: len(model.a2)] if begin == "measured" else y[:0]

@@ -22,6 +22,7 @@ from nlsid_core.identification.polynomial.options import Polynomial as Options
 from nlsid_core.identification.proofs.sets import Names
 from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel, MonotoneEquation, Polynomials, signals_of
+from nlsid_core.models.monotone_equation import increasing
 from nlsid_core.polynomial import Polynomial, monomial_values, monomials, variables
 
 MOST_TERMS = 1000  # of e and f: with 10 000 samples a step takes 2.5 s and 0.8 GB, of one core
@@ -122,8 +123,7 @@ class ImplicitRows:
     def equation(self, e: FloatArray, f: FloatArray) -> MonotoneEquation:
         """e(v) = f(x, w) of set 3.8, of scaled e (m_e, 1) and f (m_f, 1)."""
         first, (mean, spread) = self.dataset.trajectories[0], self.y_scale
-        powers = np.zeros(3)
-        powers[: len(e)] = e[:, 0] / spread[0] ** np.arange(1, len(e) + 1)
+        powers = increasing(np.pad(e[:, 0], (0, 3 - len(e)))) / spread[0] ** np.arange(1, 4)
         constant = f[~self.right.any(axis=1)].sum()
         slopes = self.right.T @ f[:, 0] / self.units[1]  # every other term is one state or input
         return MonotoneEquation(
@@ -179,7 +179,7 @@ class ImplicitRows:
             h = _with_symmetric_left(h, n_v)
         first, window = self.dataset.trajectories[0], self.model_class.window(len(self.u_scale[0]))
         lags = range(1, self.model_class.lags + 1)
-        model = ImplicitModel(
+        return ImplicitModel(
             h=h,
             shift=delayed_states(n - n_v, n + len(names.w)),
             monotonicity=monotonicity,
@@ -188,8 +188,11 @@ class ImplicitRows:
             inputs=tuple(
                 f"{first.u_names[i]}(t-{d})" if d else f"{first.u_names[i]}(t)" for i, d in window
             ),
+            y=signals_of(first, "y"),
+            u=signals_of(first, "u"),
+            window=window,
+            bags=self.dataset.bags,
         )
-        return with_signals(model, self.dataset, window)
 
 
 def build_implicit_rows(
@@ -286,15 +289,6 @@ def refuse_large(model_class: Options, outputs: int, inputs: int) -> None:
             f"{square} monomials in a square of set {model_class.form}, more than "
             f"{MOST_MONOMIALS}; {FEWER}"
         )
-
-
-def with_signals(
-    model: ImplicitModel, dataset: Dataset, window: tuple[tuple[int, int], ...]
-) -> ImplicitModel:
-    """The model with the signals and recordings it was made from."""
-    first = dataset.trajectories[0]
-    y, u = signals_of(first, "y"), signals_of(first, "u")
-    return replace(model, y=y, u=u, window=window, bags=dataset.bags)
 
 
 def _refuse_data_outside(rows: ImplicitRows) -> None:
