@@ -219,7 +219,8 @@ def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
     bags = "1 bag has samples" if len(other) == 1 else f"{len(other)} bags have samples"
     yield (
         f"nothing was judged: {bags} of another period than the model's {other[0].period:g} s: "
-        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs"
+        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs; "
+        "of a table on another grid than its bag's, end the response's path in |linear(0.1 s)"
     )
 
 
