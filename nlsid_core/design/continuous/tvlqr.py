@@ -90,8 +90,8 @@ def steady(
 ) -> FloatArray:
     """S (n, n) at the motion's end if it stayed there as long again, to S_final: K hardly turns."""
     end = _linearised(field, nominal, float(nominal.t[-1]), -1.0)
-    H = _hamiltonian(*end, Q, np.linalg.inv(R))
-    return _backward(lambda _: H, nominal.t, S_final, RICCATI)[0]
+    H = _hamiltonian(*end, Q, np.asarray(np.linalg.inv(R)))
+    return np.asarray(_backward(lambda _: H, nominal.t, S_final, RICCATI)[0])
 
 
 def lyapunov(
