@@ -11,6 +11,7 @@ from nlsid_core.design import ContinuousTracking, design, plan_motion
 from nlsid_core.dynamics import Nominal
 from nlsid_core.errors import Infeasible
 
+TIMES = np.linspace(0, 2, 301)
 WIND = 0.8  # m/s across a vehicle at 5 m/s: more than the cost-to-go's P(t) can hold
 
 
@@ -20,17 +21,24 @@ def drifting(x: Any, u: Any, w: Any) -> Any:
 
 
 def lane_change() -> Nominal:
-    def still(x: Any, u: Any) -> Any:
-        return drifting(x, u, np.zeros(1))
+    return plan_motion(
+        lambda x, u: drifting(x, u, np.zeros(1)), start=[0, 0], end=[1, 0], seconds=2, u=[0]
+    )
 
-    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, u=[0])
+
+def motor(x: Any, u: Any, w: Any) -> Any:
+    """Angle in rad, speed in rad/s, current in A: dry friction, and a torque that nobody knows."""
+    return [
+        x[1],
+        20 * x[2] - 4 * np.tanh(x[1] / 0.5) - 0.5 * x[1] + w[0],
+        (u[0] - 2 * x[2] - 0.4 * x[1]) / 0.05,
+    ]
 
 
 @pytest.mark.slow
 def test_wind_that_no_cost_to_go_holds_is_held_by_what_it_can_reach() -> None:
     motion = lane_change()
-    problem = ContinuousTracking(drifting, motion, goal=[1, 0.3], uncertain=[[-WIND, WIND]])
-    found = design(problem)
+    found = design(ContinuousTracking(drifting, motion, goal=[1, 0.3], uncertain=[[-WIND, WIND]]))
     assert len(found.funnel.t) > len(motion.t)  # P is far from linear somewhere
     assert found.funnel.widths(0.0)[0] > 0.5
     run = Simulation(Truth(drifting, found, 1), found.policy, found.funnel).boundary(
@@ -52,9 +60,8 @@ def test_a_motion_with_more_knots_is_the_same_motion() -> None:
     finer = motion.halved(np.arange(len(motion.t) - 1) % 2 == 0)
     assert len(finer.t) == len(motion.t) + len(motion.t) // 2
     assert set(motion.t) < set(finer.t)
-    times = np.linspace(0, 2, 301)
     for before, after in ((motion.x, finer.x), (motion.u, finer.u)):
-        np.testing.assert_allclose(after(times), before(times), atol=1e-14)
+        np.testing.assert_allclose(after(TIMES), before(TIMES), atol=1e-14)
 
 
 @pytest.mark.slow
@@ -69,22 +76,45 @@ def test_an_airplane_in_half_a_metre_per_second_of_wind_is_proved_at_the_first_t
 
 
 @pytest.mark.slow
+def test_a_motor_whose_voltage_is_held_under_an_unknown_torque_is_proved() -> None:
+    """What the hold does counts among what pushes; else it is refused."""
+    motion = plan_motion(
+        lambda x, u: motor(x, u, [0]), start=[0, 0, 0], end=[2, 0, 0], seconds=1.5, u=[0]
+    )
+    found = design(
+        ContinuousTracking(
+            motor,
+            motion,
+            goal=[0.15, 1.0, 0.5],
+            limits=[[-12, 12]],
+            uncertain=[[-1, 1]],
+            hold=0.005,
+        )
+    )
+    ran = Simulation(Truth(motor, found, 1), found.policy, found.funnel).held(
+        hold=0.005, error=np.zeros(3), starts=300, rng=np.random.default_rng(0)
+    )
+    assert ran.violations == 0
+
+
+@pytest.mark.slow
 def test_factors_are_as_near_as_the_scale_that_they_are_written_in_needs() -> None:
     def double(x: Any, u: Any, w: Any) -> Any:
         return [x[1], u[0] + w[0]]
 
-    limits = [[-1, 1]]
     motion = plan_motion(
         lambda x, u: double(x, u, np.zeros(1)),
         start=[0, 0],
         end=[1, 0],
         seconds=4,
         u=[0],
-        limits=limits,
-    )
-    problem = ContinuousTracking(
-        double, motion, goal=[0.1, 0.1], limits=limits, uncertain=[[-0.05, 0.05]]
+        limits=[[-1, 1]],
     )
     # The constant of one piece is just above the power of two between two scales, and its factors'
     # just below: the kernel refused what was near enough in the other scale.
-    assert design(problem).funnel.widths(0.0) == pytest.approx([0.4717, 0.6671], rel=1e-3)
+    found = design(
+        ContinuousTracking(
+            double, motion, goal=[0.1, 0.1], limits=[[-1, 1]], uncertain=[[-0.05, 0.05]]
+        )
+    )
+    assert found.funnel.widths(0.0) == pytest.approx([0.4717, 0.6671], rel=1e-3)

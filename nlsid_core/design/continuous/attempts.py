@@ -32,7 +32,9 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress
 
 HALVINGS = 6  # of intervals where P is far from linear
-FINER = ("knots", "remainder")  # what is less where knots are closer
+AROUND = "around what w reaches"
+PUSHING = ("disturbance", "hold")  # what a reach counts
+FINER = ("knots", "remainder", "hold")  # what is less where knots are closer
 MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
 AT_LIMIT = 0.99  # of ρ's cap: an input reaches its limit
 NARROW = 0.5  # of half-widths without limits: with less, few limited inputs may saturate
@@ -49,7 +51,13 @@ class Tried:
     @property
     def cause(self) -> str:
         """The term that takes most; "knots" where it lies between them."""
-        return self.refusal.diagnosis.dominant if isinstance(self.refusal, NoFunnel) else "knots"
+        return "knots" if self.found is None else self.found.diagnosis.dominant
+
+    @property
+    def found(self) -> NoFunnel | None:
+        """What was refused, also where a hold is named; None if it lies between knots."""
+        found = self.refusal if isinstance(self.refusal, NoFunnel) else self.refusal.__cause__
+        return found if isinstance(found, NoFunnel) else None
 
     @property
     def t(self) -> float:
@@ -58,10 +66,9 @@ class Tried:
         return -np.inf if t is None else t
 
     def __str__(self) -> str:
-        found = self.refusal if isinstance(self.refusal, NoFunnel) else self.refusal.__cause__
-        if not isinstance(found, NoFunnel):
+        if self.found is None:
             return f"{self.name}: none ({self.refusal})"
-        return f"{self.name}: none at {found.t:.3g} s, because of {found.diagnosis.cause}"
+        return f"{self.name}: none at {self.found.t:.3g} s, because of {self.found.diagnosis.cause}"
 
 
 Attempt: TypeAlias = tuple[str, Callable[[list[Tried]], Setting | None]]
@@ -87,9 +94,10 @@ def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
     listed: list[Attempt] = [("as it is", lambda _: setting)]
     if problem.policy is None:
         listed += HALVINGS * [("with more knots", partial(_finer, problem))]
-    for floor in (0.0, FLOOR):
-        listed.append(("around what w reaches", partial(_pushed, problem, floor)))
-    return listed
+    listed.append((AROUND, partial(_pushed, problem, 0.0, False)))
+    if problem.policy is None:
+        listed.append((f"{AROUND}, with quicker feedback", partial(_pushed, problem, FLOOR, True)))
+    return [*listed, (AROUND, partial(_pushed, problem, FLOOR, False))]
 
 
 def first_found(listed: Sequence[Attempt], progress: Progress) -> tuple[Found, str]:
@@ -161,15 +169,22 @@ def _finer(problem: ContinuousTracking, tried: list[Tried]) -> Setting | None:
     return prepare(replace(problem, nominal=motion_of(last.setting).halved(chosen)))
 
 
-def _pushed(problem: ContinuousTracking, floor: float, tried: list[Tried]) -> Setting | None:
-    """P(t) of a pushed linear loop's reach, if w stopped the last; None if it misses the goal.
+def _pushed(
+    problem: ContinuousTracking, floor: float, settled: bool, tried: list[Tried]
+) -> Setting | None:
+    """P(t) of a pushed linear loop's reach, if that stopped any; None if it misses the goal.
 
-    Where P turns fast on some intervals, there are more knots.
+    Where P turns fast on some intervals, there are more knots. settled: see `prepare`.
     """
-    setting = tried[-1].setting if tried[-1].cause == "disturbance" else None
+    pushed = [one.setting for one in tried if one.cause in PUSHING]
+    if not pushed:
+        return None
+    setting = pushed[-1]
+    if settled:
+        setting = prepare(replace(problem, nominal=motion_of(setting)), settled=True)
     for _ in range(HALVINGS):
-        found = None if setting is None else reached(setting, floor)
-        if setting is None or found is None:
+        found = reached(setting, floor, stay=settled)
+        if found is None:
             return None
         if found.size < 1:
             setting.steps.tightness = found.tightness
@@ -178,5 +193,6 @@ def _pushed(problem: ContinuousTracking, floor: float, tried: list[Tried]) -> Se
         more = int(found.coarse.sum())
         if problem.policy is not None or not more or len(setting.policy.t) + more > MOST_KNOTS:
             return None
-        setting = prepare(replace(problem, nominal=motion_of(setting).halved(found.coarse)))
+        finer = motion_of(setting).halved(found.coarse)
+        setting = prepare(replace(problem, nominal=finer), settled=settled)
     return None

@@ -17,7 +17,7 @@ from nlsid_core.design.continuous.lstep import (
     section_at,
 )
 from nlsid_core.design.continuous.problem import ContinuousTracking, Goal
-from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
+from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, steady, tvlqr
 from nlsid_core.design.continuous.witnesses import affine
 from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
@@ -29,6 +29,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its own
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
+QUICKER = 4.0  # times less R: feedback that acts up to twice as fast
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 SAME_MOTION = 1e-9  # of states, relative and absolute: the motion of a policy is the one given
@@ -83,11 +84,14 @@ class Setting:
         return MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
 
 
-def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
+def prepare(
+    problem: ContinuousTracking, *, saturated: bool = False, settled: bool = False
+) -> Setting:
     """The problem, checked and completed; see `design_funnel` for what is raised.
 
     saturated: whether inputs may be at their limits; else the funnel keeps them within. A given
-    policy clips at its own limits.
+    policy clips at its own limits. settled: whether feedback acts QUICKER, and as if the motion
+    went on after its end.
     """
     if problem.policy is not None:
         problem = replace(problem, nominal=own_motion(problem.policy, problem.nominal))
@@ -104,6 +108,9 @@ def prepare(problem: ContinuousTracking, *, saturated: bool = False) -> Setting:
     Q = definite(weights[0] if problem.Q is None else problem.Q, field.n, "Q", strict=False)
     R = definite(weights[1] if problem.R is None else problem.R, field.m, "R", strict=True)
     final = GOAL_ROOM * wanted.P
+    if settled:
+        R = R / QUICKER if problem.R is None else R
+        final = steady(field, nominal, Q=Q, R=R, S_final=final)
     if problem.policy is None:
         linear = problem.hold is not None  # a held input may not jump
         tracking = tvlqr(field, nominal, Q=Q, R=R, S_final=final, linear=linear)

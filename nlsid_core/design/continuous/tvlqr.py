@@ -33,6 +33,7 @@ RTOL = 1e-9  # of S between knots, to √(S_ii S_jj); P's interpolation error is
 EASY, MOST_STEPS = 1e-12, 256  # of the same: then fewer steps are tried next; of an interval
 GAUSS = 15**0.5 / 10  # of a step: from its middle to the outer two of Gauss's three points
 NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
+RICCATI = "the Riccati equation: is the linearisation controllable?"
 BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
 
 
@@ -66,12 +67,9 @@ def tvlqr(
     R_inverse = np.linalg.inv(R)
 
     def hamiltonian(t: float) -> FloatArray:
-        A, B = _linearised(field, nominal, t)
-        return np.block([[A, -B @ R_inverse @ B.T], [-Q, -A.T]])
+        return _hamiltonian(*_linearised(field, nominal, t), Q, R_inverse)
 
-    S = _backward(
-        hamiltonian, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
-    )
+    S = _backward(hamiltonian, nominal.t, S_final, RICCATI)
 
     def gain_at(k: int, side: float) -> FloatArray:
         return np.asarray(R_inverse @ _linearised(field, nominal, nominal.t[k], side)[1].T @ S[k])
@@ -85,6 +83,15 @@ def tvlqr(
         K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
     return Tracking(policy, S)
+
+
+def steady(
+    field: VectorField, nominal: Nominal, *, Q: FloatArray, R: FloatArray, S_final: FloatArray
+) -> FloatArray:
+    """S (n, n) at the motion's end if it stayed there as long again, to S_final: K hardly turns."""
+    end = _linearised(field, nominal, float(nominal.t[-1]), -1.0)
+    H = _hamiltonian(*end, Q, np.asarray(np.linalg.inv(R)))
+    return np.asarray(_backward(lambda _: H, nominal.t, S_final, RICCATI)[0])
 
 
 def lyapunov(
@@ -192,6 +199,10 @@ def _linearised(
 ) -> tuple[FloatArray, FloatArray]:
     inside = np.clip(t + side * 1e-12, nominal.t[0], nominal.t[-1])
     return field.jacobians(float(inside), nominal.x(t), nominal.u(t))
+
+
+def _hamiltonian(A: FloatArray, B: FloatArray, Q: FloatArray, R_inverse: FloatArray) -> FloatArray:
+    return np.asarray(np.block([[A, -B @ R_inverse @ B.T], [-Q, -A.T]]))
 
 
 def _backward(
