@@ -15,7 +15,7 @@ STATEMENTS = {
     ("nlsid_core",): 17_842,
     ("bags",): 11_498,
     ("nlsid_ros",): 2_601,
-    ("tests",): 21_064,
+    ("tests",): 21_065,
     ("benchmarks", "examples"): 3_793,
 }
 ARGUMENTS, FIELDS = 6, 8
