@@ -256,7 +256,7 @@ class _Unwrapped(_Step):
     def update(self, _stamp_ns: int, value: float) -> float:
         if math.isfinite(step := (value - self._last) / self._turn):
             self._turns += round(step)
-        self._last = value
+            self._last = value
         return value - self._turn * self._turns
 
 

@@ -205,9 +205,9 @@ def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> N
 
 def test_an_unwrapped_angle_is_the_angle_without_jumps() -> None:
     truth = np.linspace(0.0, -40.0, 500)
-    wrapped = np.angle(np.exp(1j * truth))
+    wrapped = np.where(np.arange(500) % 7 > 3, np.nan, np.angle(np.exp(1j * truth)))
     found = Expression.parse("/odom:a.yaw|unwrap").apply(wrapped, np.arange(500), "rad")
-    np.testing.assert_allclose(found, truth, atol=1e-12)
+    np.testing.assert_allclose(found, truth + 0.0 * wrapped, atol=1e-12)  # over what is missing too
     compass = np.rad2deg(truth) % 360.0 + np.where(np.arange(500) == 0, 359.9, 0.0)
     found = Expression.parse("/boat:heading|unit(deg)|unwrap").apply(compass, np.arange(500), "")
     np.testing.assert_allclose(found[0], -0.1, atol=1e-9)
