@@ -407,7 +407,7 @@ def _say_funnel(proposal: Proposal, trials: int) -> None:
         few = 1.0 + 1.0 / max(1, trials // 2)
         times = few * min(proposal.choice.optimism, MOST_OPTIMISM)
         why += (
-            f"; {SAFETY:g} times {times:.2g}: no trial is left for calibration, errors are larger "
+            f"; {SAFETY:g} times {times:.3g}: no trial is left for calibration, errors are larger "
             "on what was held out than where models were fitted, and few trials set the level"
         )
     proposal.content["funnel"] = {"safety_factor": float(f"{SAFETY * times:.2g}")}
