@@ -35,7 +35,8 @@ class Steps:
 
     on_grid: the share of them that is near the period. off_grid: periods by which the stamps of a
     run stray from one grid of the period. repeated: stamps that are the one before. wide: longer
-    ones, without the gaps, are half as much of the time as a monitor lets be filled in.
+    ones than these two, without the gaps, are as much of the time as a monitor lets be filled in,
+    and half as much.
     """
 
     period: float
@@ -43,7 +44,7 @@ class Steps:
     off_grid: float
     repeated: int
     longest: float
-    wide: float
+    wide: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -114,11 +115,10 @@ def read_paces(
     near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
     period, off_grid = _grid(steps, median)
     between = np.sort(every[every <= FEW_GAPS * median])
-    wide = np.searchsorted(np.cumsum(between), (1.0 - 0.5 * MOST_FILLED) * between.sum())
+    shares = 1.0 - np.array([1.0, 0.5]) * MOST_FILLED
+    often, wide = between[np.searchsorted(np.cumsum(between), shares * between.sum())].tolist()
     return Paces(
-        Steps(
-            period, float(near.mean()), off_grid, repeated, float(every.max()), float(between[wide])
-        ),
+        Steps(period, float(near.mean()), off_grid, repeated, float(every.max()), (often, wide)),
         Ages(
             period=float(np.median(u_every)) if len(u_every) else math.inf,
             longest=max(each.longest for each in commanded),
@@ -244,10 +244,11 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
             f"takes {TOLERANCE:g}": True,
         }
         why["resample"] = next(reason for reason, holds in reasons.items() if holds)
-    if not regular and steps.wide > BRIDGED * grid["period"]:
-        grid["period"] = _up(steps.wide / BRIDGED)
+    often, wide = steps.wide
+    if not regular and often > BRIDGED * grid["period"]:
+        grid["period"] = _up(wide / BRIDGED)
         why["period"] = (
-            f"responses come up to {steps.wide:.3g} s apart; a sample is measured where it has "
+            f"responses come up to {wide:.3g} s apart; a sample is measured where it has "
             f"messages at most {BRIDGED:g} periods apart"
         )
     most = FEW_GAPS * steps.period

@@ -192,10 +192,10 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
         for name in ("gentle", "hard"):
             assert bench.call(f"/{name}/plant/push").success
         first = ("outside", "assumption violated")  # whichever is heard first ends the run
-        ends = ("asked to", *(f"{said}: funnel_monitor says" for said in first))
         bench.spin_until(
             lambda: any(
-                bench.has_said(f"idle; stopped: {end}", "hard/tracking_controller") for end in ends
+                bench.has_said(f"idle; stopped: {end}", "hard/tracking_controller")
+                for end in ("asked to", *(f"{said}: funnel_monitor says" for said in first))
             )
         )
         bench.spin_until(lambda: any(bench.has_said(s, "hard/funnel_monitor") for s in first))
