@@ -1,6 +1,6 @@
 """Public data sets: what `nlsid learn` chooses, what it promises, and what it reaches on test data.
 
-python -m benchmarks.nonlinear --data DIR [--json] [--out FILE] [NAME ...]
+python -m benchmarks.nonlinear --data DIR [--only FOLDER ...] [--json] [--out FILE]
 
 DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. Every choice is made as
 `nlsid init` makes it, at its defaults, by training data that are held out; the model is then fitted
@@ -225,17 +225,15 @@ def main() -> None:
     """Print the figures, and with --json one JSON object as the last line."""
     options = parser(__doc__, data=True)
     options.add_argument("--out", type=Path, help="a file for the results, as they come")
-    known = [case.folder for case in SETS]
-    options.add_argument("names", nargs="*", help=f"of {', '.join(known)}; all by default")
+    folders = [case.folder for case in SETS]
+    options.add_argument("--only", nargs="+", choices=folders, default=folders, help="these sets")
     arguments = options.parse_args()
-    if unknown := set(arguments.names) - set(known):
-        options.error(
-            f"no set is called {', '.join(sorted(unknown))}; there are {', '.join(known)}"
-        )
-    wanted = [case for case in SETS if case.folder in (arguments.names or known)]
     rows = {}
-    for case in wanted:
+    for case in (case for case in SETS if case.folder in arguments.only):
         print(case.name, flush=True)
+        if not (arguments.data / case.folder).is_dir():
+            print(f"    no folder {case.folder}")
+            continue
         rows[case.name] = measure(case, arguments.data)
         if arguments.out is not None:
             files.write_atomically(arguments.out, (json.dumps(rows, indent=1) + "\n").encode())

@@ -67,14 +67,16 @@ class CheckBag:
             clock=self.config.clock,
             definitions=definitions,
         )
+        # Where `nlsid identify` takes the samples, the configured grid has settled what is said of
+        # stamps, and what the grid of `nlsid bag check` would leave out is no finding.
+        settled = () if refused else ("regularity", "samples")
         findings = [
             replace(
                 found,
-                level=Level.GOOD if decided or _is_of_others(found) else found.level,
+                level=Level.GOOD if found.check in settled or _is_of_others(found) else found.level,
                 what=without_name(found.what, bag, name),
             )
             for found in fitness.findings
-            for decided in [not refused and found.check in ("regularity", "samples")]
             if refused or found.check != "samples" or found.level is Level.GOOD
         ]
         counts = [text for key, text in custom.items() if key.endswith(LOST)]

@@ -96,12 +96,13 @@ def stability(candidate: Candidate[Model]) -> str:
 def in_unit(data: Dataset, *percents: float) -> str:
     """State percentages of the spread of one output in its unit; several outputs have no such text.
 
-    Two sets of trials compare by it: the calmer trials have the larger percentages.
+    A 0 is left out: what is "at most" has one end. Two sets of trials compare by it: the calmer
+    trials have the larger percentages.
     """
     _, spread = signal_scale(data, "y")
     if len(spread) > 1:
         return ""
-    ends = " to ".join(f"{spread[0] * part / 100.0:.2g}" for part in percents)
+    ends = " to ".join(f"{spread[0] * part / 100.0:.2g}" for part in percents if part)
     return f" ({ends} {data.trajectories[0].y_units[0] or 'in its unit'})"
 
 

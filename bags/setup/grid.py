@@ -44,7 +44,7 @@ class Steps:
     off_grid: float
     repeated: int
     longest: float
-    wide: tuple[float, float]
+    wide: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ def read_paces(
     near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
     period, off_grid = _grid(steps, median)
     between = np.sort(every[every <= FEW_GAPS * median])
-    shares = 1.0 - np.array([1.0, 0.5]) * MOST_FILLED
-    often, wide = between[np.searchsorted(np.cumsum(between), shares * between.sum())].tolist()
+    narrow = (1.0 - MOST_FILLED * np.array([1.0, 0.5])) * between.sum()
+    wide = between[np.searchsorted(np.cumsum(between), narrow)].tolist()
     return Paces(
-        Steps(period, float(near.mean()), off_grid, repeated, float(every.max()), (often, wide)),
+        Steps(period, float(near.mean()), off_grid, repeated, float(every.max()), tuple(wide)),
         Ages(
             period=float(np.median(u_every)) if len(u_every) else math.inf,
             longest=max(each.longest for each in commanded),
@@ -223,8 +223,8 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
             f"samples are {steps.period:.4g} s apart, {1.0 / steps.period:.2g} Hz; if times in "
             "milliseconds were taken for seconds, read them again with their unit"
         )
-    enough = DYNAMICS * read.band * steps.period  # of a sample, that a step is
-    factor = max(int(1.0 / enough), 1) if enough > 0.0 else 1
+    part = DYNAMICS * read.band * steps.period  # that a step is of the longest that is enough
+    factor = max(int(1.0 / part), 1) if part > 0.0 else 1
     if factor > 1:
         grid["period"] = float(f"{factor * steps.period:.4g}")
         why["period"] = (
@@ -244,12 +244,11 @@ def say_grid(proposal: Proposal, read: Paces) -> None:
             f"takes {TOLERANCE:g}": True,
         }
         why["resample"] = next(reason for reason, holds in reasons.items() if holds)
-    often, wide = steps.wide
-    if not regular and often > BRIDGED * grid["period"]:
-        grid["period"] = _up(wide / BRIDGED)
+    if not regular and min(steps.wide) > BRIDGED * grid["period"]:
+        grid["period"] = _up(max(steps.wide) / BRIDGED)
         why["period"] = (
-            f"responses come up to {wide:.3g} s apart; a sample is measured where it has "
-            f"messages at most {BRIDGED:g} periods apart"
+            f"responses come up to {max(steps.wide):.3g} s apart; a sample is measured where it "
+            f"has messages at most {BRIDGED:g} periods apart"
         )
     most = FEW_GAPS * steps.period
     grid["max_gap"] = _up(max(min(1.2 * steps.longest, most), 2.0 * grid["period"]))

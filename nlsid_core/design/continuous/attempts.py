@@ -32,7 +32,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress
 
 HALVINGS = 6  # of intervals where P is far from linear
-AROUND = "around what w reaches"
+AROUND = "around what pushes reach"
 PUSHING = ("disturbance", "hold")  # what a reach counts
 FINER = ("knots", "remainder", "hold")  # what is less where knots are closer
 MOST_LIMITED = 2  # inputs that may saturate together: 9 modes, each with programs of its own
@@ -87,7 +87,7 @@ def with_knots(problem: ContinuousTracking) -> Setting:
 
 
 def attempts(problem: ContinuousTracking, setting: Setting) -> list[Attempt]:
-    """As it is; with more knots where that stopped it; around what w reaches.
+    """As it is; with more knots where that stopped it; around what pushes reach.
 
     A given policy keeps its knots.
     """
