@@ -70,9 +70,11 @@ def folder_page(folder: Path, held: Mapping[str, str] | None = None) -> str:
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     design = None if is_rejected else _loaded(folder)
     drawn = "" if design is None else _drawn(folder, design)
-    short = ""
-    if design is not None and isinstance(design.funnel, TubeFunnel):
-        short = f"<p>{escape(show.promise(design))}</p>"
+    short = (
+        f"<p>{escape(show.promise(design))}</p>"
+        if design is not None and isinstance(design.funnel, TubeFunnel)
+        else ""
+    )
     chapters = {
         "What is proved": short + decided,
         **(held or {}),

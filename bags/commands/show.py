@@ -27,6 +27,8 @@ from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import AnyDesign
 from nlsid_core.errors import DataError, counted, percent
 from nlsid_core.funnels.tube import Tube
+from nlsid_core.identification.prediction import history
+from nlsid_core.identification.validation import unscored
 from nlsid_core.kernel import text
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
@@ -57,11 +59,13 @@ def say_identified(console: Console, result: Identified) -> None:
 
 def worth(result: Identified) -> str:
     """How well the model simulates, and what is proved of it."""
+    chosen, test = result.fit.chosen, result.test
     error = result.fit.errors["test"][result.fit.method.name]
-    size = f"{percent(error)}{tables.in_unit(result.test, error)}"
+    scored = max(history(chosen.model), unscored(test, chosen.transient))
     return (
-        f"The model simulates {counted(len(result.test), 'test trial')} with an error of {size}. "
-        f"{tables.stability_sentence(result.fit.chosen)}"
+        f"The model simulates {counted(len(test), 'test trial')} with an error of "
+        f"{percent(error)}{tables.in_unit(test, error, first=scored)}. "
+        f"{tables.stability_sentence(chosen)}"
     )
 
 

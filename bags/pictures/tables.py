@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any, Final
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -15,7 +16,6 @@ from bags.monitoring.catching import Catching, Caught
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import counted, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
-from nlsid_core.identification.regressors import signal_scale
 from nlsid_core.models import StateAffineModel
 
 STABILITY = "proved rate a sample (time constant)"
@@ -93,13 +93,13 @@ def stability(candidate: Candidate[Model]) -> str:
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
-def in_unit(data: Dataset, *percents: float) -> str:
+def in_unit(data: Dataset, *percents: float, first: int = 0) -> str:
     """State percentages of the spread of one output in its unit; several outputs have no such text.
 
-    A 0 is left out: what is "at most" has one end. Two sets of trials compare by it: the calmer
-    trials have the larger percentages.
+    first: sample of each trial from which on the spread counts. A 0 is left out: what is "at most"
+    has one end. Two sets of trials compare by it: the calmer trials have the larger percentages.
     """
-    _, spread = signal_scale(data, "y")
+    spread = np.concatenate([trial.y[first:] for trial in data]).std(axis=0)
     if len(spread) > 1:
         return ""
     ends = " to ".join(f"{spread[0] * part / 100.0:.2g}" for part in percents if part)

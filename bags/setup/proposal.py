@@ -41,8 +41,10 @@ class Proposal:
             )
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
         promise = self.choice.promise
-        size = in_unit(self.choice.held_out.data, promise.low, promise.high)
-        said = f"expect an error in simulation of {promise}{size}: {grade}"
+        said = (
+            f"expect an error in simulation of {promise}"
+            f"{in_unit(self.choice.held_out.data, promise.low, promise.high)}: {grade}"
+        )
         return f"{said}, if the question above is answered" if self.doubts else said
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
